@@ -1,4 +1,4 @@
-"""The console command: `lorasp-jax train | envs | data | report | completion`."""
+"""The console command: `lorasp-jax train | study | envs | data | report | completion`."""
 
 import argparse
 import importlib
@@ -12,6 +12,7 @@ import lorasp_jax
 
 COMMANDS = {
     "train": ("lorasp_jax.cli.train", "adapt a policy to a robot"),
+    "study": ("lorasp_jax.study.__main__", "run many experiments and test claims about them"),
     "envs": ("envs.__main__", "collect, render or play episodes of the scripted experts"),
     "data": ("lorasp_jax.data.__main__", "inspect or convert datasets"),
     "report": (

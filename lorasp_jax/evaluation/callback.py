@@ -43,14 +43,15 @@ class Evaluation(Callback):
         self,
         compile_rollout: Callable[[Config, str], tuple[Env, Callable]] = compiled_rollout,
         evaluate: Callable[..., Result] = evaluate,
-        write_video: Callable[[Env, Poses, Path], None] = video.write_episode,
+        write_video: Callable[[Env, Poses, Path], None] | None = video.write_episode,
     ) -> None:
         """Create the callback; nothing compiles until the first evaluation.
 
         Args:
             compile_rollout: (config, task) -> the task's environment and its jitted rollout.
             evaluate: evaluates a policy, like `rollout.evaluate`.
-            write_video: renders an episode's poses and writes the video to a file.
+            write_video: renders an episode's poses and writes the video to a file; None: no videos
+                and images.
         """
         self._compile_rollout, self._evaluate = compile_rollout, evaluate
         self._write_video = write_video
@@ -91,6 +92,8 @@ class Evaluation(Callback):
 
     def _write_media(self, run: Run, results: dict[str, Result]) -> None:
         """Write each task's video and the initial camera images of its first demonstration."""
+        if self._write_video is None:
+            return
         for task, result in results.items():
             images = {name: np.asarray(i[0, 0]) for name, i in run.episodes[task].image.items()}
             video.write_image(run.folder / f"cameras_{task}.png", video.side_by_side(images))

@@ -1,12 +1,14 @@
 """A study: named cells, most of which are training runs, and the claims that they test."""
 
+import fnmatch
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from lorasp_jax.config import MAX_NAME_BYTES, Config
+from lorasp_jax.training.experiment_file import call
 
 if TYPE_CHECKING:  # a run of a finished study should load no model code
     from envs.datasets.episodes import Episodes
@@ -14,7 +16,7 @@ if TYPE_CHECKING:  # a run of a finished study should load no model code
 
 Results: TypeAlias = Mapping[str, Mapping[str, Any]]
 """The content of cell.json by cell name."""
-RESERVED = ("demonstrations", "groups", "results.json")
+RESERVED = ("demonstrations", "groups", "held_out", "logs", "results.json")
 """What a study's folder contains besides the folders of cells."""
 _PART = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._+=-]*")
 
@@ -101,6 +103,8 @@ class Study:
             if parents := [str(path) for path in PurePosixPath(name).parents if str(path) in names]:
                 raise ValueError(f"cell {name!r} lies in the folder of cell {parents[0]!r}")
         _check_order(self.cells)
+        for group in self.groups:
+            _check_path(group)
 
     def __getitem__(self, name: str) -> Cell | Derived:
         """Return a cell by name."""
@@ -116,6 +120,35 @@ class Study:
             group_of[cell.name] = own
             groups[own] = (*groups.get(own, ()), cell)
         return groups
+
+
+def load(path: Path, scale: str) -> Study:
+    """Load the study that a file defines.
+
+    Raises:
+        ValueError: the file is missing, its code fails, or `get_study` does not return a `Study`.
+    """
+    study = call(path, "get_study", scale)
+    if not isinstance(study, Study):
+        raise ValueError(f"get_study in {path} must return a Study, got {type(study).__name__}")
+    return study
+
+
+def select(study: Study, only: str, shard: tuple[int, int]) -> list[str]:
+    """Return the names of a shard's cells that match a shell pattern.
+
+    Groups are dealt out in turn, so that every cell is in one shard.
+
+    Raises:
+        ValueError: no cell of the study matches.
+    """
+    matching = {cell.name for cell in study.cells if fnmatch.fnmatchcase(cell.name, only)}
+    if not matching:
+        first = study.cells[0].name if study.cells else "none"
+        raise ValueError(f"no cell of {study.name} matches {only!r}; the first cell is {first}")
+    index, count = shard
+    groups = list(study.groups.values())[index - 1 :: count]
+    return [cell.name for group in groups for cell in group if cell.name in matching]
 
 
 def _check_path(name: str) -> None:

@@ -1,0 +1,116 @@
+"""Run a study: `python -m lorasp_jax.study --config FILE`, or `lorasp-jax study`."""
+
+import argparse
+import functools
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from envs.cli.errors import INTERRUPTED, REFUSED, parse_arguments, report_error
+from lorasp_jax.study import listing, results
+from lorasp_jax.study.status import BROKEN, Board, State, clear_failure, results_of, tidy
+from lorasp_jax.study.study import load, select
+
+SCALES = ("smoke", "accelerator")
+
+
+def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.study") -> int:
+    """Run a study and return the exit code.
+
+    0: all cells that can run are finished; 2: invalid input, or a cell failed, is damaged or has
+    other settings; 130: stopped by a signal.
+    """
+    options = parse_arguments(parser(program), arguments)
+    errors = Console(stderr=True)
+    try:
+        return _execute(options, Console())
+    except Exception as error:  # prints one sentence for invalid input, re-raises bugs
+        return report_error(error, errors)
+    except KeyboardInterrupt:
+        errors.print("stopped; to resume, give the same command", highlight=False)
+        return INTERRUPTED
+
+
+def parser(program: str) -> argparse.ArgumentParser:
+    """Return this command's argument parser."""
+    parser = argparse.ArgumentParser(
+        prog=program, description="Run the missing cells of a study and collect all results."
+    )
+    add = parser.add_argument
+    add("--config", type=Path, required=True, help="study file with get_study(scale)")
+    add("--scale", choices=SCALES, default="accelerator", help="size preset (default: accelerator)")
+    add("--only", metavar="PATTERN", default="*", help="cells to run, such as 'pi0/multi/*'")
+    add("--jobs", type=_positive, default=1, metavar="N", help="processes that share the device")
+    add("--shard", type=_shard, default=(1, 1), metavar="I/N", help="run the I-th of N parts")
+    add("--dry-run", action="store_true", help="list the cells, then exit")
+    add(
+        "--out",
+        type=Path,
+        default=Path("runs"),
+        help="parent of the study's folder (default: runs)",
+    )
+    return parser
+
+
+def _execute(options: argparse.Namespace, console: Console) -> int:
+    """List or run the selected cells, then write the results of all finished ones."""
+    study = load(options.config, options.scale)
+    folder, names = options.out / study.name, select(study, options.only, options.shard)
+    board = Board(study, folder)
+    if options.dry_run:
+        statuses = board.read()
+        console.print(listing.dry_run_table(study, names, statuses))
+        _print(console, listing.totals(study, names, statuses))
+        return 0
+    for name in names:
+        clear_failure(folder / name)
+    statuses = board.read()
+    for name in names:
+        if statuses[name].state is State.FINISHED:
+            tidy(folder / name)  # the last process may have been killed before it did
+    if any(statuses[name].state is State.RUNNABLE for name in names):
+        _run(options, folder, names, console)
+        statuses = board.read()
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / results.RESULTS_FILE
+    results.write(path, study.name, results_of(statuses, statuses))
+    _print(console, *listing.problems(names, statuses))
+    _print(console, listing.totals(study, names, statuses), f"results: {path}")
+    return REFUSED if any(statuses[name].state in BROKEN for name in names) else 0
+
+
+def _print(console: Console, *lines: str) -> None:
+    for line in lines:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _run(options: argparse.Namespace, folder: Path, names: list[str], console: Console) -> None:
+    """Run cells in worker processes."""
+    from lorasp_jax.study.workers import Workers
+
+    if options.jobs > 1:  # otherwise the first process takes most of the device's memory
+        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    load_study = functools.partial(load, options.config, options.scale)
+    Workers(load_study, folder, names, console).run(options.jobs)
+
+
+def _positive(text: str) -> int:
+    """Parse a positive integer."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"must be a positive whole number, got {text!r}")
+    return int(text)
+
+
+def _shard(text: str) -> tuple[int, int]:
+    """Parse a shard such as 2/4."""
+    index, _, count = text.partition("/")
+    if not (index.isdecimal() and count.isdecimal() and 1 <= int(index) <= int(count)):
+        raise argparse.ArgumentTypeError(f"must be I/N with 1 <= I <= N, got {text!r}")
+    return int(index), int(count)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,169 @@
+"""Run one cell of a study: train and evaluate, or derive a policy and evaluate it."""
+
+import contextlib
+import dataclasses
+import functools
+import gc
+import hashlib
+import json
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from envs.compilation import cache
+from envs.datasets.episodes import Episodes
+from envs.datasets.locks import locked
+from lorasp_jax.config import Config, EvaluationConfig
+from lorasp_jax.evaluation.callback import Evaluation
+from lorasp_jax.evaluation.rollout import compiled_rollout
+from lorasp_jax.peft import FullFineTuning
+from lorasp_jax.study.cost import training_cost
+from lorasp_jax.study.held_out import EPISODES, held_out
+from lorasp_jax.study.measures import measures
+from lorasp_jax.study.runner import Job
+from lorasp_jax.study.study import Derived
+from lorasp_jax.training import loop, records, setup
+from lorasp_jax.training.base import base_model
+from lorasp_jax.training.demonstrations import Progress, demonstrations, map_threads
+from lorasp_jax.training.export import Export, load_policy
+from lorasp_jax.training.run import Run
+from lorasp_jax.training.run_folder import open_run, read_json
+
+WIDTH = 120
+"""Line length of logs."""
+
+
+def run_cell(job: Job) -> dict[str, Any]:
+    """Run a cell and return what cell.json records about it, except the settings.
+
+    Raises:
+        ValueError: see `setup.prepare` and `loop.train`; for a derived cell, the source's policy is
+            missing or cannot be transformed.
+    """
+    cache.enable()
+    try:
+        return _derive(job) if isinstance(job.cell, Derived) else _train(job)
+    finally:
+        gc.collect()  # models have reference cycles; the next cell needs their memory
+
+
+def _train(job: Job) -> dict[str, Any]:
+    """Train a policy, or resume it, and evaluate it."""
+    console, started = Console(width=WIDTH), time.perf_counter()
+    collect = functools.partial(shared_demonstrations, job.study_folder)
+    with open_run(job.config, job.folder.parent, resume="auto"):
+        run = setup.prepare(job.config, job.folder, console, started, collect=collect)
+        loop.train(run, [Export(), _evaluation()], resume=True)
+        with run.timed("measure"):
+            base = base_model(job.config)[0] if job.config.peft.trains_base else None
+            episodes = held_out_demonstrations(job.study_folder, run.config)
+            measured = measures(run.policy, episodes, base=base)
+            speed = training_cost(job.folder, job.config, run.policy.model.config)
+        return {**_results(run), "speed": speed, "measures": measured}
+
+
+def _derive(job: Job) -> dict[str, Any]:
+    """Transform the policy of another cell and evaluate it."""
+    assert isinstance(job.cell, Derived)
+    run = Run(job.config, job.folder, Console(width=WIDTH), "")
+    with run.timed("derive"):
+        source = load_policy(job.study_folder / job.cell.source)
+        run.episodes = held_out_demonstrations(job.study_folder, run.config)
+        run.policy = job.cell.transform(source, job.results, run.episodes)
+    _evaluation().on_end(run)
+    with run.timed("measure"):
+        measured = measures(run.policy, run.episodes, source=source)
+    return {**_results(run), "speed": {}, "measures": measured}
+
+
+def _results(run: Run) -> dict[str, Any]:
+    """Return what cell.json takes from results.json."""
+    results = read_json(run.folder / "results.json", records.RESULTS)
+    tasks: Mapping[str, Any] = results["tasks"]
+    outcomes = {task: value["after"]["outcomes"] for task, value in tasks.items()}
+    before = {t: value["before"]["outcomes"] for t, value in tasks.items() if "before" in value}
+    names = (
+        "active_rank",
+        "layer_active_rank",
+        "active_rank_histogram",
+        "trainable_parameters",
+        "total_parameters",
+    )
+    return {
+        "outcomes": outcomes,
+        **({"before": before} if before else {}),
+        **{name: results[name] for name in names},
+        "seconds": dict(run.seconds),
+    }
+
+
+def shared_demonstrations(
+    study_folder: Path, config: Config, _folder: Path, progress: Progress
+) -> dict[str, Episodes]:
+    """Load the demonstrations that all cells with the same robot and data settings share.
+
+    They do not depend on the seed, and a task has the same ones whatever tasks it is trained with.
+    The first cell that needs them collects them.
+    """
+    collect = functools.partial(demonstrations, progress=progress)
+    return _shared(study_folder / "demonstrations", dataclasses.replace(config, seed=0), collect)
+
+
+def held_out_demonstrations(study_folder: Path, config: Config) -> dict[str, Episodes]:
+    """Load the held-out demonstrations (see `held_out.held_out`), shared in the same way."""
+    data = dataclasses.replace(config.data, episodes=EPISODES)
+    return _shared(study_folder / "held_out", dataclasses.replace(config, data=data), held_out)
+
+
+def _shared(
+    root: Path, config: Config, collect: Callable[[Config, Path], dict[str, Episodes]]
+) -> dict[str, Episodes]:
+    """Load each task's episodes from a folder named after the settings, or collect them there."""
+    settings = {
+        "robot": config.robot,
+        "data": dataclasses.asdict(config.data),
+        "image_size": config.image_size,
+        "control_dt": config.control_dt,
+    }
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
+    folder = root / f"{Path(config.robot).stem}_{digest}"
+
+    def one(task: str) -> Episodes:
+        with _alone(folder / "cache" / f"{task}.npz"):
+            return collect(dataclasses.replace(config, tasks=(task,)), folder)[task]
+
+    return dict(zip(config.tasks, map_threads(one, config.tasks), strict=True))
+
+
+def _alone(file: Path) -> contextlib.AbstractContextManager[None]:
+    """Let one process at a time make a file; nobody waits once it exists."""
+    return contextlib.nullcontext() if file.exists() else locked(file, waiting=lambda: None)
+
+
+def _evaluation() -> Evaluation:
+    """Return an evaluation without videos, which shares compiled rollouts with other cells."""
+    return Evaluation(compile_rollout=_shared_rollout, write_video=None)
+
+
+def _shared_rollout(config: Config, task: str) -> Any:
+    """Return environment and compiled rollout, shared by all cells of this process."""
+    return _rollout(config.robot, config.image_size, config.control_dt, config.evaluation, task)
+
+
+@functools.cache
+def _rollout(
+    robot: str, image_size: int, control_dt: float, evaluation: EvaluationConfig, task: str
+) -> Any:
+    config = Config(
+        name="any",
+        scale="smoke",
+        peft=FullFineTuning(),
+        robot=robot,
+        image_size=image_size,
+        control_dt=control_dt,
+        evaluation=evaluation,
+    )
+    return compiled_rollout(config, task)

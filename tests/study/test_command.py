@@ -1,0 +1,152 @@
+import json
+import re
+import subprocess
+import sys
+
+import pytest
+
+from lorasp_jax.study import __main__ as command
+from lorasp_jax.study import results, runner, workers
+from lorasp_jax.study.study import load, select
+from tests import ROOT
+from tests.study import fakes
+from tests.study.fakes import NAMES, ran, study
+
+FILE = "from tests.study.fakes import study\n\ndef get_study(scale):\n    return study()\n"
+
+
+class InProcess(workers.Workers):
+    """Run the cells in this process."""
+
+    run_cell = staticmethod(fakes.run)
+
+    def run(self, count):
+        runner.work(self._study, self._folder, self._names, self.run_cell)
+
+
+@pytest.fixture
+def start(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(workers, "Workers", InProcess)
+    (tmp_path / "study.py").write_text(FILE)
+
+    def start(*options):
+        arguments = ["--config", str(tmp_path / "study.py"), "--out", str(tmp_path / "runs")]
+        code = command.main([*arguments, *options])
+        output = capsys.readouterr()
+        return code, re.sub(r"\s+", " ", output.out + output.err)
+
+    return start
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "runs/fake"
+
+
+def test_a_study_runs_once(start, folder):
+    code, text = start()
+    assert code == 0
+    assert "fake: 6 finished" in text
+    assert sorted(results.load(folder / "results.json")) == sorted(NAMES)
+    before = (folder / "results.json").read_bytes()
+    assert start()[0] == 0
+    assert len(ran(folder)) == 6
+    assert (folder / "results.json").read_bytes() == before
+
+
+def test_parts_of_a_study(start, folder):
+    code, text = start("--only", "lora/*")
+    assert (code, ran(folder)) == (0, [])
+    assert "lora/s0: waiting for sp/s0 (runnable), sp/s1 (runnable)" in text
+    assert start("--only", "sp/*")[0] == 0
+    assert ran(folder) == ["sp/s0", "sp/s1"]
+    assert start("--shard", "2/2")[0] == 0
+    assert ran(folder)[2:] == ["lora/s0", "lora/s1", "cut/s0"]
+    assert start("--shard", "1/2")[0] == 0
+    assert ran(folder)[5:] == ["lr"]
+
+
+def test_a_failed_cell_is_reported_and_tried_again(start, folder, monkeypatch):
+    monkeypatch.setattr(InProcess, "run_cell", staticmethod(fail))
+    code, text = start()
+    assert code == 2
+    assert "sp/s1: failed RuntimeError: boom" in text
+    assert "fake: 2 finished, 3 waiting, 1 failed" in text
+    monkeypatch.setattr(InProcess, "run_cell", staticmethod(fakes.run))
+    assert start()[0] == 0
+    assert sorted(ran(folder)) == sorted(NAMES)
+
+
+def fail(job):
+    if job.cell.name == "sp/s1":
+        raise RuntimeError("boom")
+    return fakes.run(job)
+
+
+def test_a_damaged_cell_is_reported(start, folder):
+    start()
+    (folder / "lr/cell.json").write_text("{")
+    code, text = start()
+    assert code == 2
+    assert re.search(r"lr: damaged \S+/lr/cell.json", text)
+    assert "5 finished, 1 damaged" in text
+    assert sorted(results.load(folder / "results.json")) == sorted({*NAMES} - {"lr"})
+
+
+def test_dry_run(start, folder):
+    code, text = start("--dry-run", "--only", "[ls]*")
+    assert code == 0
+    assert re.search(r"sp/s0 │ LoRASP │ 2,000 │ [\d,]+ │ runnable │ \?", text)
+    assert re.search(r"lora/s0 │ \? │ \? │ \? │ waiting │ \?", text)
+    assert not folder.exists()
+    start()
+    code, text = start("--dry-run")
+    assert re.search(r"lora/s1 │ LoRA │ 2,000 │ [\d,]+ │ finished │ \d s", text)
+    assert re.search(r"cut/s0 │ from lora/s0 │ 0 │ │ finished │ \d s", text)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--only", "x*"], "error: no cell of fake matches 'x*'; the first cell is sp/s0"),
+        (["--shard", "3/2"], "must be I/N with 1 <= I <= N, got '3/2'"),
+        (["--shard", "1"], "must be I/N with 1 <= I <= N, got '1'"),
+        (["--jobs", "0"], "must be a positive whole number, got '0'"),
+        (["--config", "missing.py"], "error: config missing.py does not exist"),
+    ],
+)
+def test_bad_options(start, options, message, capsys):
+    try:
+        code, text = start(*options)
+    except SystemExit as error:
+        code, text = error.code, re.sub(r"\s+", " ", capsys.readouterr().err)
+    assert code == 2
+    assert message in text
+
+
+def test_every_cell_is_in_one_shard():
+    shards = [select(study(), "*", (index, 3)) for index in (1, 2, 3)]
+    assert sorted(shards[0] + shards[1] + shards[2]) == sorted(NAMES)
+    assert shards[1] == ["lora/s0", "lora/s1", "cut/s0"]
+
+
+def test_a_file_must_return_a_study(tmp_path):
+    (tmp_path / "a.py").write_text("def get_study(scale): return 7\n")
+    with pytest.raises(ValueError, match=r"get_study in .*a\.py must return a Study, got int"):
+        load(tmp_path / "a.py", "smoke")
+
+
+def test_a_finished_study_loads_no_model_and_no_simulation(start, tmp_path):
+    start()
+    program = "import json, sys; from lorasp_jax.study.__main__ import main; code = main({}); "
+    program += "print(json.dumps([code, [m for m in {} if m in sys.modules]]))"
+    slow = ["mujoco", "lorasp_jax.models", "orbax", "matplotlib", "tyro", "scipy"]
+    arguments = ["--config", str(tmp_path / "study.py"), "--out", str(tmp_path / "runs")]
+    process = subprocess.run(
+        [sys.executable, "-c", program.format(arguments, slow)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert json.loads(process.stdout.splitlines()[-1]) == [0, []]

@@ -1,0 +1,134 @@
+import dataclasses
+import random
+import shutil
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from envs.datasets.episodes import Episodes
+from lorasp_jax.study import results, run_cell
+from lorasp_jax.study.held_out import EPISODES, SEED
+from tests import ROOT
+from tests.runs import random_episodes
+from tests.study.fakes import CONFIG
+
+UNREPEATABLE = {"seconds", "speed", "measures"}
+
+
+@pytest.fixture
+def collected(monkeypatch):
+    """Configs for which demonstrations were collected."""
+    configs = []
+
+    def demonstrations(config, folder, progress=None):
+        (task,) = config.tasks
+        path = folder / "cache" / f"{task}.npz"
+        if path.exists():
+            return {task: Episodes.load(path, control_dt=config.control_dt)}
+        configs.append(config)
+        time.sleep(0.05)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        random_episodes(task, len(configs)).save(path)
+        return {task: Episodes.load(path, control_dt=config.control_dt)}
+
+    monkeypatch.setattr(run_cell, "demonstrations", demonstrations)
+    monkeypatch.setattr("lorasp_jax.study.held_out.demonstrations", demonstrations)
+    return configs
+
+
+def load(folder, **changes):
+    config = dataclasses.replace(CONFIG, **changes)
+    return run_cell.shared_demonstrations(folder, config, folder, lambda *_: None)
+
+
+def test_cells_share_demonstrations(tmp_path, collected):
+    first = load(tmp_path, tasks=("press", "pour"), seed=0)
+    assert list(first) == ["press", "pour"]
+    single = load(tmp_path, tasks=("pour",), seed=7, log_every=3)
+    assert (single["pour"].state == first["pour"].state).all()
+    assert sorted(config.tasks for config in collected) == [("pour",), ("press",)]
+    assert {config.seed for config in collected} == {0}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"robot": "panda"},
+        {"image_size": 32},
+        {"control_dt": 0.05},
+        {"data": dataclasses.replace(CONFIG.data, episodes=3)},
+    ],
+)
+def test_other_settings_need_other_demonstrations(tmp_path, collected, changes):
+    load(tmp_path, tasks=("press",))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Episodes, "load", lambda path, control_dt: path)
+        load(tmp_path, tasks=("press",), **changes)
+    assert len(collected) == 2
+
+
+def test_cells_at_the_same_time_collect_once(tmp_path, collected):
+    threads = [
+        threading.Thread(target=load, args=(tmp_path,), kwargs={"tasks": ("press",)})
+        for _ in range(3)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(collected) == 1
+
+
+def test_held_out_demonstrations_are_others(tmp_path, collected):
+    run_cell.held_out_demonstrations(tmp_path, dataclasses.replace(CONFIG, tasks=("press",)))
+    load(tmp_path, tasks=("press",))
+    assert [config.seed for config in collected] == [SEED, 0]
+    assert [config.data.episodes for config in collected] == [EPISODES, CONFIG.data.episodes]
+
+
+def command(out, *options):
+    file = ROOT / "tests/study/smoke.py"
+    arguments = ["--config", file, "--scale", "smoke", "--out", out, *options]
+    return [sys.executable, "-m", "lorasp_jax.study", *map(str, arguments)]
+
+
+def run_with_kills(out, delays, *options):
+    """Run a study to its end, after killing it at the given times [s] after each start."""
+    with (out.parent / f"{out.name}.txt").open("w") as log:
+        settings = {"cwd": ROOT, "stdout": log, "stderr": log}
+        for delay in delays:
+            process = subprocess.Popen(command(out, *options), **settings)
+            try:
+                process.wait(delay)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        subprocess.run(command(out, *options), check=True, **settings)
+
+
+def repeatable(path):
+    return {
+        name: {key: value for key, value in cell.items() if key not in UNREPEATABLE}
+        for name, cell in results.load(path).items()
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_killed_sharded_and_merged_studies_give_the_same_results(tmp_path):
+    run_with_kills(tmp_path / "whole", [], "--jobs", "2")
+    times = random.Random(0)
+    for index in (1, 2):
+        out, delays = tmp_path / f"shard_{index}", [times.uniform(10, 40) for _ in range(3)]
+        shutil.copytree(tmp_path / "whole/tiny/demonstrations", out / "tiny/demonstrations")
+        run_with_kills(out, delays, "--shard", f"{index}/2")
+        shutil.copytree(out, tmp_path / "merged", dirs_exist_ok=True)
+    run_with_kills(tmp_path / "merged", [times.uniform(10, 40)])
+    whole = repeatable(tmp_path / "whole/tiny/results.json")
+    assert sorted(whole) == ["lora/s0", "lora/s1", "lora_sp/s0", "lora_sp/s1", "same/s0"]
+    assert repeatable(tmp_path / "merged/tiny/results.json") == whole
+    assert whole["same/s0"]["outcomes"] == whole["lora_sp/s0"]["outcomes"]
+    assert not list((tmp_path / "merged").rglob("checkpoints"))
