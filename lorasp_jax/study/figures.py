@@ -138,6 +138,8 @@ def figure_4(book: Book) -> Figure:
                 patch_artist=True,
                 manage_ticks=False,
                 medianprops={"color": mpl.rcParams["text.color"]},
+                whiskerprops={"color": color},
+                showcaps=False,
                 flierprops={"ms": 3, "markeredgecolor": color},
             )
             for box in boxes["boxes"]:

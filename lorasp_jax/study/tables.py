@@ -222,7 +222,9 @@ def costs(book: Book, backbone: str) -> str:
             rows.append([name, missing, *[NONE] * (len(fields) - 1)])
             continue
         values = [(book.mean(prefix, *path), scale, unit) for path, scale, unit in fields]
-        rows.append([name, *(NONE if v is None else f"{v * s:.3g}{u}" for v, s, u in values)])
+        rows.append(
+            [name, *(NONE if v is None else f"{float(f'{v * s:.3g}'):,g}{u}" for v, s, u in values)]
+        )
     return markdown(headers, rows)
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import re
+import runpy
 from collections import Counter
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from lorasp_jax.config import Config
 from lorasp_jax.peft import AdaLoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP
-from lorasp_jax.study import Cell, Derived, naming
+from lorasp_jax.study import Cell, Derived, claims, naming
 from lorasp_jax.training import setup
 from tests.study import synthetic
 
@@ -139,6 +140,19 @@ def test_unknown_scale():
         ValueError, match="the study has the scales accelerator and smoke, got 'cpu'"
     ):
         synthetic.study("cpu")
+
+
+def test_claim_on_embodiments_compares_every_module():
+    """Its cells are not part of the study yet."""
+    names = [f"pi0/{robot}/full/s{seed}" for robot in ("multi", "panda") for seed in range(3)]
+    results = {name: synthetic.result(name, ("press",), 8) for name in names}
+    make = runpy.run_path(str(synthetic.PAPER.with_name("paper_claims.py")))["make_claims"]
+    tests = make(names, 64, ["pi0"])[4].tests["pi0"]
+    assert [test.measure.split(":")[0] for test in tests] == ["vision", "language", "action"]
+    for test in tests:
+        outcome = claims.judge(test, results)
+        assert outcome.verdict == "holds"
+        assert outcome.estimate.value == pytest.approx(0.2, abs=0.05)
 
 
 @pytest.mark.slow

@@ -1,0 +1,103 @@
+"""Tables show our numbers beside the paper's, and count missing cells."""
+
+import pytest
+
+from lorasp_jax.study import naming, published, tables
+from tests.study import synthetic
+
+NAMES = tuple(cell.name for cell in synthetic.study().cells)
+BOOK = tables.Book(NAMES, synthetic.results())
+
+
+def row(table: str, method: str) -> list[str]:
+    line = next(line for line in table.splitlines() if line.startswith(f"| {method} |"))
+    return [cell.strip() for cell in line.split("|")[1:-1]]
+
+
+def test_success_beside_the_papers():
+    cells = row(tables.table_1(BOOK, "pi0"), "LoRA-MoE, top-1")
+    ours = synthetic.results()
+    pour = [ours[f"pi0/multi/lora_moe_top1/s{seed}"]["outcomes"]["pour"] for seed in range(3)]
+    mean = 100 * sum(o.count("1") for o in pour) / sum(map(len, pour))
+    assert cells[4] == f"{mean:.1f} (13.3)"
+    assert cells[1].endswith("(9.2)")
+    assert cells[2].endswith("(32)")
+    assert cells[-1].endswith("] (23.3)")
+
+
+def test_tasks_keep_the_papers_order():
+    results = dict(synthetic.results())
+    for seed in range(3):
+        name = f"pi0/multi/dora/s{seed}"
+        outcomes = {"open_pot": "1111", "pour": "1110", "press": "1100", "pick_place": "1000"}
+        results[name] = {**results[name], "outcomes": outcomes}
+    cells = row(tables.table_1(tables.Book(NAMES, results), "pi0"), "DoRA, r = 64")
+    assert cells[3:7] == ["100.0", "75.0", "50.0", "25.0"]
+
+
+def test_methods_of_table_1():
+    lines = tables.table_1(BOOK, "smolvla").splitlines()[2:]
+    methods = [line.split("|")[1].strip() for line in lines]
+    assert methods[0] == "LoRA, r = 64"
+    assert methods[5:7] == ["LoRA-SP", "DoRA, r = 64"]
+    assert len(methods) == 9
+
+
+def test_ranks_by_module():
+    cells = row(tables.table_3(BOOK, "smolvla"), "LoRA-SP without spectral loss")
+    assert [cell.split()[-1] for cell in cells[1:4]] == ["(83)", "(107)", "(57)"]
+    assert tables.table_3(BOOK, "pi0") == tables.table_4(BOOK, "pi0") == ""
+
+
+def test_energy_targets_are_in_order():
+    lines = tables.table_4(BOOK, "smolvla").splitlines()[2:]
+    names = ["LoRA-SP, η = 0.5", "LoRA-SP, η = 0.7", "LoRA-SP, η = 0.8", "LoRA-SP"]
+    assert [line.split("|")[1].strip() for line in lines] == [*names, "LoRA-SP, η = 0.99"]
+
+
+def test_pruning():
+    cells = row(tables.pruning(BOOK, "smolvla"), "LoRA-SP, η = 0.7")
+    assert cells[1:3] == ["40 → 25", "5 → 4.2"]
+    assert tables.pruning(BOOK, "pi0") == ""
+
+
+def test_missing_cells():
+    results = {name: r for name, r in synthetic.results().items() if "/dora/s1" not in name}
+    book = tables.Book(NAMES, results)
+    assert row(tables.table_1(book, "pi0"), "DoRA, r = 64")[-1] == "not yet run (1 of 3)"
+    assert row(tables.costs(book, "pi0"), "DoRA, r = 64")[1] == "not yet run (1 of 3)"
+    assert book.missing("pi0/multi/lora_sp", "pi0/multi/dora") == "not yet run (1 of 6)"
+    assert book.missing("pi0/multi/lora_sp") == ""
+    assert book.missing("pi0/panda/full") == "the study has no cells for it yet"
+
+
+def test_costs():
+    cells = row(tables.costs(BOOK, "pi0"), "LoRA, r = 64")
+    assert cells[1:] == ["5.76 M", "2.1", "5.59", "14,000", "110"]
+
+
+def test_best_rate_is_bold():
+    results = dict(synthetic.results())
+    for rate, episodes in (("0.0003", "10"), ("0.001", "11"), ("0.003", "00")):
+        results[f"pi0/pilot/full/{rate}"] = {"outcomes": {"press": episodes}}
+    cells = row(tables.rates(tables.Book(NAMES, results), "pi0"), "full fine-tuning")
+    assert cells[1:] == ["50.0", "**100.0**", "0.0"]
+
+
+@pytest.mark.parametrize(
+    ("prefix", "mean"),
+    [("pi0/multi/lora_sp", 83.3), ("smolvla/single/lora_r64", 91.7), ("pi0/multi/lora_r16", 41.7)],
+)
+def test_the_papers_numbers(prefix, mean):
+    """The means that the paper's text and tables give."""
+    assert 100 * published.rates(prefix, 64).mean() == pytest.approx(mean, abs=0.06)
+
+
+def test_the_paper_has_no_number():
+    assert published.rates("pi0/multi/lora_r2", 64) is None
+    assert published.cell("pi0/multi/dora", 64) == {}
+
+
+def test_every_method_has_a_label():
+    for name in NAMES:
+        assert naming.label(name.split("/")[2], 64)
