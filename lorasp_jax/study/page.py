@@ -24,7 +24,7 @@ _WORDS = {
     "holds": "hold",
     "does not hold": "do not hold",
     "cannot be told": "cannot be told",
-    "not yet run": "have not been run",
+    "not yet run": "await their runs",
 }
 """Verdicts, and the words for several claims."""
 
@@ -187,4 +187,4 @@ def _figure_file(number: int, scheme: str) -> str:
 
 def _total(book: Book) -> str:
     seconds = sum(cell["seconds"]["total"] for cell in book.results.values())
-    return f"All {len(book.results)} finished cells together: {seconds / 3600:.1f} hours."
+    return f"All {len(book.results)} finished runs together: {seconds / 3600:.1f} hours."

@@ -133,10 +133,26 @@ def _mean(paper: Mapping[str, float]) -> float | None:
 
 
 def table_1(book: Book, backbone: str) -> str:
-    """Return Table I: methods, their size, active rank and multi-task success."""
+    """Return Table I: methods, their size, active rank and multi-task success, after the base's."""
     methods = _table_1_methods(book, backbone)
     columns = [("trainable %", _trainable(book)), ("active rank", _rank(book))]
-    return success_table(book, backbone, "multi", methods, columns)
+    table = success_table(book, backbone, "multi", methods, columns)
+    headers, rule, *rows = table.splitlines(keepends=True)
+    base = f"| {' | '.join(_base(book, backbone, len(columns)))} |\n"
+    return "".join([headers, rule, base, *rows])
+
+
+def _base(book: Book, backbone: str, columns: int) -> list[str]:
+    """Return the row of the base before adaptation, from the cell that evaluates it."""
+    prefix = f"{backbone}/multi/"
+    cells = [book.results[n] for n in book.names if n.startswith(prefix) and n in book.results]
+    before = next((cell["before"] for cell in cells if "before" in cell), None)
+    start = ["base, not adapted", *[NONE] * columns]
+    if before is None:
+        return [*start, *[NONE] * len(TASKS), "not yet run (1 of 1)"]
+    rates = {task: 100 * o.count("1") / len(o) for task, o in before.items()}
+    mean = float(np.mean(list(rates.values())))
+    return [*start, *(f"{rates[t]:.1f}" if t in rates else NONE for t in TASKS), f"{mean:.1f}"]
 
 
 def _table_1_methods(book: Book, backbone: str) -> list[str]:

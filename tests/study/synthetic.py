@@ -63,8 +63,10 @@ def result(name: str, tasks: tuple[str, ...], episodes: int) -> dict:
     ranks = scale * (np.array([30, 11, 18]) + rng.normal(0, 0.3, 3))
     towers = dict(zip(naming.TOWERS, ranks, strict=True))
     active = {} if method == "full" else {**towers, "mean": float(np.mean([*towers.values()]))}
+    evaluated = name.endswith("multi/lora_sp/s0")
     return {
         "outcomes": outcomes,
+        **({"before": {task: "0001" for task in tasks}} if evaluated else {}),
         "active_rank": {key: float(value) for key, value in active.items()},
         "trainable_parameters": 90_000 * rank,
         "total_parameters": 9_877_128 + 90_000 * rank,

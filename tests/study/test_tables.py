@@ -36,7 +36,8 @@ def test_tasks_keep_the_papers_order():
 
 
 def test_methods_of_table_1():
-    lines = tables.table_1(BOOK, "smolvla").splitlines()[2:]
+    base, *lines = tables.table_1(BOOK, "smolvla").splitlines()[2:]
+    assert base == "| base, not adapted | – | – | 25.0 | 25.0 | 25.0 | 25.0 | 25.0 |"
     methods = [line.split("|")[1].strip() for line in lines]
     assert methods[0] == "LoRA, r = 64"
     assert methods[5:7] == ["LoRA-SP", "DoRA, r = 64"]
@@ -69,6 +70,11 @@ def test_missing_cells():
     assert book.missing("pi0/multi/lora_sp", "pi0/multi/dora") == "not yet run (1 of 6)"
     assert book.missing("pi0/multi/lora_sp") == ""
     assert book.missing("pi0/panda/full") == "the study has no cells for it yet"
+
+
+def test_base_without_results():
+    cells = row(tables.table_1(tables.Book(NAMES, {}), "pi0"), "base, not adapted")
+    assert cells[-1] == "not yet run (1 of 1)"
 
 
 def test_costs():
