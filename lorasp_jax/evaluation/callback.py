@@ -20,7 +20,9 @@ from envs.state import Poses
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config
 from lorasp_jax.evaluation import video
-from lorasp_jax.evaluation.rollout import Result, compiled_rollout, evaluate
+from lorasp_jax.evaluation.programs import compiled_rollout, prepared
+from lorasp_jax.evaluation.results import Result, evaluate
+from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training import records
 from lorasp_jax.training.demonstrations import map_threads
 from lorasp_jax.training.random_streams import RandomStream
@@ -35,8 +37,8 @@ class Evaluation(Callback):
 
     The first evaluation measures the base, since new adapters leave its outputs unchanged. The
     final evaluation uses other layouts than the earlier ones; both depend only on the seed and the
-    task. All evaluations of a task share one compilation. Videos are rendered in the background
-    during training, in the foreground after it.
+    task. Compiled programs are shared, see `programs.split_rollout`. Videos are rendered in the
+    background during training, in the foreground after it.
     """
 
     def __init__(
@@ -48,8 +50,9 @@ class Evaluation(Callback):
         """Create the callback; nothing compiles until the first evaluation.
 
         Args:
-            compile_rollout: (config, task) -> the task's environment and its jitted rollout.
-            evaluate: evaluates a policy, like `rollout.evaluate`.
+            compile_rollout: (config, task) -> the task's environment and its rollout, whose first
+                call compiles.
+            evaluate: evaluates a policy, like `results.evaluate`.
             write_video: renders an episode's poses and writes the video to a file; None: no videos
                 and images.
         """
@@ -107,7 +110,10 @@ class Evaluation(Callback):
         """
         progress_bars = bars(run.console, "episodes", shown=not episodes)
         with run.timed("evaluate"), progress_bars as progress:
-            evaluate_task = functools.partial(self._evaluate_task, run, when, episodes, progress)
+            policy = prepared(run.policy)  # once for all tasks
+            evaluate_task = functools.partial(
+                self._evaluate_task, run, policy, when, episodes, progress
+            )
             tasks = run.config.tasks
             # Warp is not thread-safe.
             map_tasks = map if physics.default_backend() == "warp" else map_threads
@@ -121,7 +127,7 @@ class Evaluation(Callback):
         return results
 
     def _evaluate_task(
-        self, run: Run, when: str, episodes: int, progress: Progress, task: str
+        self, run: Run, policy: Policy, when: str, episodes: int, progress: Progress, task: str
     ) -> Result:
         episodes = episodes or run.config.evaluation.episodes
         bar = progress.add_task(f"compiling the evaluation of {task} ...", total=episodes)
@@ -140,7 +146,7 @@ class Evaluation(Callback):
             if task not in self._rollouts:
                 self._rollouts[task] = self._compile_rollout(run.config, task)
             env, rollout = self._rollouts[task]
-            return self._evaluate(run.policy, env, key, episodes, rollout=rollout, progress=report)
+            return self._evaluate(policy, env, key, episodes, rollout=rollout, progress=report)
 
 
 class NoEvaluation(Callback):

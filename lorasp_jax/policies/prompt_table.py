@@ -82,15 +82,23 @@ class PromptTable:
             )
         return dataclasses.replace(table, instructions=tuple(instructions))
 
-    def select(self, instructions: Sequence[str]) -> "PromptTable":
-        """Return a table of only these instructions, in this order.
+    def rows(self, instructions: Sequence[str]) -> np.ndarray:
+        """Return the rows of these instructions, `[N]` int32.
 
         Raises:
             ValueError: the table lacks one of them.
         """
         if missing := sorted(set(instructions) - set(self.instructions)):
             raise ValueError(f"the policy has no prompt for {missing[0]!r}")
-        rows = np.array([self.instructions.index(text) for text in instructions])
+        return np.array([self.instructions.index(text) for text in instructions], np.int32)
+
+    def select(self, instructions: Sequence[str]) -> "PromptTable":
+        """Return a table of only these instructions, in this order.
+
+        Raises:
+            ValueError: the table lacks one of them.
+        """
+        rows = self.rows(instructions)
         start = Ids(*(array[rows] for array in self.start))
         return dataclasses.replace(self, start=start, instructions=tuple(instructions))
 

@@ -88,13 +88,13 @@ class Recorder:
         text = prompts.select(env.instructions).instructions[int(state.info["instruction"][0])]
         row = jnp.array([prompts.instructions.index(text)])
         horizon, chunk = self._settings["execute_steps"], jnp.empty(0)
-        keys = jax.random.split(sample_key, -(-env.max_steps // horizon))
         steps = []
         with messages.announce("the policy"):
-            self._call(keys[0], world, env.observe(state), row)
+            self._call(sample_key, world, env.observe(state), row)
         while not state.done[0]:
             call, index = divmod(len(steps), horizon)
-            actions, patches, towers = self._call(keys[call], world, env.observe(state), row)
+            call_key = jax.random.fold_in(sample_key, call)
+            actions, patches, towers = self._call(call_key, world, env.observe(state), row)
             steps.append(jax.tree.map(np.asarray, (Poses.of(state.data), patches, towers)))
             chunk = chunk if index else actions
             state = env.step(state, chunk[:, index])

@@ -18,7 +18,7 @@ from envs.datasets.episodes import Episodes
 from envs.datasets.locks import locked
 from lorasp_jax.config import Config, EvaluationConfig
 from lorasp_jax.evaluation.callback import Evaluation
-from lorasp_jax.evaluation.rollout import compiled_rollout
+from lorasp_jax.evaluation.programs import compiled_rollout
 from lorasp_jax.peft import FullFineTuning
 from lorasp_jax.study.cost import training_cost
 from lorasp_jax.study.held_out import EPISODES, held_out

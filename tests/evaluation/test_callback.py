@@ -11,6 +11,8 @@ from rich.console import Console
 from lorasp_jax.config import EvaluationConfig
 from lorasp_jax.evaluation import Result
 from lorasp_jax.evaluation.callback import Evaluation
+from lorasp_jax.models.sampling import Sampler
+from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training.run import Run
 from tests.runs import CONFIG, random_episodes
 
@@ -22,7 +24,8 @@ def run(tmp_path):
     config = dataclasses.replace(CONFIG, evaluation=settings, optim=optim, log_every=40)
     run = Run(config, tmp_path, Console(file=io.StringIO()), "")
     run.episodes = {task: random_episodes(task, 0) for task in config.tasks}
-    run.policy = cast(Any, None)  # never evaluated
+    unused = cast(Any, None)
+    run.policy = Policy(Sampler([], unused, unused, ()), unused)
     return run
 
 

@@ -3,14 +3,12 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import envs
-from envs.state import Poses
 from lorasp_jax.evaluation import evaluate, make_rollout
-from lorasp_jax.evaluation.rollout import Rollout, _max_rank, _result, _with_prompts
+from lorasp_jax.evaluation.rollout import _max_rank
 from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.prompt_table import PromptTable
@@ -41,7 +39,7 @@ def policy_with(folder, env, targets=CONFIG.targets, **fields):
     ],
 )
 def test_lowers_for(platform, kind, gate, env, tmp_path):
-    policy = _with_prompts(policy_with(tmp_path / "run", env, ("q_proj",)), env)
+    policy = policy_with(tmp_path / "run", env, ("q_proj",))
     device = jax.sharding.AbstractDevice(device_kind=kind, num_cores=None, platform=platform)
     mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
     shapes = jax.eval_shape(lambda: (policy, jax.random.key(0)))
@@ -89,7 +87,7 @@ def test_evaluate(env, tmp_path):
 
 @pytest.mark.slow
 def test_a_sampler_gives_the_same_rollout(env, tmp_path):
-    policy = _with_prompts(policy_with(tmp_path / "run", env), env)
+    policy = policy_with(tmp_path / "run", env)
     rollout = make_rollout(env, execute_steps=4, denoise_steps=1)
     trace = jax.make_jaxpr(rollout, return_shape=True)
     (one, shapes), (other, others) = (
@@ -111,30 +109,3 @@ def test_max_rank(tmp_path):
     lora = make_run(tmp_path / "lora", dataclasses.replace(CONFIG, peft=LoRA(rank=5))).policy
     full = make_run(tmp_path / "full", dataclasses.replace(CONFIG, peft=FullFineTuning())).policy
     assert [_max_rank(policy.with_sampler()) for policy in (lora, full)] == [5, 0]
-
-
-def batch(success, steps, counts):
-    """A rollout with poses world + time / 100."""
-    pose = np.arange(9)[:, None] / 100 + np.arange(len(success))
-    return Rollout(
-        success=jnp.array(success),
-        steps=jnp.array(steps),
-        active_rank={"vision": {"fc1": jnp.array([1.0, 3.0])}},
-        active_rank_histogram={"vision": jnp.array(counts, jnp.int32)},
-        poses=Poses(*(pose,) * 4),
-    )
-
-
-def test_batches_are_aggregated():
-    max_int32 = 2**31 - 1
-    first = batch([False, True, True], [9, 4, 6], [[0, max_int32], [1, max_int32]])
-    second = batch([False, False, False], [9, 9, 9], [[0, 5], [2, 0]])
-    result = _result([first, second])
-    assert (result.success, result.episodes) == (pytest.approx(1 / 3), 6)
-    assert result.outcomes == (False, True, True, False, False, False)
-    assert result.steps == pytest.approx(46 / 6)
-    assert result.active_rank == {"vision": {"fc1": [1.0, 3.0]}}
-    assert result.active_rank_histogram["vision"].tolist() == [3, 2 * max_int32 + 5]
-    np.testing.assert_allclose(result.poses[0], [1.0, 1.01, 1.02, 1.03])  # up to its end
-    assert "poses" not in repr(result)
-    np.testing.assert_allclose(_result([second]).poses[0], np.arange(9) / 100)

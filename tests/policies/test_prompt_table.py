@@ -34,6 +34,7 @@ def test_select_reorders_instructions():
     table = PromptTable.of(words, ["open the lid", *TEXTS], config, num_joints=6)
     subset = PromptTable.of(words, TEXTS[::-1], config, num_joints=6)
     state = jnp.zeros((2, 7))
+    assert table.rows(TEXTS[::-1]).tolist() == [2, 1]
     jax.tree.map(np.testing.assert_array_equal, table.select(TEXTS[::-1]), subset)
     assert (subset.encode(rows, state).ids != table.encode(rows, state).ids).any()
     with pytest.raises(ValueError, match="the policy has no prompt for 'close the lid'"):

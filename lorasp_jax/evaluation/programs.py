@@ -1,0 +1,118 @@
+"""Rollouts from separate programs: tasks share those of a policy, policies those of a task.
+
+Compiling a rollout takes longer than running it, and a jitted `make_rollout` compiles the policy
+again for each task, and the physics again for each method.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+import envs
+from envs.compilation import fast_cpu
+from envs.env import Env
+from envs.state import State
+from lorasp_jax.config import Config
+from lorasp_jax.evaluation.rollout import Rollout, act, as_rollout, num_calls, predict
+from lorasp_jax.models.sampling import Sampler
+from lorasp_jax.policies.policy import Policy
+from lorasp_jax.policies.processor import RawObservation
+from lorasp_jax.training.distributed import mesh as meshes
+
+
+def split_rollout(
+    env: Env, *, execute_steps: int = 5, denoise_steps: int = 10
+) -> Callable[[Policy, jax.Array], Rollout]:
+    """Create a function like a jitted `make_rollout`, with equal results up to rounding.
+
+    One program samples a policy's chunk; it is shared by all environments with as many worlds and
+    equal cameras. Three programs reset, render and step the environment; they are shared by all
+    policies. Several threads may call the function.
+    """
+
+    def rollout(policy: Policy, key: jax.Array) -> Rollout:
+        calls = num_calls(env, policy, execute_steps)
+        rows = policy.processor.prompts.rows(env.instructions)
+        policy, place = _without_names(prepared(policy)), _placement(policy)
+        # Programs are compiled again for arrays placed otherwise, so all follow the keys.
+        reset_key, sample_key = jax.device_put(tuple(jax.random.split(key)), place)
+        state = _reset(env, reset_key)
+        prompts = jax.device_put(rows[np.asarray(state.info["instruction"])], place)
+        records = []
+        for call in range(calls):
+            inputs = (sample_key, np.int32(call), _observe(env, state), prompts, state.done)
+            actions, ranks = _predict()(policy, *inputs, denoise_steps=denoise_steps)
+            actions = jax.device_put(actions, place)
+            state, poses = _act(env, state, actions, execute_steps=execute_steps)
+            records.append((poses, *ranks))
+        state, records = jax.device_get((state, records))
+        return as_rollout(state, *jax.tree.map(lambda *values: np.stack(values), *records))
+
+    return rollout
+
+
+def prepared(policy: Policy) -> Policy:
+    """Return the policy with a sampler, made by one program; for rollouts of several tasks."""
+    if isinstance(policy.model, Sampler):
+        return policy
+    return dataclasses.replace(policy, model=_sampler(policy.model))
+
+
+def compiled_rollout(
+    config: Config, task: str
+) -> tuple[Env, Callable[[Policy, jax.Array], Rollout]]:
+    """Return the environment of a task, shared by all runs of this process, and its rollout."""
+    settings, size = config.evaluation, config.image_size
+    env = _environment(task, config.robot, settings.worlds, size, config.control_dt)
+    steps = {"execute_steps": settings.execute_steps, "denoise_steps": settings.denoise_steps}
+    return env, split_rollout(env, **steps)
+
+
+@functools.cache
+def _environment(task: str, robot: str, worlds: int, image_size: int, control_dt: float) -> Env:
+    return envs.make(
+        task, robot=robot, num_envs=worlds, image_size=image_size, control_dt=control_dt
+    )
+
+
+@jax.jit
+def _sampler(model: Any) -> Any:
+    return model.sampler()
+
+
+@functools.partial(fast_cpu.jit, static_argnums=0)
+def _reset(env: Env, key: jax.Array) -> State:
+    return env.reset(key)
+
+
+@functools.partial(fast_cpu.jit, static_argnums=0)
+def _observe(env: Env, state: State) -> RawObservation:
+    return env.observe(state)
+
+
+_act = fast_cpu.jit(act, static_argnums=0, static_argnames="execute_steps")
+
+
+@functools.cache
+def _predict() -> Callable[..., Any]:
+    """Return the jitted `predict`; not a constant, because its options start JAX's backend."""
+    options = fast_cpu.without_simulation()
+    return jax.jit(predict, static_argnames="denoise_steps", compiler_options=options)
+
+
+def _without_names(policy: Policy) -> Policy:
+    """Drop the instructions, which are static, so that policies for other tasks look the same."""
+    prompts = dataclasses.replace(policy.processor.prompts, instructions=())
+    return Policy(policy.model, dataclasses.replace(policy.processor, prompts=prompts))
+
+
+def _placement(policy: Policy) -> Any:
+    """Return the policy's device, or its mesh with everything replicated."""
+    sharding = jax.tree.leaves(policy.model)[0].sharding
+    if len(sharding.device_set) == 1:
+        return jax.sharding.SingleDeviceSharding(*sharding.device_set)
+    return meshes.replicated(sharding.mesh)

@@ -1,0 +1,114 @@
+"""Success of a policy on a task, measured in closed loop."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+
+from envs.env import Env
+from envs.state import Poses
+from lorasp_jax.evaluation import metrics
+from lorasp_jax.evaluation.programs import split_rollout
+from lorasp_jax.evaluation.rollout import RECORDED_WORLDS, Rollout
+from lorasp_jax.policies.policy import Policy
+
+
+@dataclass(frozen=True)
+class Result:
+    """Closed-loop success of a policy on one task.
+
+    Attributes:
+        success: fraction of successful episodes.
+        episodes: number of episodes.
+        ci95: 95 % Wilson interval of the success rate.
+        outcomes: success of each episode, in the order of the layouts that the key draws.
+        steps: mean control steps per episode.
+        active_rank: mean active ranks by tower and linear layer, each a list over stacked layers.
+        active_rank_histogram: `[R + 1]` int64 per tower, the sum of `metrics.rank_histogram` over
+            all policy calls.
+        poses: poses of one recorded episode, a successful one if possible; the leading axis is
+            time.
+    """
+
+    success: float
+    episodes: int
+    ci95: tuple[float, float]
+    outcomes: tuple[bool, ...]
+    steps: float
+    active_rank: dict[str, dict[str, list[float]]]
+    active_rank_histogram: dict[str, np.ndarray]
+    poses: Poses = dataclasses.field(repr=False)
+
+
+def evaluate(
+    policy: Policy,
+    env: Env,
+    key: jax.Array,
+    num_episodes: int = 256,
+    *,
+    rollout: Callable[[Policy, jax.Array], Rollout] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Result:
+    """Measure the success rate of `policy` on the task of `env`.
+
+    Args:
+        policy: policy for the robot of `env`, with prompts for `env.instructions`.
+        env: environment; `num_envs` episodes run in parallel.
+        key: PRNG key of the layouts and the sampled actions.
+        num_episodes: a multiple of `env.num_envs`.
+        rollout: (policy, key) -> `Rollout`, such as a jitted `make_rollout(env)` with other
+            settings; None uses `programs.split_rollout`, which compiles less often.
+        progress: called with (completed, total) episodes.
+
+    Raises:
+        ValueError: `num_episodes` is not a positive multiple of `env.num_envs`, or the policy has
+            no prompt for one of the instructions.
+    """
+    batches, rest = divmod(num_episodes, env.num_envs)
+    if rest or batches < 1:
+        raise ValueError(
+            f"num_episodes must be a positive multiple of {env.num_envs}, got {num_episodes}"
+        )
+    rollout = rollout or split_rollout(env)
+    runs: list[Rollout] = []
+    for batch_key in jax.random.split(key, batches):
+        runs.append(jax.block_until_ready(rollout(policy, batch_key)))
+        if progress:
+            progress(len(runs) * env.num_envs, num_episodes)
+    return _result(runs)
+
+
+def _result(runs: Sequence[Rollout]) -> Result:
+    """Aggregate batches of episodes."""
+    success = np.concatenate([run.success for run in runs])
+    successes, episodes = int(success.sum()), len(success)
+    histograms = [run.active_rank_histogram for run in runs]
+    return Result(
+        success=successes / episodes,
+        episodes=episodes,
+        ci95=metrics.wilson_interval(successes, episodes),
+        outcomes=tuple(success.tolist()),
+        steps=float(np.mean([run.steps for run in runs])),
+        active_rank=jax.tree.map(
+            lambda *means: np.mean(means, axis=0).tolist(), *map(_mean_ranks, runs)
+        ),
+        # int64: token counts over all policy calls can overflow 32 bits.
+        active_rank_histogram=jax.tree.map(
+            lambda *counts: np.sum(counts, axis=(0, 1), dtype=np.int64), *histograms
+        ),
+        poses=_recorded_episode(runs[0]),
+    )
+
+
+def _mean_ranks(run: Rollout) -> metrics.LayerRanks:
+    """Average active ranks over the policy calls, weighted by the number of unfinished worlds."""
+    weights = np.asarray(run.running) / max(np.sum(run.running), 1)
+    return jax.tree.map(lambda ranks: np.tensordot(weights, ranks, axes=1), run.active_rank)
+
+
+def _recorded_episode(run: Rollout) -> Poses:
+    """Return one episode's poses: of the first recorded world that succeeds, or else of world 0."""
+    world = int(np.argmax(run.success[:RECORDED_WORLDS]))
+    return jax.tree.map(lambda x: x[: max(int(run.steps[world]), 1), world], run.poses)

@@ -1,0 +1,189 @@
+"""Rollouts from separate programs: equal to those of one program, and compiled only once."""
+
+import contextlib
+import dataclasses
+from dataclasses import field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+from jax import monitoring
+
+from envs.compilation import fast_cpu
+from envs.compilation.alarms import COMPILATION
+from envs.state import Data, State
+from lorasp_jax import models
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.config import EvaluationConfig
+from lorasp_jax.evaluation import make_rollout
+from lorasp_jax.evaluation.programs import compiled_rollout, prepared, split_rollout
+from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.peft import Aux, LoRA, LoRASP, Method
+from lorasp_jax.policies import statistics_files
+from lorasp_jax.policies.policy import Policy
+from lorasp_jax.policies.processor import Processor
+from lorasp_jax.policies.prompt_table import PromptTable
+from lorasp_jax.policies.statistics import Statistics
+from lorasp_jax.policies.tokenizer import Offline
+from lorasp_jax.training.demonstrations import map_threads
+from lorasp_jax.training.distributed import mesh as meshes
+from tests import ROOT
+from tests.runs import CONFIG
+
+POLICY = {"_sampler": 1, "predict": 1}
+WORLD = ("_reset", "_observe", "act")
+
+
+@contextlib.contextmanager
+def compilations():
+    """Count the programs of an evaluation that are compiled in this block, by name."""
+    counts = {}
+
+    def listen(event, duration, fun_name="", **_):
+        name = fun_name.removeprefix("jit(").removesuffix(")")
+        if event == COMPILATION and name in {*POLICY, *WORLD}:
+            counts[name] = counts.get(name, 0) + 1
+
+    monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield counts
+    finally:
+        monitoring.unregister_event_duration_listener(listen)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Room:
+    """An environment without physics: a world succeeds when its first joint angle exceeds 1."""
+
+    instructions: tuple[str, ...]
+    max_steps: int
+    num_envs: int = 16
+
+    def reset(self, key, ranges=None):
+        assert ranges is None
+        zero = jnp.zeros(self.num_envs)
+        pose = jnp.zeros((self.num_envs, 2, 3))
+        info = {
+            "success": zero > 0,
+            "steps": zero.astype(jnp.int32),
+            "instruction": jax.random.randint(key, (self.num_envs,), 0, len(self.instructions)),
+        }
+        state = jax.random.normal(key, (self.num_envs, 7))
+        data = Data(**{f.name: pose for f in dataclasses.fields(Data)})
+        return State(data.replace(qpos=state), zero, zero > 0, {}, info)
+
+    def observe(self, state):
+        image = jnp.full((self.num_envs, 32, 32, 3), 100, jnp.uint8)
+        return {"image": {"side": image, "wrist": image}, "state": state.data.qpos}
+
+    def step(self, state, action):
+        qpos = state.data.qpos + 0.1 * action
+        success = state.info["success"] | (qpos[:, 0] > 1)
+        steps = state.info["steps"] + ~success
+        info = state.info | {"success": success, "steps": steps}
+        data = state.data.replace(qpos=qpos)
+        return State(data, state.reward, success | (steps >= self.max_steps), {}, info)
+
+
+ROOMS = Room(("open it", "close it"), 6), Room(("wait", "walk", "go"), 9)
+TABLE = PromptTable.of(
+    Offline(), [t for room in ROOMS for t in room.instructions], Pi0Config.dummy(), num_joints=6
+)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """A random policy whose actions and active rank depend on the prompt."""
+
+    weight: jax.Array
+    methods: tuple[Method, ...] = field(metadata={"static": True})
+    config: Pi0Config = field(default=Pi0Config.dummy(), metadata={"static": True})
+
+    def sampler(self):
+        return self
+
+    def sample_actions(self, key, obs, *, num_steps, slots, return_aux):
+        assert return_aux
+        noise = jax.random.normal(key, (len(obs.state), self.config.chunk, slots.size))
+        prompt = jnp.sum(obs.tokens * obs.token_mask, 1) % 5
+        actions = noise * self.weight[0] / num_steps + prompt[:, None, None] - 2
+        rank = prompt[None, :, None].astype(jnp.float32)
+        return jnp.where(slots, actions, 0), {"vision": {"fc1": Aux(rank, token_mask=rank >= 0)}}
+
+
+def policy(weight=0.5, method=CONFIG.peft, devices=1):
+    """A policy placed as in training, sharded over the devices."""
+    data = np.random.default_rng(0).normal(size=(9, 7))
+    statistics = Statistics.measure(data, data, np.ones(9, bool), slots=range(7), dim=8)
+    processor = Processor.of(Pi0Config.dummy(), statistics, TABLE, num_joints=6)
+    mesh = meshes.make_mesh(devices, jax.devices()[:devices])
+    weights = jnp.full((len(data), 8), weight)
+    weights = jax.device_put(weights, meshes.shardings(weights, mesh, minimum=0))
+    return Policy(Model(weights, (method,)), processor)
+
+
+def assert_equal(one, other):
+    for name in ("success", "steps", "running"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), name)
+    for name in ("active_rank", "poses"):
+        pair = getattr(one, name), getattr(other, name)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-3), *pair)
+    pair = one.active_rank_histogram, other.active_rank_histogram
+    jax.tree.map(np.testing.assert_array_equal, *pair)
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_both_forms_are_equal(room):
+    settings, key = {"execute_steps": 3, "denoise_steps": 2}, jax.random.key(3)
+    split = split_rollout(room, **settings)(policy(), key)
+    assert_equal(split, jax.jit(make_rollout(room, **settings))(policy(), key))
+    assert set(np.unique(split.success)) == {False, True}
+    assert split.running[0] == 16 > split.running[-1]
+
+
+@pytest.mark.parametrize("devices", [1, 2])
+def test_tasks_share_the_policy_and_methods_the_tasks(devices):
+    rooms = [dataclasses.replace(room) for room in ROOMS]
+    rollouts = [split_rollout(room, execute_steps=3, denoise_steps=1) for room in rooms]
+
+    def run(policy):
+        with compilations() as counts:
+            policy = prepared(policy)
+            map_threads(lambda rollout: rollout(policy, jax.random.key(3)), rollouts)
+        return counts
+
+    one, other = LoRA(rank=2), LoRA(rank=3)
+    assert run(policy(0.5, one, devices)) == POLICY | dict.fromkeys(WORLD, 2)
+    assert run(policy(0.25, one, devices)) == {}
+    assert run(policy(0.25, other, devices)) == POLICY
+
+
+@pytest.mark.slow
+def test_both_forms_are_equal_in_simulation():
+    """The base on its own robot, with tasks of different lengths and instructions."""
+    settings = EvaluationConfig(episodes=8, num_envs=8, denoise_steps=4)
+    config = dataclasses.replace(CONFIG, robot="panda", image_size=64, evaluation=settings)
+    folder = ROOT / "assets" / "pi0_nano"
+    model = models.load(folder)
+    rules = [("q_proj", LoRASP(rank=8, hidden_width=8))]
+    model = adaptation.adapt(model, rules, rngs=nnx.Rngs(0))
+    key = jax.random.key(5)
+    with compilations() as counts:
+        pairs = [compiled_rollout(config, task) for task in ("press", "open_pot")]
+        texts = [text for env, _ in pairs for text in env.instructions]
+        prompts = PromptTable.of(Offline(), texts, model.config, num_joints=7)
+        statistics = statistics_files.read(folder)
+        base = Policy(model, Processor.of(model.config, statistics, prompts, num_joints=7))
+        splits = map_threads(lambda rollout: rollout(prepared(base), key), [r for _, r in pairs])
+        pairs[0][1](base, jax.random.key(6))
+    assert counts == POLICY | dict.fromkeys(WORLD, 2)
+    assert compiled_rollout(config, "press")[0] is pairs[0][0]
+    env, split = pairs[0][0], splits[0]
+    whole = fast_cpu.jit(make_rollout(env, denoise_steps=4))(base, key)
+    assert split.success.any()
+    assert split.success.tolist() == whole.success.tolist()
+    pair = split.active_rank, whole.active_rank
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a[0], b[0], atol=0.05), *pair)
