@@ -88,9 +88,9 @@ class Recorder:
         text = prompts.select(env.instructions).instructions[int(state.info["instruction"][0])]
         row = jnp.array([prompts.instructions.index(text)])
         horizon, chunk = self._settings["execute_steps"], jnp.empty(0)
-        steps = []
+        steps, observation = [], env.observe(state)
         with messages.announce("the policy"):
-            self._call(sample_key, world, env.observe(state), row)
+            self._call(sample_key, world, observation, row)
         while not state.done[0]:
             call, index = divmod(len(steps), horizon)
             call_key = jax.random.fold_in(sample_key, call)
