@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from lorasp_jax.report.html import speed, success_cell, write_report
+from lorasp_jax.report.html import phases, speed, success_cell, write_report
 from lorasp_jax.training import records
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import STOPPED, read_json, read_metrics, write_json
@@ -90,6 +90,6 @@ def final_table(folder: Path) -> Table:
     for label, value in {**ranks, "trainable parameters": trainable, **speed(rows)}.items():
         table.add_row(label, "", value)
     table.add_section()
-    for phase, seconds in results["seconds"].items():
+    for phase, seconds in phases(results["seconds"]).items():
         table.add_row(f"time, {phase}", "", f"{seconds:,.0f} s")
     return table

@@ -3,7 +3,7 @@
 import base64
 import html
 import json
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -77,7 +77,9 @@ def write_report(folder: Path) -> Path:
         *_active_rank(results, rows, config["peft"].get("rank")),
         *_media(folder, [t for t in results["tasks"] if finished or _video(folder, t).exists()]),
         "<h2>Time</h2>",
-        _table(("phase", "seconds"), ((k, f"{v:.1f}") for k, v in results["seconds"].items())),
+        _table(
+            ("phase", "seconds"), ((k, f"{v:.1f}") for k, v in phases(results["seconds"]).items())
+        ),
         "<h2>Settings</h2>",
         f"<pre>{html.escape(json.dumps(config, indent=2))}</pre>",
     ]
@@ -91,6 +93,13 @@ def write_report(folder: Path) -> Path:
     path = folder / "report.html"
     write_text(path, page)
     return path
+
+
+def phases(seconds: Mapping[str, float]) -> dict[str, float]:
+    """Return the time per phase [s], the total last; "other" is mostly imports."""
+    timed = {phase: value for phase, value in seconds.items() if phase != "total"}
+    total = seconds.get("total", sum(timed.values()))
+    return {**timed, "other": max(total - sum(timed.values()), 0.0), "total": total}
 
 
 def _unfinished(folder: Path) -> dict[str, Any]:

@@ -42,6 +42,7 @@ def test_report_is_updated(run):
     assert cells["active rank, mean"][1] == "3.1"
     assert cells["trainable parameters"][1] == "10 of 1,000"
     assert cells["time, total"][1] == "7 s"
+    assert "time, other" in cells
 
 
 def test_table_keeps_numbers_on_one_line(folder):  # noqa: F811
