@@ -11,8 +11,8 @@ from rich.console import Console
 
 from envs.cli.errors import INTERRUPTED, REFUSED, parse_arguments, report_error
 from lorasp_jax.study import listing, results
-from lorasp_jax.study.status import BROKEN, Board, State, clear_failure, results_of, tidy
-from lorasp_jax.study.study import load, select
+from lorasp_jax.study.status import BROKEN, Board, State, Status, clear_failure, results_of, tidy
+from lorasp_jax.study.study import Study, load, select
 
 SCALES = ("smoke", "accelerator")
 
@@ -74,12 +74,24 @@ def _execute(options: argparse.Namespace, console: Console) -> int:
     if any(statuses[name].state is State.RUNNABLE for name in names):
         _run(options, folder, names, console)
         statuses = board.read()
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / results.RESULTS_FILE
-    results.write(path, study.name, results_of(statuses, statuses))
+    path = _write(study, folder, statuses)
     _print(console, *listing.problems(names, statuses))
-    _print(console, listing.totals(study, names, statuses), f"results: {path}")
+    _print(console, listing.totals(study, names, statuses), f"see {path}")
     return REFUSED if any(statuses[name].state in BROKEN for name in names) else 0
+
+
+def _write(study: Study, folder: Path, statuses: dict[str, Status]) -> Path:
+    """Write the results of all finished cells and, if the study has claims, the page on them."""
+    path = folder / results.RESULTS_FILE
+    folder.mkdir(parents=True, exist_ok=True)
+    results.write(path, study.name, results_of(statuses, statuses))
+    if not study.claims:
+        return path
+    from lorasp_jax.study import page
+
+    (folder / "figures").mkdir(exist_ok=True)
+    page.write(study, results.load(path), folder)
+    return folder / "study.md"
 
 
 def _print(console: Console, *lines: str) -> None:

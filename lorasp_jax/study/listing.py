@@ -18,7 +18,9 @@ def dry_run_table(study: Study, names: Collection[str], statuses: Mapping[str, S
 
     Settings that depend on results which do not exist yet are shown as "?".
     """
-    table = Table("cell", "method", title=f"study {study.name}")
+    table = Table(title=f"study {study.name}")
+    table.add_column("cell", min_width=max(map(len, names), default=0))
+    table.add_column("method")
     for column in ("steps", "trainable"):
         table.add_column(column, justify="right")
     table.add_column("state")

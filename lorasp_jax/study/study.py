@@ -16,7 +16,10 @@ if TYPE_CHECKING:  # a run of a finished study should load no model code
 
 Results: TypeAlias = Mapping[str, Mapping[str, Any]]
 """The content of cell.json by cell name."""
-RESERVED = ("demonstrations", "groups", "held_out", "logs", "results.json")
+RESERVED = (
+    *("demonstrations", "held_out", "groups", "logs"),
+    *("results.json", "study.md", "figures"),
+)
 """What a study's folder contains besides the folders of cells."""
 _PART = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._+=-]*")
 
