@@ -16,10 +16,8 @@ from rich.console import Console
 from envs.compilation import cache
 from envs.datasets.episodes import Episodes
 from envs.datasets.locks import locked
-from lorasp_jax.config import Config, EvaluationConfig
+from lorasp_jax.config import Config
 from lorasp_jax.evaluation.callback import Evaluation
-from lorasp_jax.evaluation.programs import compiled_rollout
-from lorasp_jax.peft import FullFineTuning
 from lorasp_jax.study.cost import training_cost
 from lorasp_jax.study.held_out import EPISODES, held_out
 from lorasp_jax.study.measures import measures
@@ -56,7 +54,7 @@ def _train(job: Job) -> dict[str, Any]:
     collect = functools.partial(shared_demonstrations, job.study_folder)
     with open_run(job.config, job.folder.parent, resume="auto"):
         run = setup.prepare(job.config, job.folder, console, started, collect=collect)
-        loop.train(run, [Export(), _evaluation()], resume=True)
+        loop.train(run, [Export(), Evaluation(write_video=None)], resume=True)
         with run.timed("measure"):
             base = base_model(job.config)[0] if job.config.peft.trains_base else None
             episodes = held_out_demonstrations(job.study_folder, run.config)
@@ -73,7 +71,7 @@ def _derive(job: Job) -> dict[str, Any]:
         source = load_policy(job.study_folder / job.cell.source)
         run.episodes = held_out_demonstrations(job.study_folder, run.config)
         run.policy = job.cell.transform(source, job.results, run.episodes)
-    _evaluation().on_end(run)
+    Evaluation(write_video=None).on_end(run)
     with run.timed("measure"):
         measured = measures(run.policy, run.episodes, source=source)
     return {**_results(run), "speed": {}, "measures": measured}
@@ -141,29 +139,3 @@ def _shared(
 def _alone(file: Path) -> contextlib.AbstractContextManager[None]:
     """Let one process at a time make a file; nobody waits once it exists."""
     return contextlib.nullcontext() if file.exists() else locked(file, waiting=lambda: None)
-
-
-def _evaluation() -> Evaluation:
-    """Return an evaluation without videos, which shares compiled rollouts with other cells."""
-    return Evaluation(compile_rollout=_shared_rollout, write_video=None)
-
-
-def _shared_rollout(config: Config, task: str) -> Any:
-    """Return environment and compiled rollout, shared by all cells of this process."""
-    return _rollout(config.robot, config.image_size, config.control_dt, config.evaluation, task)
-
-
-@functools.cache
-def _rollout(
-    robot: str, image_size: int, control_dt: float, evaluation: EvaluationConfig, task: str
-) -> Any:
-    config = Config(
-        name="any",
-        scale="smoke",
-        peft=FullFineTuning(),
-        robot=robot,
-        image_size=image_size,
-        control_dt=control_dt,
-        evaluation=evaluation,
-    )
-    return compiled_rollout(config, task)
