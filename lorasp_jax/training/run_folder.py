@@ -164,7 +164,11 @@ def changed_settings(recorded: Mapping[str, Any], current: Mapping[str, Any]) ->
 
     The recorded one may have been written by an earlier version.
     """
-    return _differences({**recorded, "peft": upgrade(recorded["peft"])}, current)
+    earlier = {
+        "peft": upgrade(recorded["peft"]),
+        "evaluation": {"before": True, **recorded.get("evaluation", {})},  # every run did
+    }
+    return _differences({**recorded, **earlier}, current)
 
 
 def _differences(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> list[str]:
