@@ -62,7 +62,7 @@ def call_milliseconds(policy: Policy, episodes: Episodes) -> float:
     images = {name: jnp.asarray(image[0, :1]) for name, image in episodes.image.items()}
     observation = {"image": images, "state": jnp.asarray(episodes.state[0, :1])}
     phrase = episodes.instructions[int(episodes.instruction[0])]
-    row = jnp.array([policy.processor.prompts.instructions.index(phrase)])
+    row = jnp.array(policy.processor.prompts.rows([phrase]))
     arguments = policy, jax.random.key(0), observation, row
     jax.block_until_ready(_sample(*arguments))  # compiles
     times = []

@@ -47,10 +47,9 @@ def sampler(policy: Policy, episodes: Episodes, batch_size: int) -> Sample:
         ValueError: the policy has no prompt for one of the instructions.
     """
     processor, chunk = policy.processor, policy.model.config.chunk
-    processor.prompts.select(episodes.instructions)  # raises
-    rows = np.array([processor.prompts.instructions.index(p) for p in episodes.instructions])
+    rows = processor.prompts.rows(episodes.instructions)
     steps = jax.device_get(flatten([episodes]))
-    steps = dataclasses.replace(steps, instruction=rows[steps.instruction].astype(np.int32))
+    steps = dataclasses.replace(steps, instruction=rows[steps.instruction])
 
     def sample(key: jax.Array) -> Batch:
         start_key, noise_key = jax.random.split(key)
