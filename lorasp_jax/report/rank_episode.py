@@ -84,9 +84,9 @@ class Recorder:
         reset_key, sample_key = jax.random.split(key)
         worlds = dataclasses.replace(env, num_envs=self._worlds).reset(reset_key)
         state: State = jax.tree.map(lambda x: x[world : world + 1], worlds)
-        prompts = self._policy.processor.prompts
-        text = prompts.select(env.instructions).instructions[int(state.info["instruction"][0])]
-        row = jnp.array([prompts.instructions.index(text)])
+        instruction = int(state.info["instruction"][0])
+        rows = self._policy.processor.prompts.rows(env.instructions)
+        row = jnp.array(rows[[instruction]])
         horizon, chunk = self._settings["execute_steps"], jnp.empty(0)
         steps, observation = [], env.observe(state)
         with messages.announce("the policy"):
@@ -100,6 +100,7 @@ class Recorder:
             state = env.step(state, chunk[:, index])
         poses, patches, towers = jax.tree.map(lambda *x: np.stack(x), *steps)
         poses = jax.tree.map(lambda x: x[:, 0], poses)
+        text = env.instructions[instruction]
         return Episode(text, bool(state.info["success"][0]), poses, patches, towers)
 
     def _call(
