@@ -12,7 +12,7 @@ from rich.console import Console
 from envs.cli.errors import INTERRUPTED, REFUSED, parse_arguments, report_error
 from lorasp_jax.study import listing, results
 from lorasp_jax.study.status import BROKEN, Board, State, Status, clear_failure, results_of, tidy
-from lorasp_jax.study.study import Study, load, select
+from lorasp_jax.study.study import Study, select
 
 SCALES = ("smoke", "accelerator")
 
@@ -46,18 +46,21 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--jobs", type=_positive, default=1, metavar="N", help="processes that share the device")
     add("--shard", type=_shard, default=(1, 1), metavar="I/N", help="run the I-th of N parts")
     add("--dry-run", action="store_true", help="list the cells, then exit")
+    add("--no-run", action="store_true", help="run no cell, but write results and page")
     add(
         "--out",
         type=Path,
         default=Path("runs"),
         help="parent of the study's folder (default: runs)",
     )
+    text = "results to start from; all results are written there, and the page beside it"
+    add("--results", type=Path, metavar="FILE", help=text)
     return parser
 
 
 def _execute(options: argparse.Namespace, console: Console) -> int:
     """List or run the selected cells, then write the results of all finished ones."""
-    study = load(options.config, options.scale)
+    study = results.load_study(options.config, options.scale, options.results)
     folder, names = options.out / study.name, select(study, options.only, options.shard)
     board = Board(study, folder)
     if options.dry_run:
@@ -65,33 +68,34 @@ def _execute(options: argparse.Namespace, console: Console) -> int:
         console.print(listing.dry_run_table(study, names, statuses))
         _print(console, listing.totals(study, names, statuses))
         return 0
-    for name in names:
-        clear_failure(folder / name)
+    if not options.no_run:
+        _run(options, board, folder, names, console)
     statuses = board.read()
-    for name in names:
-        if statuses[name].state is State.FINISHED:
-            tidy(folder / name)  # the last process may have been killed before it did
-    if any(statuses[name].state is State.RUNNABLE for name in names):
-        _run(options, folder, names, console)
-        statuses = board.read()
-    path = _write(study, folder, statuses)
     _print(console, *listing.problems(names, statuses))
+    path = _write(study, options.results or folder / results.RESULTS_FILE, statuses)
     _print(console, listing.totals(study, names, statuses), f"see {path}")
     return REFUSED if any(statuses[name].state in BROKEN for name in names) else 0
 
 
-def _write(study: Study, folder: Path, statuses: dict[str, Status]) -> Path:
-    """Write the results of all finished cells and, if the study has claims, the page on them."""
-    path = folder / results.RESULTS_FILE
-    folder.mkdir(parents=True, exist_ok=True)
-    results.write(path, study.name, results_of(statuses, statuses))
+def _write(study: Study, path: Path, statuses: dict[str, Status]) -> Path:
+    """Write the results of all finished cells and, if the study has claims, the page on them.
+
+    Raises:
+        ValueError: results that the study started from would be lost.
+    """
+    found = results_of(statuses, statuses)
+    for name in sorted(study.finished.keys() - found.keys()):
+        why = f"is {statuses[name].state}" if name in statuses else "is not in the study"
+        raise ValueError(f"{path} is left as it is: it has results of {name}, which {why}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    results.write(path, study.name, found)
     if not study.claims:
         return path
     from lorasp_jax.study import page
 
-    (folder / "figures").mkdir(exist_ok=True)
-    page.write(study, results.load(path), folder)
-    return folder / "study.md"
+    (path.parent / "figures").mkdir(exist_ok=True)
+    page.write(study, results.load(path), path.parent)
+    return path.parent / "study.md"
 
 
 def _print(console: Console, *lines: str) -> None:
@@ -99,13 +103,25 @@ def _print(console: Console, *lines: str) -> None:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
-def _run(options: argparse.Namespace, folder: Path, names: list[str], console: Console) -> None:
-    """Run cells in worker processes."""
+def _run(
+    options: argparse.Namespace, board: Board, folder: Path, names: list[str], console: Console
+) -> None:
+    """Run cells in worker processes, failed ones once more."""
+    for name in names:
+        clear_failure(folder / name)
+    statuses = board.read()
+    for name in names:
+        if statuses[name].state is State.FINISHED:
+            tidy(folder / name)  # the last process may have been killed before it did
+    if all(statuses[name].state is not State.RUNNABLE for name in names):
+        return
     from lorasp_jax.study.workers import Workers
 
     if options.jobs > 1:  # otherwise the first process takes most of the device's memory
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    load_study = functools.partial(load, options.config, options.scale)
+    load_study = functools.partial(
+        results.load_study, options.config, options.scale, options.results
+    )
     Workers(load_study, folder, names, console).run(options.jobs)
 
 

@@ -1,5 +1,6 @@
 """All results of a study in one small file, from which tables, figures and page are made."""
 
+import dataclasses
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -11,6 +12,8 @@ from envs.datasets.writing import write_text
 from lorasp_jax.storage.digest import verify_digest, with_digest
 from lorasp_jax.storage.json_values import check
 from lorasp_jax.study.status import SCHEMA
+from lorasp_jax.study.study import Study
+from lorasp_jax.study.study import load as load_file
 
 RESULTS_FILE = "results.json"
 MAX_BYTES = 2_000_000
@@ -48,15 +51,28 @@ def write(path: Path, study: str, results: Mapping[str, Mapping[str, Any]]) -> N
     write_text(path, text)
 
 
-def load(path: Path) -> dict[str, dict[str, Any]]:
+def load_study(config: Path, scale: str, path: Path | None) -> Study:
+    """Load the study that a file defines; it starts from the results in `path`, if given.
+
+    Raises:
+        ValueError: see `study.load` and `load`.
+    """
+    study = load_file(config, scale)
+    return dataclasses.replace(study, finished=load(path, study.name)) if path else study
+
+
+def load(path: Path, study: str = "") -> dict[str, dict[str, Any]]:
     """Read the results of all cells, by cell name, from a file of `write`.
 
     Raises:
-        ValueError: the file does not exist or is damaged.
+        ValueError: the file does not exist, is damaged or, if `study` is given, has the results of
+            another study.
     """
     with as_value_error(path, remedy=": restore it, or run the study again"):
         content = verify_digest(json.loads(read_bytes(path)))
         check(content, {"study": str, "common": {}, "cells": {str: {"config": {}}}})
+        if study and content["study"] != study:
+            raise ValueError(f"it has the results of {content['study']}, not of {study}")
         results = {
             name: {**cell, "config": _nested({**content["common"], **cell["config"]})}
             for name, cell in content["cells"].items()

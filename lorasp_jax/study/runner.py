@@ -6,6 +6,7 @@ each other, and a killed one loses at most the steps since its last checkpoint.
 """
 
 import contextlib
+import functools
 import time
 import traceback
 from collections.abc import Callable, Collection, Iterator
@@ -77,28 +78,41 @@ def work(
         if not groups:
             return
         # The first group that is free; then look again, because it may have enabled earlier ones.
-        if not any(_run_group(board, folder, *item, run_cell, report) for item in groups.items()):
+        run_group = functools.partial(_run_group, study, board, folder, run_cell, report)
+        if not any(run_group(*item) for item in groups.items()):
             time.sleep(poll)
 
 
 def _run_group(
+    study: Study,
     board: Board,
     folder: Path,
-    group: str,
-    cells: list[Cell | Derived],
     run_cell: RunCell,
     report: Report,
+    group: str,
+    cells: list[Cell | Derived],
 ) -> bool:
     """Run what can run in a group; return False if another worker has claimed the group."""
     with _claimed(folder, group) as claimed:
         for cell in cells if claimed else ():
-            statuses = board.read()  # another worker may have run the cell meanwhile
-            current = statuses[cell.name]
-            if current.state is State.RUNNABLE:
-                assert current.config is not None
-                results = status.results_of(cell.needs, statuses)
-                run_one(Job(cell, current.config, folder, results), run_cell, report)
+            for due in _due(study, folder, cell):
+                statuses = board.read()  # another worker may have run the cell meanwhile
+                if statuses[cell.name].state is State.RUNNABLE:
+                    config = statuses[due.name].config
+                    assert config is not None
+                    results = status.results_of(due.needs, statuses)
+                    run_one(Job(due, config, folder, results), run_cell, report)
         return claimed
+
+
+def _due(study: Study, folder: Path, cell: Cell | Derived) -> list[Cell | Derived]:
+    """Return a cell, after the sources that must run again because no policy of theirs is here.
+
+    That is so if the study started from a file of results.
+    """
+    if not isinstance(cell, Derived) or (folder / cell.source / status.CELL_FILE).exists():
+        return [cell]
+    return [*_due(study, folder, study[cell.source]), cell]
 
 
 def run_one(job: Job, run_cell: RunCell, report: Report) -> None:

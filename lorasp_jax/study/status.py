@@ -59,7 +59,7 @@ class Status:
         reason: why the cell does not run or is not finished, on one line.
         config: the config of the cell's run, or of its source's; None if it depends on results that
             do not exist yet.
-        result: content of cell.json if the cell is finished.
+        result: content of cell.json if the cell is finished, or what the study starts from.
     """
 
     state: State
@@ -93,7 +93,8 @@ class Board:
             ValueError: a file is damaged.
         """
         folder = self._folder / cell.name
-        result = self._read(folder / CELL_FILE, SCHEMA)
+        own = self._read(folder / CELL_FILE, SCHEMA)
+        result = own or {**self._study.finished.get(cell.name, {})}
         # A finished cell whose own settings are unknown counts as unfinished, too.
         unfinished = [
             name
@@ -112,10 +113,10 @@ class Board:
         recorded = result["config"] if result else self._read(folder / CONFIG_FILE, records.CONFIG)
         if recorded and (changed := changed_settings(recorded, describe_config(cell, config))):
             return Status(State.CHANGED, f"it was run with other {', '.join(changed)}", config)
+        if not own and (failure := _failure(folder)):
+            return Status(State.FAILED, failure, config, result or None)
         if result:
             return Status(State.FINISHED, "", config, result)
-        if failure := _failure(folder):
-            return Status(State.FAILED, failure, config)
         return Status(State.RUNNABLE, "", config)
 
     def _config(self, cell: Cell | Derived, others: dict[str, Status]) -> Config:

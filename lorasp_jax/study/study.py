@@ -3,7 +3,7 @@
 import fnmatch
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -81,11 +81,14 @@ class Study:
         name: the study's folder in the folder of all runs.
         cells: every cell; each comes after those that it needs.
         claims: the claims to test, decided before the cells run (see `study.claims`).
+        finished: results that the study starts from; these cells run only if a derived cell needs
+            their policies.
     """
 
     name: str
     cells: tuple[Cell | Derived, ...]
     claims: tuple[Any, ...] = ()
+    finished: Results = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Validate names and order.

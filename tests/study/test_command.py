@@ -1,5 +1,6 @@
 import json
 import re
+import shutil
 import subprocess
 import sys
 
@@ -150,3 +151,90 @@ def test_a_finished_study_loads_no_model_and_no_simulation(start, tmp_path):
         check=True,
     )
     assert json.loads(process.stdout.splitlines()[-1]) == [0, []]
+
+
+@pytest.fixture
+def committed(start, folder, tmp_path):
+    """Results of a finished study whose folder is gone."""
+    start()
+    file = tmp_path / "docs/study.json"
+    file.parent.mkdir()
+    (folder / "results.json").rename(file)
+    shutil.rmtree(folder)
+    return file
+
+
+def without(file, *names):
+    """Remove cells from a file of results."""
+    found = results.load(file)
+    results.write(file, "fake", {n: r for n, r in found.items() if n not in names})
+
+
+def test_a_study_starts_from_a_file_of_results(start, folder, committed):
+    before = committed.read_bytes()
+    for options in ([], ["--no-run"]):
+        code, text = start("--results", str(committed), *options)
+        assert (code, ran(folder)) == (0, [])
+        assert "fake: 6 finished" in text
+        assert committed.read_bytes() == before
+    without(committed, "lora/s1", "lr")
+    assert "4 finished" in start("--results", str(committed), "--no-run")[1]
+    assert "4 finished" in start("--results", str(committed), "--dry-run")[1]
+    assert ran(folder) == []
+    start("--results", str(committed))
+    assert ran(folder) == ["lora/s1", "lr"]
+    assert committed.read_bytes() == before
+    assert start()[0] == 0  # without the file, the others run
+    assert sorted(ran(folder)) == sorted(NAMES)
+
+
+def test_a_derived_cell_gets_its_source_again(start, folder, committed):
+    before = committed.read_bytes()
+    without(committed, "cut/s0")
+    start("--results", str(committed))
+    assert ran(folder) == ["lora/s0", "cut/s0"]
+    assert committed.read_bytes() == before
+
+
+def test_a_source_that_fails_again_keeps_its_results(start, folder, committed, monkeypatch):
+    without(committed, "cut/s0")
+    before = committed.read_bytes()
+    monkeypatch.setattr(InProcess, "run_cell", staticmethod(fail_source))
+    code, text = start("--results", str(committed))
+    assert code == 2
+    assert "lora/s0: failed RuntimeError: no memory" in text
+    assert "cut/s0: waiting for lora/s0 (failed)" in text
+    assert committed.read_bytes() == before
+
+
+def fail_source(job):
+    if job.cell.name == "lora/s0":
+        raise RuntimeError("no memory")
+    return fakes.run(job)
+
+
+def test_no_result_of_the_file_is_lost(start, folder, committed, tmp_path):
+    before = committed.read_bytes()
+    (folder / "lr").mkdir(parents=True)
+    (folder / "lr/cell.json").write_text("{")
+    code, text = start("--results", str(committed))
+    assert code == 2
+    assert "study.json is left as it is: it has results of lr, which is damaged" in text
+    shutil.rmtree(folder)
+    changed = FILE.replace("study()", 'study(**{"lr": fakes.CONFIG})').replace(
+        "from tests.study.fakes import study", "from tests.study import fakes\nstudy = fakes.study"
+    )
+    (tmp_path / "study.py").write_text(changed)
+    code, text = start("--results", str(committed))
+    assert code == 2
+    assert "lr: changed it was run with other optim.steps" in text
+    assert committed.read_bytes() == before
+
+
+def test_results_of_another_study_are_refused(start, committed):
+    results.write(committed, "other", {})
+    code, text = start("--results", str(committed))
+    assert code == 2
+    assert "has the results of other, not of fake" in text
+    committed.unlink()
+    assert "study.json is missing" in start("--results", str(committed))[1]
