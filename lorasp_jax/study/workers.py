@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from multiprocessing import connection, context
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from envs.cli.errors import INTERRUPTED
 from lorasp_jax.study import forecast, status
 from lorasp_jax.study.runner import Job, RunCell, work
-from lorasp_jax.study.status import Board, State
+from lorasp_jax.study.status import Board, State, Status
 from lorasp_jax.study.study import Study
 from lorasp_jax.training.interrupt import sigterm_as_interrupt
 
@@ -62,6 +62,7 @@ class Workers:
         self._board, self._console = Board(self._study, folder), console
         self._running: dict[context.SpawnProcess, tuple[connection.Connection, list[str]]] = {}
         self._started: dict[str, float] = {}
+        self._finished: set[str] = set()
         self._finish_time: float | None = None
 
     def run(self, count: int) -> None:
@@ -110,6 +111,7 @@ class Workers:
             return
         cells.remove(name)
         del self._started[name]
+        self._finished.add(name)
         self._print(name)
 
     def _handle_exit(self, code: int | None, cells: list[str]) -> None:
@@ -138,14 +140,27 @@ class Workers:
         """Count the finished cells and estimate when the others will be."""
         statuses = self._board.read()
         done = [name for name in self._names if statuses[name].state is State.FINISHED]
-        open_states = State.RUNNABLE, State.WAITING
-        left = [name for name in self._names if statuses[name].state in open_states]
-        times = forecast.seconds(self._study, statuses)
         now = time.monotonic()
         ages = {name: now - start for name, start in self._started.items()}
-        seconds = [max(times[name] - ages.get(name, 0.0), 0.0) for name in left if name in times]
-        self._finish_time = now + sum(seconds) / max(len(self._running), 1) if seconds else None
+        seconds = self._expected_seconds(statuses, ages)
+        self._finish_time = None if seconds is None else now + seconds
         progress.update(bar, completed=len(done), description=", ".join(ages) or "cells")
+
+    def _expected_seconds(
+        self, statuses: Mapping[str, Status], ages: Mapping[str, float]
+    ) -> float | None:
+        """Estimate the time until all cells that can run are finished [s]; None if unknown.
+
+        `ages` has the times for which cells have been running. No two cells of a group run at once.
+        """
+        jobs = max(len(self._running), 1)
+        times = forecast.seconds(self._study, statuses, self._finished, jobs)
+        left = {*forecast.left(self._study, self._names, statuses)} & times.keys()
+        groups = [
+            sum(max(times[c.name] - ages.get(c.name, 0.0), 0.0) for c in cells if c.name in left)
+            for cells in self._study.groups.values()
+        ]
+        return max(sum(groups) / jobs, *groups) if left else None
 
     def _time_left(self) -> str:
         """Return the estimated time until all cells are finished."""

@@ -98,7 +98,7 @@ def test_dry_run(start, folder):
     code, text = start("--dry-run", "--only", "[ls]*")
     assert code == 0
     assert re.search(r"sp/s0 │ LoRASP │ 2,000 │ [\d,]+ │ runnable │ \?", text)
-    assert re.search(r"lora/s0 │ \? │ \? │ \? │ waiting │ \?", text)
+    assert re.search(r"lora/s0 │ LoRA │ 2,000 │ \? │ waiting │ \?", text)
     assert not folder.exists()
     start()
     code, text = start("--dry-run")

@@ -2,6 +2,7 @@ import dataclasses
 
 import pytest
 
+from lorasp_jax.peft import LoRA
 from lorasp_jax.study import runner, status
 from lorasp_jax.study.status import Board, State
 from tests.study import fakes
@@ -34,6 +35,38 @@ def test_nothing_has_run(folder):
     assert found["lora/s0"].reason == "for sp/s0 (runnable), sp/s1 (runnable)"
     assert found["sp/s1"].config.name == "s1"
     assert found["lora/s0"].config is None
+
+
+def test_configs_that_depend_on_missing_results_are_guessed(folder):
+    found = Board(study(), folder).read()
+    guess = found["lora/s1"].guess
+    assert guess == dataclasses.replace(CONFIG, name="s1", peft=LoRA(rank=1), seed=1)
+    assert found["cut/s0"].guess == found["lora/s0"].guess
+    assert found["sp/s0"].guess is None
+    broken = study(**{"lora/s0": lambda results: results["lr"]})
+    found = Board(broken, folder).read()
+    assert found["lora/s0"].guess is None
+    assert found["cut/s0"].guess is None
+
+
+def test_only_changes_are_read_again(folder, monkeypatch):
+    finish(folder, ["sp/s0", "sp/s1", "lora/s0", "lr"])
+    board = Board(study(), folder)
+    first = board.read()
+    read, read_json = [], status.read_json
+    monkeypatch.setattr(
+        status, "read_json", lambda path, schema: read.append(path) or read_json(path, schema)
+    )
+    assert [*map(id, board.read().values())] == [*map(id, first.values())]
+    assert read == []
+    finish(folder, ["cut/s0"])
+    read.clear()
+    assert board.read()["cut/s0"].state is State.FINISHED
+    assert read == [folder / "cut/s0/cell.json"]
+    (folder / "sp/s1/cell.json").unlink()
+    found = board.read()
+    assert (found["sp/s1"].state, found["lora/s1"].state) == (State.RUNNABLE, State.WAITING)
+    assert found["lr"] is first["lr"]
 
 
 def test_a_damaged_result_is_named(folder):
