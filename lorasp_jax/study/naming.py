@@ -53,6 +53,21 @@ def per_seed(results: Mapping[str, Any], method: Seeds, *path: str) -> list[floa
     return [float(np.mean([value(name) for name in seed])) for seed in method]
 
 
+def by_depth(linears: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
+    """Join the layers of a tower that SmolVLA stacks apart, in order of depth.
+
+    In its action tower, self-attention and cross-attention alternate.
+    """
+    found: dict[str, list[Any]] = {}
+    for name, layers in linears.items():
+        kind = name.removeprefix("self_layer/")
+        if name.startswith("cross_layer/"):
+            continue
+        pairs = zip(layers, linears.get(f"cross_layer/{kind}", ()), strict=True)
+        found[kind] = [each for pair in pairs for each in pair] if kind != name else [*layers]
+    return found
+
+
 def label(method: str, rank: int) -> str:
     """Return a method's name on the page; `rank` is the bank's size R."""
     stem = method.removesuffix("_pruned")

@@ -1,113 +1,44 @@
 """Tables of the study of the paper, in Markdown, beside the paper's numbers."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from lorasp_jax.peft import LoRASP
 from lorasp_jax.study import naming, published, statistics
-from lorasp_jax.study.naming import TOWERS, Seeds
-from lorasp_jax.study.statistics import Estimate
-
-BACKBONES = {"pi0": "π0", "smolvla": "SmolVLA"}
-TASKS = {
-    "open_pot": "open the pot",
-    "pour": "pour",
-    "press": "press",
-    "pick_place": "pick and place",
-}
-"""Tasks and their titles, in the paper's order."""
-NONE = "–"
-
-
-@dataclass(frozen=True)
-class Book:
-    """The cells of a study and the results so far.
-
-    Attributes:
-        names: all cells.
-        results: those that are finished.
-    """
-
-    names: tuple[str, ...]
-    results: Mapping[str, Any]
-
-    @property
-    def backbones(self) -> list[str]:
-        """The study's backbones, in order."""
-        return list(dict.fromkeys(name.split("/")[0] for name in self.names))
-
-    @property
-    def rank(self) -> int:
-        """R, LoRA's highest rank and the size of LoRA-SP's bank."""
-        return max(self.ranks(self.backbones[0], "multi"), default=1)
-
-    def methods(self, backbone: str, training: str) -> list[str]:
-        """Return the methods of a kind of training, in order."""
-        parts = [name.split("/") for name in self.names]
-        return list(dict.fromkeys(p[2] for p in parts if p[:2] == [backbone, training]))
-
-    def ranks(self, backbone: str, training: str) -> list[int]:
-        """Return LoRA's ranks in ascending order."""
-        stems = self.methods(backbone, training)
-        return sorted(int(m.removeprefix("lora_r")) for m in stems if m.startswith("lora_r"))
-
-    def cells(self, prefix: str) -> Seeds:
-        """Return the cells of a method, such as "pi0/multi/lora_sp", by seed."""
-        return naming.seeds(self.names, prefix)
-
-    def missing(self, *prefixes: str) -> str:
-        """Return "" if all cells of some methods are finished, else how many are missing."""
-        methods = [naming.flat(self.cells(prefix)) for prefix in prefixes]
-        count = sum(name not in self.results for names in methods for name in names)
-        if count:
-            return f"not yet run ({count} of {sum(map(len, methods))})"
-        return "" if all(methods) else "the study has no cells for it yet"
-
-    def outcomes(self, prefix: str) -> np.ndarray:
-        """Return a method's episodes, bool `[S, T, N]`, tasks in order of name."""
-        return naming.outcomes(self.results, self.cells(prefix))
-
-    def tasks(self, prefix: str) -> list[str]:
-        """Return a finished method's tasks in order of name."""
-        return sorted({t for n in self.cells(prefix)[0] for t in self.results[n]["outcomes"]})
-
-    def mean(self, prefix: str, *path: str) -> float | None:
-        """Return a number of the results, averaged over a method's cells; None if it is absent."""
-        try:
-            return float(np.mean(naming.per_seed(self.results, self.cells(prefix), *path)))
-        except KeyError:
-            return None
-
-
-def markdown(headers: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a Markdown table."""
-    lines = [headers, ["---"] * len(headers), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
-def percent(estimate: Estimate) -> str:
-    """Return a rate with its interval, such as "91.2 [89.0, 93.1]"."""
-    value, low, high = (f"{100 * x:.1f}" for x in estimate)
-    return f"{value} [{low}, {high}]"
-
+from lorasp_jax.study.book import BACKBONES, NONE, TASKS, Book, markdown, percent
+from lorasp_jax.study.naming import TOWERS
 
 Column = tuple[str, Callable[[str], str]]
 """Title of a column, and its text for a method that is finished."""
 
 
 def success_table(
-    book: Book, backbone: str, training: str, methods: Sequence[str], columns: Sequence[Column] = ()
+    book: Book,
+    backbone: str,
+    training: str,
+    labels: Mapping[str, str],
+    columns: Sequence[Column] = (),
 ) -> str:
-    """Return success by method and task, the paper's numbers in brackets, after other columns."""
+    """Return success by method and task, the paper's numbers in brackets, after other columns.
+
+    If no method is finished, return only how many runs there are.
+
+    Args:
+        book: the results.
+        backbone: shown in the table, like `training`.
+        training: "multi" or "single".
+        labels: methods and their names in the table.
+        columns: further columns.
+    """
+    prefixes = [f"{backbone}/{training}/{method}" for method in labels]
+    if all(book.missing(prefix) for prefix in prefixes):
+        return f"{book.missing(*prefixes)}.\n"
     titles = [TASKS[task] for task in TASKS]
     headers = ["method", *(title for title, _ in columns), *titles, "mean [95 % interval]"]
     rows = []
-    for method in methods:
-        prefix = f"{backbone}/{training}/{method}"
+    for prefix, name in zip(prefixes, labels.values(), strict=True):
         paper = published.cell(prefix, book.rank).get("success", {})
-        name = naming.label(method, book.rank)
         if missing := book.missing(prefix):
             cells = [NONE for _ in columns] + [_with("", paper.get(task)) for task in TASKS]
             rows.append([name, *cells, _with(missing, _mean(paper))])
@@ -134,9 +65,11 @@ def _mean(paper: Mapping[str, float]) -> float | None:
 
 def table_1(book: Book, backbone: str) -> str:
     """Return Table I: methods, their size, active rank and multi-task success, after the base's."""
-    methods = _table_1_methods(book, backbone)
+    methods = _labels(book, book.table_1_methods(backbone))
     columns = [("trainable %", _trainable(book)), ("active rank", _rank(book))]
     table = success_table(book, backbone, "multi", methods, columns)
+    if not table.startswith("|"):
+        return table
     headers, rule, *rows = table.splitlines(keepends=True)
     base = f"| {' | '.join(_base(book, backbone, len(columns)))} |\n"
     return "".join([headers, rule, base, *rows])
@@ -149,32 +82,49 @@ def _base(book: Book, backbone: str, columns: int) -> list[str]:
     before = next((cell["before"] for cell in cells if "before" in cell), None)
     start = ["base, not adapted", *[NONE] * columns]
     if before is None:
-        return [*start, *[NONE] * len(TASKS), "not yet run (1 of 1)"]
+        return [*start, *[NONE] * len(TASKS), "0 of 1 runs so far"]
     rates = {task: 100 * o.count("1") / len(o) for task, o in before.items()}
     mean = float(np.mean(list(rates.values())))
     return [*start, *(f"{rates[t]:.1f}" if t in rates else NONE for t in TASKS), f"{mean:.1f}"]
 
 
-def _table_1_methods(book: Book, backbone: str) -> list[str]:
-    """Return the methods of Table I in the paper's order, then those beyond it."""
-    first = f"lora_r{book.rank}"
-    paper = [first, "lora_moe_top1", "lora_moe_weighted", "ada_lora", "full", "lora_sp"]
-    own = book.methods(backbone, "multi")
-    return [m for m in (*paper, "dora", "lora_same_rank", "lora_cut") if m in own]
+def table_2(book: Book) -> str:
+    """Return the mean success of Table II's methods by backbone and kind of training."""
+    kinds = {
+        (backbone, training): title
+        for backbone in book.backbones
+        for training, title in (("single", "one per task"), ("multi", "all tasks"))
+        if book.methods(backbone, "single")
+    }
+    if not kinds:
+        return ""
+    methods = dict.fromkeys(m for backbone, _ in kinds for m in _table_2_methods(book, backbone))
+    headers = [f"{BACKBONES[backbone]}, {title}" for (backbone, _), title in kinds.items()]
+    rows = []
+    for method in methods:
+        row = [naming.label(method, book.rank)]
+        for backbone, training in kinds:
+            prefix = f"{backbone}/{training}/{method}"
+            ours = book.missing(prefix) or percent(statistics.success(book.outcomes(prefix)))
+            paper = published.cell(prefix, book.rank).get("success", {})
+            row.append(_with(ours, _mean(paper)))
+        rows.append(row)
+    return markdown(["method", *headers], rows)
 
 
-def table_2(book: Book, backbone: str) -> str:
+def table_2_by_task(book: Book, backbone: str) -> str:
     """Return Table II: LoRA of all ranks, full fine-tuning and LoRA-SP, both ways of training."""
     parts = []
-    for training, title in (
-        ("single", "One policy per task"),
-        ("multi", "One policy for all tasks"),
-    ):
+    for training, title in (("single", "one policy per task"), ("multi", "one for all tasks")):
         if book.methods(backbone, "single"):
-            lora = [f"lora_r{rank}" for rank in book.ranks(backbone, training)]
-            rows = success_table(book, backbone, training, [*lora, "full", "lora_sp"])
-            parts.append(f"{title}:\n\n{rows}")
+            methods = _labels(book, _table_2_methods(book, backbone))
+            rows = success_table(book, backbone, training, methods)
+            parts.append(f"**{BACKBONES[backbone]}, {title}**\n\n{rows}")
     return "\n".join(parts)
+
+
+def _table_2_methods(book: Book, backbone: str) -> list[str]:
+    return [*(f"lora_r{rank}" for rank in book.ranks(backbone, "multi")), "full", "lora_sp"]
 
 
 def table_3(book: Book, backbone: str) -> str:
@@ -183,7 +133,7 @@ def table_3(book: Book, backbone: str) -> str:
     if methods[0] not in book.methods(backbone, "multi"):
         return ""
     columns = [(tower, _tower(book, index)) for index, tower in enumerate(TOWERS)]
-    return success_table(book, backbone, "multi", methods, columns)
+    return success_table(book, backbone, "multi", _labels(book, methods), columns)
 
 
 def table_4(book: Book, backbone: str) -> str:
@@ -193,23 +143,23 @@ def table_4(book: Book, backbone: str) -> str:
     if not methods:
         return ""
     methods.insert(-1, "lora_sp")  # .9 comes before .99
-    return success_table(book, backbone, "multi", methods, [("active rank", _rank(book))])
+    labels = _labels(book, methods) | {"lora_sp": f"LoRA-SP, η = {LoRASP().energy_target:g}"}
+    return success_table(book, backbone, "multi", labels, [("active rank", _rank(book))])
 
 
 def pruning(book: Book, backbone: str) -> str:
     """Return what pruning after training saves and costs."""
     headers = ["method", "adapters [MB]", "one call [ms]", "success", "after pruning"]
     rows = []
-    for method in book.methods(backbone, "multi"):
-        if not method.endswith("_pruned"):
-            continue
+    methods = [m for m in book.methods(backbone, "multi") if m.endswith("_pruned")]
+    for method in methods:
         prefix = f"{backbone}/multi/{method}"
         source = prefix.removesuffix("_pruned")
         name = naming.label(method.removesuffix("_pruned"), book.rank)
         if missing := book.missing(prefix, source):
             rows.append([name, NONE, NONE, NONE, missing])
             continue
-        smaller = [book.results[name]["measures"]["smaller"] for (name,) in book.cells(prefix)]
+        smaller = book.measures(prefix, "smaller")
         sizes = np.mean([s["bytes"] for s in smaller], axis=0) / 1e6
         times = np.mean([s["milliseconds"] for s in smaller], axis=0)
         success = [percent(statistics.success(book.outcomes(p))) for p in (source, prefix)]
@@ -220,8 +170,8 @@ def pruning(book: Book, backbone: str) -> str:
 def costs(book: Book, backbone: str) -> str:
     """Return what each method of Table I costs."""
     headers = [
-        *("method", "trainable", "GFLOP per sample", "memory [GiB]", "samples/s"),
-        "seconds per cell",
+        *("method", "mean success", "trainable", "GFLOP per sample", "memory [GiB]"),
+        *("samples/s", "seconds per run"),
     ]
     fields = (
         (("trainable_parameters",), 1e-6, " M"),
@@ -231,36 +181,52 @@ def costs(book: Book, backbone: str) -> str:
         (("seconds", "total"), 1.0, ""),
     )
     rows = []
-    for method in _table_1_methods(book, backbone):
+    for method in book.table_1_methods(backbone):
+        if method == "lora_cut":  # it is not trained
+            continue
         prefix = f"{backbone}/multi/{method}"
         name = naming.label(method, book.rank)
         if missing := book.missing(prefix):
-            rows.append([name, missing, *[NONE] * (len(fields) - 1)])
+            rows.append([name, missing, *[NONE] * len(fields)])
             continue
+        success = f"{100 * book.outcomes(prefix).mean():.1f}"
         values = [(book.mean(prefix, *path), scale, unit) for path, scale, unit in fields]
         rows.append(
-            [name, *(NONE if v is None else f"{float(f'{v * s:.3g}'):,g}{u}" for v, s, u in values)]
+            [
+                *(name, success),
+                *(NONE if v is None else f"{float(f'{v * s:.3g}'):,g}{u}" for v, s, u in values),
+            ]
         )
     return markdown(headers, rows)
 
 
-def rates(book: Book, backbone: str) -> str:
+def rates(book: Book) -> str:
     """Return the success of each method's pilot cells, the chosen learning rate in bold."""
-    methods = book.methods(backbone, "pilot")
-    pilots = {m: naming.flat(book.cells(f"{backbone}/pilot/{m}")) for m in methods}
-    values = list(
-        dict.fromkeys(name.rsplit("/", 1)[1] for names in pilots.values() for name in names)
-    )
+    names = [name.split("/") for name in book.names]
+    values = list(dict.fromkeys(name[3] for name in names if name[1] == "pilot"))
+    methods = dict.fromkeys(name[2] for name in names if name[1] == "pilot")
+    headers = [f"{BACKBONES[b]}, {float(v):g}" for b in book.backbones for v in values]
     rows = []
-    for method, names in pilots.items():
-        label = naming.label(method, book.rank)
-        if missing := book.missing(f"{backbone}/pilot/{method}"):
-            rows.append([label, missing, *[NONE] * (len(values) - 1)])
-            continue
-        best = naming.best_pilot(book.results, names)
-        means = {n: f"{100 * naming.outcomes(book.results, ((n,),)).mean():.1f}" for n in names}
-        rows.append([label, *(f"**{means[n]}**" if n == best else means[n] for n in names)])
-    return markdown(["method", *(f"rate {value}" for value in values)], rows)
+    for method in methods:
+        row = [naming.label(method, book.rank)]
+        for backbone in book.backbones:
+            row += _rates(book, f"{backbone}/pilot/{method}", len(values))
+        rows.append(row)
+    return markdown(["method", *headers], rows)
+
+
+def _rates(book: Book, prefix: str, count: int) -> list[str]:
+    """Return the success of one method's pilot cells."""
+    if missing := book.missing(prefix):
+        return [missing, *[NONE] * (count - 1)]
+    names = naming.flat(book.cells(prefix))
+    best = naming.best_pilot(book.results, names)
+    means = {n: f"{100 * naming.outcomes(book.results, ((n,),)).mean():.1f}" for n in names}
+    return [f"**{means[n]}**" if n == best else means[n] for n in names]
+
+
+def _labels(book: Book, methods: Iterable[str]) -> dict[str, str]:
+    return {method: naming.label(method, book.rank) for method in methods}
 
 
 def _trainable(book: Book) -> Callable[[str], str]:
@@ -291,4 +257,4 @@ def _tower(book: Book, index: int) -> Callable[[str], str]:
 
 
 def _arrow(pair: Sequence[float]) -> str:
-    return " → ".join(f"{value:.3g}" for value in pair)
+    return " → ".join(f"{value:#.3g}" for value in pair)

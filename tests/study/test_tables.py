@@ -3,14 +3,16 @@
 import pytest
 
 from lorasp_jax.study import naming, published, tables
+from lorasp_jax.study.book import Book
 from tests.study import synthetic
 
 NAMES = tuple(cell.name for cell in synthetic.study().cells)
-BOOK = tables.Book(NAMES, synthetic.results())
+BOOK = Book(NAMES, synthetic.results())
 
 
 def row(table: str, method: str) -> list[str]:
-    line = next(line for line in table.splitlines() if line.startswith(f"| {method} |"))
+    lines = table.replace("\u00a0", " ").splitlines()
+    line = next(line for line in lines if line.startswith(f"| {method} |"))
     return [cell.strip() for cell in line.split("|")[1:-1]]
 
 
@@ -31,14 +33,14 @@ def test_tasks_keep_the_papers_order():
         name = f"pi0/multi/dora/s{seed}"
         outcomes = {"open_pot": "1111", "pour": "1110", "press": "1100", "pick_place": "1000"}
         results[name] = {**results[name], "outcomes": outcomes}
-    cells = row(tables.table_1(tables.Book(NAMES, results), "pi0"), "DoRA, r = 64")
+    cells = row(tables.table_1(Book(NAMES, results), "pi0"), "DoRA, r = 64")
     assert cells[3:7] == ["100.0", "75.0", "50.0", "25.0"]
 
 
 def test_methods_of_table_1():
     base, *lines = tables.table_1(BOOK, "smolvla").splitlines()[2:]
     assert base == "| base, not adapted | – | – | 25.0 | 25.0 | 25.0 | 25.0 | 25.0 |"
-    methods = [line.split("|")[1].strip() for line in lines]
+    methods = [line.split("|")[1].replace("\u00a0", " ").strip() for line in lines]
     assert methods[0] == "LoRA, r = 64"
     assert methods[5:7] == ["LoRA-SP", "DoRA, r = 64"]
     assert len(methods) == 9
@@ -51,43 +53,66 @@ def test_ranks_by_module():
 
 
 def test_energy_targets_are_in_order():
-    lines = tables.table_4(BOOK, "smolvla").splitlines()[2:]
-    names = ["LoRA-SP, η = 0.5", "LoRA-SP, η = 0.7", "LoRA-SP, η = 0.8", "LoRA-SP"]
-    assert [line.split("|")[1].strip() for line in lines] == [*names, "LoRA-SP, η = 0.99"]
+    lines = tables.table_4(BOOK, "smolvla").replace("\u00a0", " ").splitlines()[2:]
+    names = [f"LoRA-SP, η = {eta}" for eta in (0.5, 0.7, 0.8, 0.9, 0.99)]
+    assert [line.split("|")[1].strip() for line in lines] == names
 
 
 def test_pruning():
     cells = row(tables.pruning(BOOK, "smolvla"), "LoRA-SP, η = 0.7")
-    assert cells[1:3] == ["40 → 25", "5 → 4.2"]
+    assert cells[1:3] == ["40.0 → 25.0", "5.00 → 4.20"]
     assert tables.pruning(BOOK, "pi0") == ""
 
 
 def test_missing_cells():
     results = {name: r for name, r in synthetic.results().items() if "/dora/s1" not in name}
-    book = tables.Book(NAMES, results)
-    assert row(tables.table_1(book, "pi0"), "DoRA, r = 64")[-1] == "not yet run (1 of 3)"
-    assert row(tables.costs(book, "pi0"), "DoRA, r = 64")[1] == "not yet run (1 of 3)"
-    assert book.missing("pi0/multi/lora_sp", "pi0/multi/dora") == "not yet run (1 of 6)"
-    assert book.missing("pi0/multi/lora_sp") == ""
-    assert book.missing("pi0/panda/full") == "the study has no cells for it yet"
+    book = Book(NAMES, results)
+    assert row(tables.table_1(book, "pi0"), "DoRA, r = 64")[-1] == "2 of 3 runs so far"
+    assert row(tables.costs(book, "pi0"), "DoRA, r = 64")[1] == "2 of 3 runs so far"
+    del results["smolvla/single/full/pour/s2"]
+    cells = row(tables.table_2(Book(NAMES, results)), "full fine-tuning")
+    assert cells[3] == "11 of 12 runs so far (93.3)"
+    assert cells[4].endswith("] (86.7)")
+
+
+def test_a_table_without_a_finished_method_is_one_line():
+    results = {n: r for n, r in synthetic.results().items() if n == "pi0/multi/lora_sp/s0"}
+    book = Book(NAMES, results)
+    assert tables.table_1(book, "pi0") == "1 of 27 runs so far.\n"
+    assert "0 of 96 runs so far." in tables.table_2_by_task(book, "smolvla")
 
 
 def test_base_without_results():
-    cells = row(tables.table_1(tables.Book(NAMES, {}), "pi0"), "base, not adapted")
-    assert cells[-1] == "not yet run (1 of 1)"
+    results = {n: r for n, r in synthetic.results().items() if n != "pi0/multi/lora_sp/s0"}
+    cells = row(tables.table_1(Book(NAMES, results), "pi0"), "base, not adapted")
+    assert cells[-1] == "0 of 1 runs so far"
+
+
+def test_ranks_of_both_backbones():
+    cells = row(tables.table_2(BOOK), "LoRA-SP")
+    ours = [BOOK.outcomes(f"smolvla/{kind}/lora_sp").mean() for kind in ("single", "multi")]
+    for text, rate, paper in zip(cells[3:], ours, (93.3, 91.7), strict=True):
+        assert text.startswith(f"{100 * rate:.1f} [")
+        assert text.endswith(f"] ({paper})")
+    assert tables.table_2(Book(("pi0/multi/full/s0",), {})) == ""
 
 
 def test_costs():
     cells = row(tables.costs(BOOK, "pi0"), "LoRA, r = 64")
-    assert cells[1:] == ["5.76 M", "2.1", "5.59", "14,000", "110"]
+    rate = BOOK.outcomes("pi0/multi/lora_r64").mean()
+    assert cells[1:] == [f"{100 * rate:.1f}", "5.76 M", "2.1", "5.59", "14,000", "110"]
+    assert "cut" not in tables.costs(BOOK, "pi0")
 
 
 def test_best_rate_is_bold():
     results = dict(synthetic.results())
     for rate, episodes in (("0.0003", "10"), ("0.001", "11"), ("0.003", "00")):
         results[f"pi0/pilot/full/{rate}"] = {"outcomes": {"press": episodes}}
-    cells = row(tables.rates(tables.Book(NAMES, results), "pi0"), "full fine-tuning")
-    assert cells[1:] == ["50.0", "**100.0**", "0.0"]
+    del results["smolvla/pilot/full/0.001"]
+    table = tables.rates(Book(NAMES, results))
+    cells = row(table, "full fine-tuning")
+    assert cells[1:] == ["50.0", "**100.0**", "0.0", "2 of 3 runs so far", "–", "–"]
+    assert row(table, "method")[1:3] == ["π0, 0.0003", "π0, 0.001"]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,120 @@
+"""All figures of the study's page: which results they need, their captions and files."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from envs.datasets.writing import write_text
+from lorasp_jax.study import figure_style, figures, task_figures
+from lorasp_jax.study.book import BACKBONES, Book
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure.
+
+    Attributes:
+        draw: draws it for the backbones of a book.
+        needs: returns the methods that it shows for a backbone, such as "pi0/multi/lora_r2".
+        title: its name and what it shows.
+        caption: how to read it.
+    """
+
+    draw: Callable[[Book], Figure]
+    needs: Callable[[Book, str], list[str]]
+    title: str
+    caption: str
+
+
+def _lora(book: Book, backbone: str, *kinds: str) -> list[str]:
+    ranks = book.ranks(backbone, "multi")
+    return [f"{backbone}/{kind}/lora_r{rank}" for kind in kinds for rank in ranks]
+
+
+def _lora_sp(_: Book, backbone: str) -> list[str]:
+    return [f"{backbone}/multi/lora_sp"]
+
+
+DRAWINGS = {
+    "1": Drawing(
+        figures.figure_1,
+        lambda book, b: [*_lora(book, b, "multi"), f"{b}/multi/full", *_lora_sp(book, b)],
+        "Figure 1. Multi-task success relative to full fine-tuning (dotted) against rank",
+        "Bands and bars are 95 % intervals. The paper's ranks are scaled from R = 128 to {rank}.",
+    ),
+    "3": Drawing(
+        figures.figure_3,
+        lambda book, b: _lora(book, b, "single", "multi"),
+        "Figure 3. Success of LoRA against rank, by task",
+        "The band spans the tasks.",
+    ),
+    "4": Drawing(
+        figures.figure_4,
+        lambda _, b: [f"{b}/multi/full", f"{b}/panda/full"],
+        "Figure 4. Rank of full fine-tuning's updates, for a robot that the base has seen and for "
+        "one that it has not",
+        "Share of the singular values that hold 99 % of an update's energy. Boxes are over layers "
+        "and seeds.",
+    ),
+    "6": Drawing(
+        figures.figure_6,
+        _lora_sp,
+        "Figure 6. LoRA-SP's active rank over the tokens of held-out demonstrations, first seed",
+        "One box per layer, whiskers from minimum to maximum; layers of one kind stand side by "
+        "side, in order of depth.",
+    ),
+    "directions": Drawing(
+        task_figures.shared_directions,
+        _lora_sp,
+        "Figure A. Which directions tasks share in LoRA-SP",
+        "Dots are means over seeds, lines span the seeds.",
+    ),
+    "gradients": Drawing(
+        task_figures.gradients,
+        task_figures.gradient_methods,
+        "Figure B. Cosines of gradients after multi-task training",
+        "Dots are means over pairs of tasks and seeds, lines span the seeds.",
+    ),
+}
+"""Figures by the name of their files; those of the paper have its numbers."""
+
+
+def write(book: Book, folder: Path) -> None:
+    """Write the figures into `folder`/figures; delete those that no backbone has the results for.
+
+    A figure shows the backbones for which it has all results.
+    """
+    for name, drawn in DRAWINGS.items():
+        complete = [b for b in book.backbones if not book.missing(*drawn.needs(book, b))]
+        for scheme in figure_style.SCHEMES:
+            path = folder / "figures" / _file(name, scheme)
+            if complete:
+                write_text(path, figure_style.svg(drawn.draw, book.of(complete), scheme))
+            else:
+                path.unlink(missing_ok=True)
+
+
+def markdown(book: Book, name: str) -> str:
+    """Return a figure with its caption, and how many runs it lacks."""
+    drawn = DRAWINGS[name]
+    missing = {
+        BACKBONES[b]: text for b in book.backbones if (text := book.missing(*drawn.needs(book, b)))
+    }
+    parts = [f"{backbone}: {text}" for backbone, text in missing.items()]
+    if len({*missing.values()}) == 1 and len(missing) == len(book.backbones):
+        parts = [*missing.values()][:1]
+    lacks = f" **{'; '.join(parts)}.**" if parts else ""
+    caption = f"*{drawn.title}. {drawn.caption.format(rank=book.rank)}*{lacks}\n"
+    if len(missing) == len(book.backbones):
+        return caption
+    dark, light = (f"figures/{_file(name, scheme)}" for scheme in ("dark", "light"))
+    return (
+        f'<picture>\n  <source media="(prefers-color-scheme: dark)" srcset="{dark}">\n'
+        f'  <img alt="{drawn.title}" src="{light}">\n</picture>\n\n{caption}'
+    )
+
+
+def _file(name: str, scheme: str) -> str:
+    return f"study_{name}_{scheme}.svg"

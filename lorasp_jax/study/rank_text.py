@@ -1,0 +1,78 @@
+"""Where LoRA-SP spends its rank, in words."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from lorasp_jax.study import naming
+from lorasp_jax.study.book import BACKBONES, Book
+from lorasp_jax.study.naming import TOWERS
+
+_EXTREMES = 3
+"""Kinds of layers to name at each end."""
+Boxes = Mapping[tuple[str, str], np.ndarray]
+"""(tower, kind of linear layer) -> five-number summaries `[S, L, 5]`."""
+
+
+def where_rank_goes(book: Book) -> str:
+    """Return a paragraph for each backbone."""
+    return "\n".join(f"**{BACKBONES[b]}**: {_paragraph(book, b)}\n" for b in book.backbones)
+
+
+def _paragraph(book: Book, backbone: str) -> str:
+    prefix = f"{backbone}/multi/lora_sp"
+    if missing := book.missing(prefix):
+        return f"{missing}."
+    boxes = _boxes(book, prefix)
+    means = {tower: book.mean(prefix, "active_rank", tower) or 0.0 for tower in TOWERS}
+    spread = {
+        t: float(np.mean([(b[..., 3] - b[..., 1]).mean() for b in _of(boxes, t)])) for t in TOWERS
+    }
+    high, low = _extremes(boxes)
+    return (
+        f"on average, a token uses {_by_tower(means, f' of {book.rank} directions')}. "
+        f"The median over tokens is highest in {high}, and lowest in {low}. "
+        f"From the first layer to the last, it goes {_by_tower(_depth(boxes))}. "
+        f"Within one layer, the middle half of the tokens spans {_by_tower(spread, ' ranks')}."
+    )
+
+
+def _boxes(book: Book, prefix: str) -> Boxes:
+    """Return the summaries of all seeds."""
+    seeds = book.measures(prefix, "rank_boxes")
+    return {
+        (tower, kind): np.array([naming.by_depth(seed[tower])[kind] for seed in seeds], float)
+        for tower in seeds[0]
+        for kind in naming.by_depth(seeds[0][tower])
+    }
+
+
+def _of(boxes: Boxes, tower: str) -> list[np.ndarray]:
+    return [array for (name, _), array in boxes.items() if name == tower]
+
+
+def _extremes(boxes: Boxes) -> tuple[str, str]:
+    """Return the kinds of layers with the highest and the lowest medians."""
+    medians = {kind: float(array[..., 2].mean()) for kind, array in boxes.items()}
+    ordered = sorted(medians, key=lambda kind: -medians[kind])
+    name = lambda kind: f"{kind[0]} `{kind[1]}` ({medians[kind]:.0f})"  # noqa: E731
+    high, low = ordered[:_EXTREMES], ordered[::-1][:_EXTREMES]
+    return ", ".join(map(name, high)), ", ".join(map(name, low))
+
+
+def _depth(boxes: Boxes) -> dict[str, str]:
+    """Return the medians of the first and the last layers, averaged over kinds, by tower."""
+    found = {}
+    for tower in TOWERS:
+        stacks = [array[..., 2].mean(0) for array in _of(boxes, tower) if array.shape[1] > 1]
+        if stacks:
+            first, last = (np.mean([stack[end] for stack in stacks]) for end in (0, -1))
+            found[tower] = f"from {first:.0f} to {last:.0f}"
+    return found
+
+
+def _by_tower(values: Mapping[str, float | str], unit: str = "") -> str:
+    """Return values by tower, such as "30.1 ranks in vision, 11.0 in language and ..."."""
+    texts = {t: v if isinstance(v, str) else f"{v:.1f}" for t, v in values.items()}
+    parts = [f"{text}{'' if n else unit} in {t}" for n, (t, text) in enumerate(texts.items())]
+    return " and ".join(", ".join(parts).rsplit(", ", 1))

@@ -1,0 +1,99 @@
+"""Figures that the paper lacks: what tasks share. See `figures` for their argument."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from lorasp_jax.report.figures import COLORS
+from lorasp_jax.study import naming
+from lorasp_jax.study.book import BACKBONES, TASKS, Book
+from lorasp_jax.study.figure_style import SERIES, panels
+from lorasp_jax.study.naming import TOWERS
+
+_ROW = 0.26
+"""Height of a row [inches]."""
+
+
+def shared_directions(book: Book) -> Figure:
+    """Plot how far each pair of tasks uses the same directions, by tower, and what chance gives."""
+    pairs = {
+        b: _pairs(book.measures(f"{b}/multi/lora_sp", "direction_overlap")) for b in book.backbones
+    }
+    figure, grid = panels(book, 1, 1.0 + 2 * _ROW * max(map(len, pairs.values())))
+    for axes, backbone in zip(grid[0], book.backbones, strict=True):
+        cells = book.measures(f"{backbone}/multi/lora_sp", "direction_overlap")
+        for offset, tower in zip((-0.22, 0, 0.22), TOWERS, strict=True):
+            for row, pair in enumerate(pairs[backbone]):
+                values = [cell[pair][tower] for cell in cells]
+                measured, chance = zip(*values, strict=True)
+                _dots(axes, row + offset, measured, float(np.mean(chance)), COLORS[tower])
+            axes.plot([], [], "o", color=COLORS[tower], label=tower)
+        _rows(axes, [_title(pair) for pair in pairs[backbone]])
+        axes.set_xlim(0, 1)
+        axes.set_title(BACKBONES[backbone], loc="left")
+        axes.set_xlabel("shared use of directions")
+    grid[0][0].plot([], [], "o", mfc="none", color="gray", label="by chance")
+    _legend(figure, grid[0][0])
+    return figure
+
+
+def gradients(book: Book) -> Figure:
+    """Plot by method whether gradients of different tasks point the same way."""
+    methods = {b: [p.split("/")[2] for p in gradient_methods(book, b)] for b in book.backbones}
+    figure, grid = panels(book, 1, 1.0 + 1.2 * _ROW * max(map(len, methods.values())))
+    for axes, backbone in zip(grid[0], book.backbones, strict=True):
+        for row, method in enumerate(methods[backbone]):
+            cells = book.measures(f"{backbone}/multi/{method}", "gradient_cosine")
+            other, same = ([_mean(cell, same=same) for cell in cells] for same in (False, True))
+            color = SERIES[2] if method == "lora_sp" else SERIES[0]
+            _dots(axes, row, other, float(np.mean(same)), color)
+        _rows(axes, [naming.label(method, book.rank) for method in methods[backbone]])
+        axes.axvline(0, color="gray", lw=1)
+        axes.set_title(BACKBONES[backbone], loc="left")
+        axes.set_xlabel("cosine of two gradients")
+    axes = grid[0][0]
+    axes.plot([], [], "o", color=SERIES[0], label="of two tasks")
+    axes.plot([], [], "o", mfc="none", color=SERIES[0], label="of one task")
+    _legend(figure, axes)
+    return figure
+
+
+def gradient_methods(book: Book, backbone: str) -> list[str]:
+    """Return the methods of Table I that were trained, such as "pi0/multi/lora_sp"."""
+    methods = book.table_1_methods(backbone)
+    return [f"{backbone}/multi/{method}" for method in methods if method != "lora_cut"]
+
+
+def _mean(cosines: dict[str, dict[str, float]], *, same: bool) -> float:
+    """Return the mean cosine over pairs of different tasks, or of the same task."""
+    pairs = [(pair.split("|"), towers["all"]) for pair, towers in cosines.items()]
+    return float(np.mean([value for (a, b), value in pairs if (a == b) is same]))
+
+
+def _dots(axes: Axes, row: float, measured: Sequence[float], reference: float, color: str) -> None:
+    """Draw the mean over seeds, their range, and a hollow dot to compare it with."""
+    axes.plot([min(measured), max(measured)], [row, row], color=color, lw=1.5)
+    axes.plot([np.mean(measured)], [row], "o", color=color, ms=6)
+    axes.plot([reference], [row], "o", color=color, ms=6, mfc="none")
+
+
+def _rows(axes: Axes, labels: Sequence[str]) -> None:
+    axes.set_yticks(range(len(labels)), labels)
+    axes.set_ylim(len(labels) - 0.5, -0.5)
+
+
+def _legend(figure: Figure, axes: Axes) -> None:
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=4)
+
+
+def _pairs(cells: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the pairs of tasks, such as "pour|press", in the paper's order of tasks."""
+    order = [*TASKS]
+    return sorted(cells[0], key=lambda pair: sorted(order.index(task) for task in pair.split("|")))
+
+
+def _title(pair: str) -> str:
+    return ", ".join(TASKS[task] for task in pair.split("|"))

@@ -1,0 +1,44 @@
+"""Figures appear on the page as soon as a backbone has all results for them."""
+
+import pytest
+
+from lorasp_jax.study import drawings
+from lorasp_jax.study.book import Book
+from tests.study import synthetic
+
+NAMES = tuple(cell.name for cell in synthetic.study().cells)
+SOME = {n: r for n, r in synthetic.results().items() if n.startswith("pi0/multi/") or n[-1] == "0"}
+BOOK = Book(NAMES, SOME)
+
+
+@pytest.fixture
+def written(tmp_path):
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures/study_3_dark.svg").touch()
+    drawings.write(BOOK, tmp_path)
+    return sorted(path.name for path in tmp_path.rglob("*.svg"))
+
+
+def test_only_figures_with_all_results_are_drawn(written):
+    names = ("1", "6", "directions", "gradients")
+    assert written == [f"study_{name}_{s}.svg" for name in names for s in ("dark", "light")]
+
+
+def test_missing_backbones_are_named():
+    text = drawings.markdown(BOOK, "gradients")
+    assert 'src="figures/study_gradients_light.svg"' in text
+    assert text.endswith("**SmolVLA: 8 of 24 runs so far.**\n")
+    text = drawings.markdown(BOOK, "3")
+    assert "<picture>" not in text
+    assert "**π0: 42 of 90 runs so far; SmolVLA: 30 of 90 runs so far.**" in text
+
+
+def test_a_finished_figure_lacks_nothing():
+    text = drawings.markdown(Book(NAMES, synthetic.results()), "1")
+    assert "scaled from R = 128 to 64.*\n" in text
+    assert "so far" not in text
+
+
+def test_a_figure_without_cells():
+    book = Book(tuple(n for n in NAMES if "/panda/" not in n), {})
+    assert drawings.markdown(book, "4").endswith("**The study has no runs for this.**\n")

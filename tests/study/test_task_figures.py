@@ -1,0 +1,47 @@
+"""Figures of what tasks share."""
+
+import numpy as np
+import pytest
+
+from lorasp_jax.study import task_figures
+from lorasp_jax.study.book import Book
+from tests.study import synthetic
+
+BOOK = Book(tuple(synthetic.results()), synthetic.results())
+
+
+def dots(axes, row):
+    """Positions of the dots in a row, filled ones first."""
+    found = [line for line in axes.lines if list(line.get_ydata()) == [row]]
+    found.sort(key=lambda line: line.get_markerfacecolor() == "none")
+    return [float(line.get_xdata()[0]) for line in found]
+
+
+def test_shared_directions():
+    first, axes = task_figures.shared_directions(BOOK).axes
+    labels = [text.get_text() for text in first.get_yticklabels()]
+    assert labels[0] == "open the pot, pour"
+    assert labels[-1] == "press, pick and place"
+    cells = BOOK.measures("smolvla/multi/lora_sp", "direction_overlap")
+    values = np.array([cell["open_pot|press"]["language"] for cell in cells])
+    assert dots(axes, 1) == pytest.approx(values.mean(0))
+
+
+def test_gradients_by_method():
+    axes = task_figures.gradients(BOOK).axes[0]
+    labels = [text.get_text() for text in axes.get_yticklabels()]
+    assert labels[5] == "LoRA-SP"
+    assert len(labels) == 8
+    cosines = [
+        [(pair.split("|"), towers["all"]) for pair, towers in cell.items()]
+        for cell in BOOK.measures("pi0/multi/lora_sp", "gradient_cosine")
+    ]
+    other = np.mean([[c for (a, b), c in cell if a != b] for cell in cosines])
+    same = np.mean([[c for (a, b), c in cell if a == b] for cell in cosines])
+    assert dots(axes, 5) == pytest.approx([other, same])
+
+
+def test_a_method_that_is_not_trained_has_no_gradients():
+    methods = task_figures.gradient_methods(BOOK, "pi0")
+    assert "pi0/multi/lora_cut" not in methods
+    assert methods[0] == "pi0/multi/lora_r64"

@@ -1,0 +1,61 @@
+"""Verdicts on the page, and how much is missing for the others."""
+
+import pytest
+
+from lorasp_jax.study import verdicts
+from lorasp_jax.study.book import Book
+from lorasp_jax.study.claims import judge_all
+from tests.study import synthetic
+
+CLAIMS = synthetic.study().claims
+NAMES = tuple(cell.name for cell in synthetic.study().cells)
+
+
+def shown(make, results):
+    book = Book(NAMES, results)
+    return make(CLAIMS, book, judge_all(CLAIMS, results)).replace("\u00a0", " ")
+
+
+def rows(table):
+    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()[2:]]
+
+
+@pytest.fixture(scope="module")
+def some():
+    """Results that only suffice for claims 1 and 8 on π0."""
+    kept = ("pi0/multi/lora_sp/", "pi0/multi/lora_r64/", "smolvla/multi/lora_sp/s0")
+    return {n: r for n, r in synthetic.results().items() if n.startswith(kept)}
+
+
+def test_claims_are_counted_by_verdict(some):
+    first, second = shown(verdicts.summary, some).splitlines()
+    assert first.startswith("- **π0**: 2 claims hold (1, 8), ")
+    assert " await their runs (2, 3, 4, " in first
+    assert "hold" not in second
+    one = {n: r for n, r in some.items() if "lora_r64" not in n}
+    assert shown(verdicts.summary, one).startswith("- **π0**: 1 claim holds (8), ")
+
+
+def test_claims_say_how_many_runs_there_are(some):
+    table = rows(shown(verdicts.table, some))
+    assert [row[0] for row in table] == [str(number) for number in range(1, 11)]
+    assert table[0][2:4] == ["**holds**", "1 of 6 runs so far"]
+    assert table[1][2] == "3 of 6 runs so far"
+    assert table[5][2:4] == ["–", "1 of 6 runs so far"]
+    assert table[8][2] == "3 of 12 runs so far"
+
+
+def test_numbers_of_both_backbones(some):
+    table = rows(shown(verdicts.numbers, some))
+    assert table[0][:3] == ["1", "LoRA-SP minus LoRA with r = 64", "above 0 points"]
+    assert table[0][3].endswith("] (+23.3): holds")
+    assert table[0][4] == "1 of 6 runs so far (+31.7)"
+    assert ["6", "success with the spectral loss minus without", "above −3 points", "–"] in [
+        row[:4] for row in table
+    ]
+
+
+def test_reasons_are_given_once():
+    lines = verdicts.reasons(CLAIMS).splitlines()
+    assert lines[0].startswith("- claims 1, 4, ")
+    assert len(set(lines)) == len(lines)
