@@ -21,6 +21,8 @@ TASKS = {
 }
 """Tasks and their titles, in the paper's order."""
 NONE = "–"
+_UNBREAKABLE = re.compile(r"(?<=\d,) (?=[+−\d][\d.]+\])|(?<==) | (?==)|(?<=\d) (?=[%M\[])")
+"""Spaces within intervals, equations and quantities."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ def markdown(headers: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a Markdown table, in which intervals and other numbers do not break."""
     lines = [headers, ["---"] * len(headers), *rows]
     text = "".join(f"| {' | '.join(line)} |\n" for line in lines)
-    return re.sub(r"(?<=\d,) (?=[+−\d][\d.]+\])|(?<==) | (?==)|(?<=\d) (?=[%M\[])", "\u00a0", text)
+    return _UNBREAKABLE.sub("\u00a0", text)
 
 
 def percent(estimate: Estimate) -> str:

@@ -1,5 +1,6 @@
 """All figures of the study's page: which results they need, their captions and files."""
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -99,20 +100,16 @@ def write(book: Book, folder: Path) -> None:
 def markdown(book: Book, name: str) -> str:
     """Return a figure with its caption, and how many runs it lacks."""
     drawn = DRAWINGS[name]
-    missing = {
-        BACKBONES[b]: text for b in book.backbones if (text := book.missing(*drawn.needs(book, b)))
-    }
-    parts = [f"{backbone}: {text}" for backbone, text in missing.items()]
-    if len({*missing.values()}) == 1 and len(missing) == len(book.backbones):
-        parts = [*missing.values()][:1]
-    lacks = f" **{'; '.join(parts)}.**" if parts else ""
-    caption = f"*{drawn.title}. {drawn.caption.format(rank=book.rank)}*{lacks}\n"
-    if len(missing) == len(book.backbones):
-        return caption
+    needs = {b: drawn.needs(book, b) for b in book.backbones}
+    missing = {b: text for b, names in needs.items() if (text := book.missing(*names))}
+    caption = f"*{drawn.title}. {drawn.caption.format(rank=book.rank)}*"
+    if len(missing) == len(needs):
+        return f"{caption} **{book.missing(*itertools.chain(*needs.values()))}.**\n"
+    lacks = "".join(f" **{BACKBONES[b]}: {text}.**" for b, text in missing.items())
     dark, light = (f"figures/{_file(name, scheme)}" for scheme in ("dark", "light"))
     return (
         f'<picture>\n  <source media="(prefers-color-scheme: dark)" srcset="{dark}">\n'
-        f'  <img alt="{drawn.title}" src="{light}">\n</picture>\n\n{caption}'
+        f'  <img alt="{drawn.title}" src="{light}">\n</picture>\n\n{caption}{lacks}\n'
     )
 
 

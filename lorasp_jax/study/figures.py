@@ -1,5 +1,8 @@
 """Figures 1, 3, 4 and 6 of the paper, for the backbones of a book, whose results must be there."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
@@ -126,9 +129,7 @@ def figure_6(book: Book) -> Figure:
         b: [naming.by_depth(tower) for tower in _first_boxes(book, b)] for b in book.backbones
     }
     figure = Figure(figsize=(10, 2.5 * len(towers)), layout="constrained")
-    widths = [
-        [sum(map(len, tower.values())) + len(tower) for tower in row] for row in towers.values()
-    ]
+    widths = [[sum(map(_width, tower.values())) for tower in row] for row in towers.values()]
     grid = figure.subplots(
         len(towers), len(TOWERS), sharey=True, squeeze=False, width_ratios=np.max(widths, axis=0)
     )
@@ -147,6 +148,11 @@ def _first_boxes(book: Book, backbone: str) -> list[dict[str, list[list[float]]]
     return [boxes.get(tower, {}) for tower in TOWERS]
 
 
+def _width(layers: Sequence[Any]) -> int:
+    """Return the room for the boxes of some layers, their label and a gap."""
+    return max(len(layers), 2) + 1
+
+
 def _boxes(axes: Axes, linears: dict[str, list[list[float]]], color: str) -> None:
     """Draw a box for each layer; the layers of one linear map stand side by side."""
     keys = ("whislo", "q1", "med", "q3", "whishi")
@@ -155,7 +161,7 @@ def _boxes(axes: Axes, linears: dict[str, list[list[float]]], color: str) -> Non
         statistics += [{**dict(zip(keys, five, strict=True)), "fliers": []} for five in layers]
         positions += range(start, start + len(layers))
         ticks.append(start + (len(layers) - 1) / 2)
-        start += len(layers) + 1
+        start += _width(layers)
     if not statistics:
         return
     axes.bxp(

@@ -122,17 +122,15 @@ def _by_backbone(book: Book, table: Callable[[Book, str], str]) -> str:
 def _films(book: Book, names: Collection[str]) -> str:
     """Show the rank maps that exist, and say how to make others."""
     shown = [b for b in book.backbones if f"rank_map_{b}.gif" in names]
-    films = "".join(
-        f"![An episode of {BACKBONES[b]} with its active ranks](figures/rank_map_{b}.gif)\n\n"
-        for b in shown
-    )
-    what = "Rank maps" if shown else "A rank map"
-    tint = "a film of an episode in which each image patch is tinted by its active rank"
+    images = [f"![Rank map of {BACKBONES[b]}](figures/rank_map_{b}.gif)" for b in shown]
+    films = f"{markdown([BACKBONES[b] for b in shown], [images])}\n" if shown else ""
     command = (
         f"python -m lorasp_jax.report rank-map runs/paper/{book.backbones[0]}/multi/lora_sp/s0"
     )
-    start = f"*{what}: {tint}.* " if shown else f"{what}, {tint}, is made by "
-    return f"{films}{start}`{command}`.\n"
+    return (
+        f"{films}A rank map is a film of an episode in which each image patch is tinted by its "
+        f"active rank: `{command}`.\n"
+    )
 
 
 def _total(book: Book) -> str:

@@ -34,7 +34,7 @@ def shared_directions(book: Book) -> Figure:
         _rows(axes, [_title(pair) for pair in pairs[backbone]])
         axes.set_xlim(0, 1)
         axes.set_title(BACKBONES[backbone], loc="left")
-        axes.set_xlabel("shared use of directions")
+        axes.set_xlabel("overlap of directions in use")
     grid[0][0].plot([], [], "o", mfc="none", color="gray", label="by chance")
     _legend(figure, grid[0][0])
     return figure

@@ -6,7 +6,7 @@ from lorasp_jax.study.book import BACKBONES, NONE, Book, markdown
 from lorasp_jax.study.claims import Claim, Criterion, Judged, Outcome, verdict
 
 _WORDS = {
-    "holds": ("claim holds", "claims hold"),
+    "holds": ("holds", "hold"),
     "does not hold": ("does not hold", "do not hold"),
     "cannot be told": ("cannot be told", "cannot be told"),
     "not yet run": ("awaits its runs", "await their runs"),
@@ -18,13 +18,14 @@ def summary(claims: tuple[Claim, ...], book: Book, judged: Judged) -> str:
     """Count the claims with each verdict, by backbone."""
     lines = []
     for backbone in book.backbones:
+        verdicts = {c.number: _verdict(judged, c, backbone) for c in claims}
         parts = []
         for name, words in _WORDS.items():
-            numbers = [c.number for c in claims if _verdict(judged, c, backbone) == name]
-            if numbers:
-                text = f"{len(numbers)} {words[len(numbers) > 1]}"
+            if numbers := [number for number, found in verdicts.items() if found == name]:
+                text = f"**{len(numbers)} {words[len(numbers) > 1]}**"
                 parts.append(f"{text} ({', '.join(map(str, numbers))})")
-        lines.append(f"- **{BACKBONES[backbone]}**: {', '.join(parts)}")
+        tested = len(claims) - [*verdicts.values()].count(NONE)
+        lines.append(f"- {BACKBONES[backbone]}: of {tested} claims, {', '.join(parts)}")
     return "\n".join(lines)
 
 

@@ -81,11 +81,11 @@ def test_rank_maps_are_shown_if_there_are_any(tmp_path):
     (tmp_path / "figures").mkdir()
     page.write(synthetic.study("smoke"), {}, tmp_path)
     text = (tmp_path / "study.md").read_text()
-    assert "A rank map, a film of an episode" in text
+    assert "\nA rank map is a film of an episode" in text
     (tmp_path / "figures/rank_map_pi0.gif").touch()
     page.write(synthetic.study("smoke"), {}, tmp_path)
     text = (tmp_path / "study.md").read_text()
-    assert "![An episode of π0 with its active ranks](figures/rank_map_pi0.gif)" in text
+    assert "| π0 |\n| --- |\n| ![Rank map of π0](figures/rank_map_pi0.gif) |\n" in text
     assert "report rank-map runs/paper/pi0/multi/lora_sp/s0" in text
 
 
@@ -109,7 +109,7 @@ def test_a_study_without_results():
     assert f"0 of {len(synthetic.study().cells)} runs so far" in text
     assert "holds**" not in section(text, "Claims").partition("A claim is tested")[0]
     assert "*Figure 1. Multi-task" in text
-    assert "**0 of 24 runs so far.**" in text
+    assert "**0 of 48 runs so far.**" in text
 
 
 @pytest.mark.parametrize("scale", ["accelerator", "smoke"])

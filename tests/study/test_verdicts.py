@@ -8,6 +8,8 @@ from lorasp_jax.study.claims import judge_all
 from tests.study import synthetic
 
 CLAIMS = synthetic.study().claims
+TESTED = {b: sum(b in claim.tests for claim in CLAIMS) for b in ("pi0", "smolvla")}
+"""Number of claims that the study tests."""
 NAMES = tuple(cell.name for cell in synthetic.study().cells)
 
 
@@ -28,12 +30,15 @@ def some():
 
 
 def test_claims_are_counted_by_verdict(some):
+    number = TESTED["smolvla"]
     first, second = shown(verdicts.summary, some).splitlines()
-    assert first.startswith("- **π0**: 2 claims hold (1, 8), ")
-    assert " await their runs (2, 3, 4, " in first
-    assert "hold" not in second
+    assert first.startswith(f"- π0: of {TESTED['pi0']} claims, **2 hold** (1, 8), ")
+    assert " await their runs** (2, 3, 4, " in first
+    assert second.startswith(f"- SmolVLA: of {number} claims, **{number} await their runs** (1, ")
     one = {n: r for n, r in some.items() if "lora_r64" not in n}
-    assert shown(verdicts.summary, one).startswith("- **π0**: 1 claim holds (8), ")
+    assert shown(verdicts.summary, one).startswith(
+        f"- π0: of {TESTED['pi0']} claims, **1 holds** (8), "
+    )
 
 
 def test_claims_say_how_many_runs_there_are(some):
