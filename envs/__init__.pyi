@@ -9,6 +9,6 @@ from .env import Env as Env
 from .experts.collection import collect as collect
 from .experts.collection import expert_success as expert_success
 from .making import make as make
-from .scene.randomization import Randomization as Randomization
+from .scene.ranges import Randomization as Randomization
 from .state import State as State
 from .state import Trajectory as Trajectory

@@ -25,7 +25,8 @@ from envs.physics.physics import Physics
 from envs.rendering.renderer import Appearance, Renderer, RenderModel
 from envs.robots import Robot
 from envs.scene import distractors, placing, randomization, scene
-from envs.scene.randomization import Draw, Randomization
+from envs.scene.randomization import Draw
+from envs.scene.ranges import Randomization
 from envs.state import Changes, Data, Poses, State, Trajectory, where
 from envs.tasks import Layout, Task, View
 

@@ -1,6 +1,7 @@
 """Privileged state of a world as one flat vector with a documented layout.
 
-Positions and directions are in the robot's base frame, which is the world frame.
+Positions and directions are in the world frame, whose origin is on the table. It is the robot's
+base frame unless `Randomization.table_height` moves the robot.
 """
 
 from collections.abc import Iterable

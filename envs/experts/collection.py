@@ -17,7 +17,8 @@ from envs.datasets.episodes import Episodes, concatenate
 from envs.env import Env
 from envs.experts import expert, traced
 from envs.making import AnyRobot, make
-from envs.scene.randomization import Draw, Randomization, prepare
+from envs.scene.randomization import Draw, prepare
+from envs.scene.ranges import Randomization
 from envs.state import Poses
 
 # Default number of worlds per call, our choice: enough to fill the device, within its memory.

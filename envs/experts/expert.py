@@ -68,6 +68,8 @@ def _plan(env: Env, info: dict, key: jax.Array) -> Plan:
     heights = waypoints.position[:, 2] - waypoints.reach
     scaled = waypoints.position.at[:, 2].add((size - 1) * heights)
     positions = scaled + noise + waypoints.reach[:, None] * rotations[:, :, 2]
+    if info["draw"]:  # the robot's inverse kinematics start at its mount, not at the table
+        positions = positions.at[:, 2].add(info["draw"].table_height)
     joints = _joints(env.robot, positions, rotations, start[:-1])
     knots = jnp.concatenate([joints, waypoints.opening[:, None]], axis=1)
     knots = jnp.concatenate([start[None], knots])

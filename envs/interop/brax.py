@@ -16,7 +16,8 @@ import jax.numpy as jnp
 from envs import checks
 from envs.compilation import fast_cpu
 from envs.env import Env
-from envs.scene.randomization import Randomization, prepare
+from envs.scene.randomization import prepare
+from envs.scene.ranges import Randomization
 from envs.state import State
 
 try:

@@ -18,7 +18,8 @@ import numpy as np
 from envs import checks
 from envs.env import Env
 from envs.making import make as make_env
-from envs.scene.randomization import Randomization, prepare
+from envs.scene.randomization import prepare
+from envs.scene.ranges import Randomization
 from envs.state import State
 
 try:

@@ -13,7 +13,6 @@ from envs.mjcf.reading import Arm, Gripper
 from envs.rendering.model import STAND_IN_GROUP, is_visible
 from envs.robots import Robot
 
-_BASE = "base"
 _PREFIX = "robot/"  # for all names in the user's file, to avoid clashes with the scene and tasks
 _DROPPED = ("keys", "sensors", "actuators", "tendons", "equalities", "pairs", "excludes", "lights")
 _UNSET = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default color; such a geom has that of its material
@@ -43,7 +42,7 @@ class UserBody:
 
     def mjcf(self, _: Robot, /) -> tuple[str, str]:
         """Return an empty base body, which `attach` fills, and no actuators."""
-        return f'<body name="{_BASE}"/>', ""
+        return f'<body name="{robots.BASE}"/>', ""
 
     def attach(self, robot: Robot, scene: mujoco.MjSpec) -> None:
         """Attach the robot to the base body of the scene, and add the actuators."""
@@ -51,7 +50,7 @@ class UserBody:
         for name in dir(own.option):
             if not name.startswith("_"):
                 setattr(own.option, name, getattr(scene.option, name))
-        scene.body(_BASE).add_frame().attach_body(own.body(self.root), _PREFIX, "")
+        scene.body(robots.BASE).add_frame().attach_body(own.body(self.root), _PREFIX, "")
         for side, finger, pad in zip(("left", "right"), self.fingers, self.pads, strict=True):
             joint = scene.joint(_PREFIX + finger)
             joint.name = side

@@ -19,14 +19,12 @@ import mujoco
 import numpy as np
 
 from envs.physics.kinematics import Kinematics
+from envs.scene.ranges import MAX_GROWTH
 from envs.state import MOVING, Changes, Data
 
 Backend = Literal["jax", "warp"]
 BACKENDS: tuple[str, ...] = get_args(Backend)
 """jax runs everywhere; warp is much faster on NVIDIA GPUs, and runs on CPU, slowly, for tests."""
-
-MAX_GROWTH = 1.25
-"""Maximum factor on geom sizes, our choice; Warp's bounding volumes are enlarged by it."""
 
 
 @functools.cache

@@ -8,6 +8,7 @@ import importlib.util
 from types import ModuleType
 
 from envs.robots._robot import (
+    BASE,
     TIP_LENGTH,
     TIP_RADIUS,
     WRIST_AXES,
@@ -31,6 +32,7 @@ from envs.robots.arm_kinematics import (
 )
 
 __all__ = [
+    "BASE",
     "TIP_LENGTH",
     "TIP_RADIUS",
     "WRIST_AXES",

@@ -13,6 +13,7 @@ from typing import Protocol
 import mujoco
 import numpy as np
 
+BASE = "base"  # name of the body at the robot's mount
 TIP_LENGTH = 0.012  # m from the tcp to the end of the finger tips on every hand; our choice
 TIP_RADIUS = 0.005  # m, of the sphere that collides at each finger tip; our choice
 
@@ -121,7 +122,7 @@ class Primitives:
         """Do nothing: `mjcf` is complete."""
 
     def _bodies(self, robot: Robot) -> str:
-        xml, closing = f'<body name="base">{self.base}', "</body>"
+        xml, closing = f'<body name="{BASE}">{self.base}', "</body>"
         for i, (fixed, geoms) in enumerate(zip(robot.chain, self.links, strict=True)):
             xml += f'<body name="link{i + 1}" {pose(fixed)} gravcomp="1">'
             xml += f'<joint name="joint{i + 1}" range="{robot.lower[i]} {robot.upper[i]}" '

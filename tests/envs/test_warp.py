@@ -8,7 +8,7 @@ import pytest
 import envs
 from envs.experts import expert
 from envs.physics import physics
-from envs.scene.randomization import Randomization
+from envs.scene.ranges import Randomization
 from envs.state import Poses
 
 pytest.importorskip("warp")

@@ -10,10 +10,10 @@ import pytest
 from jax import monitoring
 
 import envs
-from envs import actions
+from envs import actions, robots
 from envs.experts import collection, expert
 from envs.scene import randomization
-from envs.scene.randomization import Randomization
+from envs.scene.ranges import Randomization
 
 WORLDS, STEPS = 2, 50  # the expert lifts the grape at about step 35
 FIELDS = [field.name for field in dataclasses.fields(Randomization)]
@@ -24,7 +24,7 @@ PLACES, MOTION, LOOKS = {"position", "turn"}, {"mass", "friction", "gains", "lat
 FIXED = {
     "position": 0.01, "turn": 0.3, "size": 1.1, "mass": 3.0, "friction": 0.5, "gains": 0.6,
     "camera_position": 0.02, "camera_turn": 0.1, "field_of_view": 5.0, "light_turn": 0.5,
-    "brightness": 0.5, "colour": 0.2, "latency": 0.04,
+    "brightness": 0.5, "colour": 0.2, "latency": 0.04, "table_height": 0.03,
 }  # fmt: skip
 
 
@@ -82,7 +82,7 @@ def test_a_range_changes_only_its_own_outcome(episode, neutral, name):
     assert equal(start.info["instruction"], start0.info["instruction"])
     if name in LOOKS:
         assert equal(end.data.qpos, end0.data.qpos)
-    if name in LOOKS | PLACES | {"size"}:
+    if name in LOOKS | PLACES | {"size", "table_height"}:
         assert not equal(seen["image"]["side"], seen0["image"]["side"])
     if name in MOTION:
         assert equal(seen, seen0)
@@ -117,6 +117,37 @@ def test_cameras_move_along_and_about_their_axes(env, episode, neutral):
     relative = np.einsum("wnji,wnjk->wnik", data0.cam_xmat, data.cam_xmat)
     angle = np.arccos((np.trace(relative, axis1=-2, axis2=-1) - 1) / 2)
     np.testing.assert_allclose(angle, 0.1 * np.sqrt(3), atol=1e-4)
+
+
+def test_a_higher_table_is_a_lower_robot(env):
+    """Objects and the side camera stay; the robot moves with its wrist camera."""
+    layout = env.task.place(jax.random.key(0))
+    poses = []
+    for height in (0.0, 0.03):
+        ranges = Randomization(table_height=(height, height))
+        draw, placed = randomization.draw(jax.random.key(1), ranges, env.model, layout)
+        assert equal(placed, layout)
+        poses.append(env._start(draw, placed, jnp.append(jnp.asarray(env.robot.home), 0.04)))
+    moved = {name: np.asarray(getattr(poses[1], name) - getattr(poses[0], name)) for name in (
+        "geom_xpos", "cam_xpos", "cam_xmat", "geom_xmat"
+    )}  # fmt: skip
+    robot = randomization.in_subtrees(env.model, [robots.BASE])
+    lowered = np.where(robot[env.model.geom_bodyid][:, None], [0, 0, -0.03], 0)
+    np.testing.assert_allclose(moved["geom_xpos"], lowered, atol=1e-6)
+    np.testing.assert_allclose(moved["cam_xpos"], [[0, 0, 0], [0, 0, -0.03]], atol=1e-6)
+    assert not moved["geom_xmat"].any()
+    assert not moved["cam_xmat"].any()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("height", [-0.04, 0.04])
+def test_experts_succeed_at_other_table_heights(task_name, robot_name, height):
+    ranges = Randomization(table_height=(height, height))
+    success = envs.expert_success(
+        task_name, robot_name, num_episodes=32, key=jax.random.key(1), ranges=ranges
+    )
+    assert success.mean() >= 0.95
 
 
 @pytest.mark.slow
@@ -187,9 +218,16 @@ def mujoco_xml(env):
     return scene.mjcf(env.task.scene, env.robot)
 
 
+def test_changed_ranges():
+    assert Randomization().changed() == Randomization(size=(1, 1)).changed() == {}
+    changed = {"turn": (0.0, 0.1), "size": (0.9, 1.0)}
+    assert Randomization(**changed).changed() == changed
+
+
 @pytest.mark.parametrize(
     ("ranges", "message"),
     [
+        ({"table_height": (0.1, 0.0)}, "table_height must be two finite numbers"),
         ({"mass": (2.0, 1.0)}, "mass must be two finite numbers"),
         ({"friction": (0.0, 1.0)}, "friction is a factor"),
         ({"mass": 2.0}, "mass must be two finite numbers"),
