@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
+from envs.scene.ranges import Randomization
 from lorasp_jax.peft import Method, _fields
 
 SCALES = ("smoke", "cpu", "accelerator")
@@ -228,6 +229,9 @@ class Config:
     and regular expressions over layer paths."""
     image_size: int = 64
     """Height and width of simulated camera images [pixels]; the backbone resizes them."""
+    scene: Randomization = field(default_factory=Randomization)
+    """Ranges, low and high, from which every simulated episode draws its scene: demonstrations and
+    evaluation. Equal ends fix a value; the defaults change nothing."""
     data: DataConfig = field(default_factory=DataConfig)
     """Training data."""
     optim: OptimConfig = field(default_factory=OptimConfig)
@@ -248,6 +252,11 @@ class Config:
     seed: int = field(default=0, metadata={"max": 2**32 - 1})
     """Seed of every random stream of the run."""
 
+    @property
+    def ranges(self) -> Randomization | None:
+        """`scene`, or None if it changes nothing: worlds then draw nothing."""
+        return self.scene if self.scene.changed() else None
+
     def evaluates(self, step: int) -> bool:
         """Whether to evaluate when logging `step`; the final evaluation is separate."""
         every, previous = self.evaluation.every, step - self.log_every
@@ -257,6 +266,7 @@ class Config:
         """Validate the fields and their combinations."""
         _fields.check_fields(self)
         _fields.check_fields(self.peft, "peft.")
+        _fields.check_fields(self.scene, "scene.")
         _check_name(self.name)
         _at_least(1, self, "fsdp", "log_every", "checkpoint_every", "image_size")
         if self.control_dt <= 0 or not 0 <= self.seed < 2**32:
@@ -264,6 +274,7 @@ class Config:
                 "control_dt must be above 0 and seed must lie in [0, 2**32), "
                 f"got {self.control_dt} and {self.seed}"
             )
+        self.scene.check(self.control_dt)
         if self.data.fresh_every % self.log_every:
             raise ValueError(
                 f"data.fresh_every must be a multiple of log_every, got {self.data.fresh_every} "

@@ -16,6 +16,7 @@ from envs.compilation import messages
 from envs.datasets.writing import atomic_file
 from envs.env import Env
 from envs.physics import physics
+from envs.scene.randomization import Draw
 from envs.state import Poses
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config
@@ -45,7 +46,7 @@ class Evaluation(Callback):
         self,
         compile_rollout: Callable[[Config, str], tuple[Env, Callable]] = compiled_rollout,
         evaluate: Callable[..., Result] = evaluate,
-        write_video: Callable[[Env, Poses, Path], None] | None = video.write_episode,
+        write_video: Callable[[Env, Poses, Path, Draw | None], None] | None = video.write_episode,
     ) -> None:
         """Create the callback; nothing compiles until the first evaluation.
 
@@ -53,8 +54,8 @@ class Evaluation(Callback):
             compile_rollout: (config, task) -> the task's environment and its rollout, whose first
                 call compiles.
             evaluate: evaluates a policy, like `results.evaluate`.
-            write_video: renders an episode's poses and writes the video to a file; None: no videos
-                and images.
+            write_video: renders an episode and writes the video to a file, like
+                `video.write_episode`; None: no videos and images.
         """
         self._compile_rollout, self._evaluate = compile_rollout, evaluate
         self._write_video = write_video
@@ -101,7 +102,8 @@ class Evaluation(Callback):
             images = {name: np.asarray(i[0, 0]) for name, i in run.episodes[task].image.items()}
             video.write_image(run.folder / f"cameras_{task}.png", video.side_by_side(images))
             with atomic_file(run.folder / f"rollout_{task}.mp4") as unfinished:
-                self._write_video(self._rollouts[task][0], result.poses, unfinished)
+                env = self._rollouts[task][0]
+                self._write_video(env, result.poses, unfinished, result.draw)
 
     def _evaluate_tasks(self, run: Run, when: str, episodes: int = 0) -> dict[str, Result]:
         """Evaluate all tasks, concurrently unless the physics runs in Warp.

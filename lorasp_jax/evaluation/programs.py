@@ -15,6 +15,7 @@ import numpy as np
 import envs
 from envs.compilation import fast_cpu
 from envs.env import Env
+from envs.scene.ranges import Randomization
 from envs.state import State
 from lorasp_jax.config import Config
 from lorasp_jax.evaluation.rollout import Rollout, act, as_rollout, num_calls, predict
@@ -25,7 +26,11 @@ from lorasp_jax.training.distributed import mesh as meshes
 
 
 def split_rollout(
-    env: Env, *, execute_steps: int = 5, denoise_steps: int = 10
+    env: Env,
+    *,
+    execute_steps: int = 5,
+    denoise_steps: int = 10,
+    ranges: Randomization | None = None,
 ) -> Callable[[Policy, jax.Array], Rollout]:
     """Create a function like a jitted `make_rollout`, with equal results up to rounding.
 
@@ -40,7 +45,7 @@ def split_rollout(
         policy, place = _without_names(prepared(policy)), _placement(policy)
         # Programs are compiled again for arrays placed otherwise, so all follow the keys.
         reset_key, sample_key = jax.device_put(tuple(jax.random.split(key)), place)
-        state = _reset(env, reset_key)
+        state = _reset(env, reset_key, ranges)
         prompts = jax.device_put(rows[np.asarray(state.info["instruction"])], place)
         records = []
         for call in range(calls):
@@ -69,7 +74,7 @@ def compiled_rollout(
     settings, size = config.evaluation, config.image_size
     env = _environment(task, config.robot, settings.worlds, size, config.control_dt)
     steps = {"execute_steps": settings.execute_steps, "denoise_steps": settings.denoise_steps}
-    return env, split_rollout(env, **steps)
+    return env, split_rollout(env, ranges=config.ranges, **steps)
 
 
 @functools.cache
@@ -85,8 +90,8 @@ def _sampler(model: Any) -> Any:
 
 
 @functools.partial(fast_cpu.jit, static_argnums=0)
-def _reset(env: Env, key: jax.Array) -> State:
-    return env.reset(key)
+def _reset(env: Env, key: jax.Array, ranges: Randomization | None) -> State:
+    return env.reset(key, ranges)
 
 
 @functools.partial(fast_cpu.jit, static_argnums=0)

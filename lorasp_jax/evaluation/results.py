@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from envs.env import Env
+from envs.scene.randomization import Draw
 from envs.state import Poses
 from lorasp_jax.evaluation import metrics
 from lorasp_jax.evaluation.programs import split_rollout
@@ -30,6 +31,7 @@ class Result:
             all policy calls.
         poses: poses of one recorded episode, a successful one if possible; the leading axis is
             time.
+        draw: randomized values of that episode; None without ranges.
     """
 
     success: float
@@ -40,6 +42,7 @@ class Result:
     active_rank: dict[str, dict[str, list[float]]]
     active_rank_histogram: dict[str, np.ndarray]
     poses: Poses = dataclasses.field(repr=False)
+    draw: Draw | None = dataclasses.field(default=None, repr=False)
 
 
 def evaluate(
@@ -84,6 +87,7 @@ def _result(runs: Sequence[Rollout]) -> Result:
     """Aggregate batches of episodes."""
     success = np.concatenate([run.success for run in runs])
     successes, episodes = int(success.sum()), len(success)
+    world = _recorded_world(runs[0])
     histograms = [run.active_rank_histogram for run in runs]
     return Result(
         success=successes / episodes,
@@ -98,7 +102,8 @@ def _result(runs: Sequence[Rollout]) -> Result:
         active_rank_histogram=jax.tree.map(
             lambda *counts: np.sum(counts, axis=(0, 1), dtype=np.int64), *histograms
         ),
-        poses=_recorded_episode(runs[0]),
+        poses=jax.tree.map(lambda x: x[: max(int(runs[0].steps[world]), 1), world], runs[0].poses),
+        draw=jax.tree.map(lambda x: x[world], runs[0].draw),
     )
 
 
@@ -108,7 +113,6 @@ def _mean_ranks(run: Rollout) -> metrics.LayerRanks:
     return jax.tree.map(lambda ranks: np.tensordot(weights, ranks, axes=1), run.active_rank)
 
 
-def _recorded_episode(run: Rollout) -> Poses:
-    """Return one episode's poses: of the first recorded world that succeeds, or else of world 0."""
-    world = int(np.argmax(run.success[:RECORDED_WORLDS]))
-    return jax.tree.map(lambda x: x[: max(int(run.steps[world]), 1), world], run.poses)
+def _recorded_world(run: Rollout) -> int:
+    """Return the first recorded world that succeeds, or else world 0."""
+    return int(np.argmax(run.success[:RECORDED_WORLDS]))

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from envs.env import Env
-from envs.scene.randomization import Randomization
+from envs.scene.randomization import Draw
+from envs.scene.ranges import Randomization
 from envs.state import Poses, State
 from lorasp_jax.evaluation import metrics
 from lorasp_jax.policies.policy import Policy
@@ -30,6 +31,7 @@ class Rollout:
         active_rank_histogram: `[calls, R + 1]` int32 per tower; see `metrics.rank_histogram`. R is
             the largest adapter rank.
         poses: poses of the first worlds at every control step, leading axes `[time, worlds]`.
+        draw: randomized values of these worlds, leading axis `[worlds]`; None without ranges.
     """
 
     success: jax.Array
@@ -38,6 +40,7 @@ class Rollout:
     active_rank: metrics.LayerRanks
     active_rank_histogram: dict[str, jax.Array]
     poses: Poses
+    draw: Draw | None
 
 
 def make_rollout(
@@ -50,7 +53,7 @@ def make_rollout(
     """Create a pure function (policy, key) that runs `env.num_envs` episodes, to be jitted.
 
     Every `execute_steps` control steps, the policy observes and samples a new chunk in
-    `denoise_steps` Euler steps. `ranges` is passed to `env.reset`; its colors are not recorded.
+    `denoise_steps` Euler steps. `ranges` is passed to `env.reset`.
     """
 
     def rollout(policy: Policy, key: jax.Array) -> Rollout:
@@ -149,6 +152,7 @@ def as_rollout(
         active_rank=ranks,
         active_rank_histogram=histogram,
         poses=jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), poses),
+        draw=jax.tree.map(lambda x: x[:RECORDED_WORLDS], state.info["draw"]),
     )
 
 

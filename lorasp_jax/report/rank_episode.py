@@ -14,6 +14,7 @@ import numpy as np
 
 from envs.compilation import fast_cpu, messages
 from envs.env import Env
+from envs.scene.randomization import Draw
 from envs.state import Poses, State
 from lorasp_jax.evaluation import metrics
 from lorasp_jax.evaluation.rollout import RECORDED_WORLDS
@@ -21,6 +22,7 @@ from lorasp_jax.peft import Aux
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import RawObservation
 from lorasp_jax.training.random_streams import RandomStream
+from lorasp_jax.training.run_folder import recorded_ranges
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,7 @@ class Episode:
         poses: poses before each step, leading axis T.
         patches: robot camera -> `[T, P, P]`, see `patch_ranks`.
         towers: tower -> `[T]` active rank, averaged over layers and tokens.
+        draw: randomized values of the world; None if the run was not randomized.
     """
 
     instruction: str
@@ -43,6 +46,7 @@ class Episode:
     poses: Poses
     patches: dict[str, np.ndarray]
     towers: dict[str, np.ndarray]
+    draw: Draw | None = None
 
 
 class Recorder:
@@ -56,7 +60,7 @@ class Recorder:
             config: the run's config, as JSON values.
         """
         self._policy, self._settings = policy.with_sampler(), config["evaluation"]
-        self._seed = config["seed"]
+        self._seed, self._ranges = config["seed"], recorded_ranges(config)
         self._worlds = min(self._settings["episodes"], self._settings["num_envs"])
         run_policy = functools.partial(_run_policy, self._settings["denoise_steps"])
         options = fast_cpu.without_simulation()
@@ -82,7 +86,7 @@ class Recorder:
     def play(self, env: Env, key: jax.Array, world: int) -> Episode:
         """Repeat the episode that `evaluation.make_rollout` runs in one world with this key."""
         reset_key, sample_key = jax.random.split(key)
-        worlds = dataclasses.replace(env, num_envs=self._worlds).reset(reset_key)
+        worlds = dataclasses.replace(env, num_envs=self._worlds).reset(reset_key, self._ranges)
         state: State = jax.tree.map(lambda x: x[world : world + 1], worlds)
         instruction = int(state.info["instruction"][0])
         rows = self._policy.processor.prompts.rows(env.instructions)
@@ -101,7 +105,8 @@ class Recorder:
         poses, patches, towers = jax.tree.map(lambda *x: np.stack(x), *steps)
         poses = jax.tree.map(lambda x: x[:, 0], poses)
         text = env.instructions[instruction]
-        return Episode(text, bool(state.info["success"][0]), poses, patches, towers)
+        draw = jax.tree.map(lambda x: x[0], state.info["draw"])
+        return Episode(text, bool(state.info["success"][0]), poses, patches, towers, draw)
 
     def _call(
         self, key: jax.Array, world: int, observation: RawObservation, row: jax.Array

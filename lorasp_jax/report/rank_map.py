@@ -1,19 +1,17 @@
 """Film where rank goes: an episode in which each image patch is tinted by its active rank."""
 
-import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
-import jax
 import numpy as np
 
 import envs
 from envs.datasets.files import check_local
 from envs.datasets.writing import atomic_file
 from envs.env import Env
-from envs.rendering.renderer import RayRenderer
 from envs.rendering.video import write_gif, write_video
 from lorasp_jax.adapters.io import native
+from lorasp_jax.evaluation.video import render_episode
 from lorasp_jax.report import rank_film
 from lorasp_jax.report.rank_episode import Episode, Recorder
 from lorasp_jax.training import records
@@ -84,11 +82,10 @@ def _tasks(run: Path, task: str | None) -> list[str]:
 
 def film(env: Env, episode: Episode) -> np.ndarray:
     """Draw an episode, uint8 `[T, H, W, 3]`."""
-    renderer = RayRenderer(env.render_model, _PIXELS, 1)
-    images = jax.jit(dataclasses.replace(env, renderer=renderer).render)(episode.poses)
+    images = render_episode(env, episode.poses, episode.draw, _PIXELS)
     outcome = "success" if episode.success else "failure"
     return rank_film.draw(
-        {camera: np.asarray(image) for camera, image in images.items()},
+        images,
         episode.patches,
         episode.towers,
         title=f"{episode.instruction} ({outcome})",

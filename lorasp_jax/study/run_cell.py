@@ -126,6 +126,8 @@ def _shared(
         "image_size": config.image_size,
         "control_dt": config.control_dt,
     }
+    if ranges := config.scene.changed():
+        settings["scene"] = ranges
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
     folder = root / f"{Path(config.robot).stem}_{digest}"
 

@@ -71,5 +71,6 @@ def _collect(
         control_dt=config.control_dt,
         num_envs=config.data.num_envs,
         action_noise=config.data.action_noise,
+        ranges=config.ranges,
         progress=progress,
     )

@@ -5,7 +5,7 @@ By itself, tyro keeps the line breaks of docstrings whose continuation lines are
 
 import dataclasses
 import functools
-from typing import get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import docstring_parser
 import tyro
@@ -25,7 +25,7 @@ def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
     fields = (
         StructFieldSpec(
             field.name,
-            types[field.name],
+            _with_bounds(types[field.name]),
             getattr(info.default, field.name),
             helptext=functools.partial(_text, info.type, field.name),
         )
@@ -33,6 +33,13 @@ def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
         if field.init
     )
     return StructConstructorSpec(instantiate=info.type, fields=tuple(fields))
+
+
+def _with_bounds(kind: Any) -> Any:
+    """Return the type of a field; the help text names the two values of a range."""
+    if kind == tuple[float, float]:
+        return Annotated[kind, tyro.conf.arg(metavar="LOW HIGH")]
+    return kind
 
 
 def _text(owner: type, name: str) -> str | None:

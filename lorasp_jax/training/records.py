@@ -29,5 +29,6 @@ CONFIG: Schema = {
     "peft": {"method": str},
     "model": {"backbone": str, "size": str},
     "optim": {"steps": int},
+    "scene?": {str: (float, float)},
 }
 WITH_RANK: Schema = CONFIG | {"peft": {"method": str, "rank": int}}

@@ -22,6 +22,7 @@ from tensorboardX.proto.summary_pb2 import Summary
 from envs.datasets.files import as_value_error, check_only_files, read_bytes
 from envs.datasets.locks import acquire
 from envs.datasets.writing import TEMPORARY_SUFFIX, write_text
+from envs.scene.ranges import Randomization
 from lorasp_jax.config import Config
 from lorasp_jax.peft._settings import upgrade
 from lorasp_jax.storage.digest import verify_digest, with_digest
@@ -38,9 +39,29 @@ STOPPED = "stopped.json"
 
 
 def to_json(config: Config) -> dict[str, Any]:
-    """Convert a config to JSON values, including the name of the adapter method."""
+    """Convert a config to JSON values, including the name of the adapter method.
+
+    `scene` has only the ranges that differ from the defaults, and is absent if none do.
+    """
     fields = json.loads(json.dumps(dataclasses.asdict(config)))
+    scene = fields.pop("scene")
+    if changed := config.scene.changed():
+        fields["scene"] = {name: scene[name] for name in changed}
     return {**fields, "peft": {"method": type(config.peft).__name__, **fields["peft"]}}
+
+
+def recorded_ranges(config: Mapping[str, Any]) -> Randomization | None:
+    """Return `Config.ranges` of a config that `to_json` converted.
+
+    Raises:
+        ValueError: the config has an unknown range.
+    """
+    ranges = config.get("scene", {})
+    known = [field.name for field in dataclasses.fields(Randomization)]
+    if unknown := [name for name in ranges if name not in known]:
+        raise ValueError(f"unknown range {unknown[0]!r}: choose from {', '.join(known)}")
+    found = {name: (value[0], value[1]) for name, value in ranges.items()}
+    return Randomization(**found) if found else None
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:

@@ -34,10 +34,11 @@ def test_evaluation_runs_at_the_next_log_step(run):
 
     def evaluate(policy, env, key, episodes, **_):
         evaluated.append((env, episodes))
-        return Result(0.5, episodes, (0.4, 0.6), (), 30.0, {}, {}, poses=())
+        return Result(0.5, episodes, (0.4, 0.6), (), 30.0, {}, {}, poses=(), draw="drawn")
 
-    def write_video(env, poses, path):
+    def write_video(env, poses, path, draw):
         assert may_render.wait(60)
+        assert draw == "drawn"
         rendered.append(env)
         path.touch()
 

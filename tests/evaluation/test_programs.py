@@ -13,11 +13,12 @@ from jax import monitoring
 
 from envs.compilation import fast_cpu
 from envs.compilation.alarms import COMPILATION
+from envs.scene.ranges import Randomization
 from envs.state import Data, State
 from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import EvaluationConfig
-from lorasp_jax.evaluation import make_rollout
+from lorasp_jax.evaluation import make_rollout, programs
 from lorasp_jax.evaluation.programs import compiled_rollout, prepared, split_rollout
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import Aux, LoRA, LoRASP, Method
@@ -62,15 +63,16 @@ class Room:
     num_envs: int = 16
 
     def reset(self, key, ranges=None):
-        assert ranges is None
         zero = jnp.zeros(self.num_envs)
         pose = jnp.zeros((self.num_envs, 2, 3))
         info = {
             "success": zero > 0,
             "steps": zero.astype(jnp.int32),
             "instruction": jax.random.randint(key, (self.num_envs,), 0, len(self.instructions)),
+            "draw": None if ranges is None else zero + ranges.turn[0],
         }
         state = jax.random.normal(key, (self.num_envs, 7))
+        state = state if ranges is None else state + ranges.turn[0]
         data = Data(**{f.name: pose for f in dataclasses.fields(Data)})
         return State(data.replace(qpos=state), zero, zero > 0, {}, info)
 
@@ -142,6 +144,31 @@ def test_both_forms_are_equal(room):
     assert_equal(split, jax.jit(make_rollout(room, **settings))(policy(), key))
     assert set(np.unique(split.success)) == {False, True}
     assert split.running[0] == 16 > split.running[-1]
+
+
+def test_randomized_rollouts():
+    """The ranges reach the environment; other ranges need no other programs."""
+    room, key, found = dataclasses.replace(ROOMS[0]), jax.random.key(3), []
+    for index, shift in enumerate((0.5, 0.25)):
+        settings = {"execute_steps": 3, "ranges": Randomization(turn=(shift, shift))}
+        with compilations() as counts:
+            found.append(split_rollout(room, **settings)(policy(), key))
+        assert bool(counts) == (index == 0)
+        assert_equal(found[-1], jax.jit(make_rollout(room, **settings))(policy(), key))
+        assert found[-1].draw.tolist() == 8 * [shift]
+    plain = split_rollout(room, execute_steps=3)(policy(), key)
+    assert plain.draw is None
+    assert len({tuple(r.steps.tolist()) for r in (plain, *found)}) > 1
+
+
+def test_the_config_says_whether_to_randomize(monkeypatch):
+    monkeypatch.setattr(programs, "_environment", lambda *_: ROOMS[0])
+    ranges = Randomization(turn=(0.5, 0.5))
+    plain = dataclasses.replace(CONFIG, evaluation=EvaluationConfig(execute_steps=3))
+    for config, draw in ((plain, None), (dataclasses.replace(plain, scene=ranges), 0.5)):
+        _, rollout = compiled_rollout(config, "press")
+        found = rollout(policy(), jax.random.key(0)).draw
+        assert found is None if draw is None else set(found.tolist()) == {draw}
 
 
 @pytest.mark.parametrize("devices", [1, 2])

@@ -9,7 +9,7 @@ from lorasp_jax.evaluation.results import _result
 from lorasp_jax.evaluation.rollout import Rollout
 
 
-def batch(success, steps, counts):
+def batch(success, steps, counts, randomized=None):
     """A rollout with poses world + time / 100."""
     pose = np.arange(9)[:, None] / 100 + np.arange(len(success))
     return Rollout(
@@ -19,6 +19,7 @@ def batch(success, steps, counts):
         active_rank={"vision": {"fc1": jnp.array([[1.0, 3.0], [5.0, 3.0]])}},
         active_rank_histogram={"vision": jnp.array(counts, jnp.int32)},
         poses=Poses(*(pose,) * 4),
+        draw=randomized and jnp.arange(len(success)),
     )
 
 
@@ -34,4 +35,11 @@ def test_batches_are_aggregated():
     assert result.active_rank_histogram["vision"].tolist() == [3, 2 * max_int32 + 5]
     np.testing.assert_allclose(result.poses[0], [1.0, 1.01, 1.02, 1.03])  # up to its end
     assert "poses" not in repr(result)
+    assert result.draw is None
     np.testing.assert_allclose(_result([second]).poses[0], np.arange(9) / 100)
+
+
+def test_randomized_values_are_those_of_the_recorded_episode():
+    counts = [[0, 1], [0, 1]]
+    for success, world in (([False, False, True], 2), ([False, False, False], 0)):
+        assert _result([batch(success, [9, 9, 9], counts, randomized=True)]).draw == world

@@ -9,6 +9,7 @@ import time
 import pytest
 
 from envs.datasets.episodes import Episodes
+from envs.scene.ranges import Randomization
 from lorasp_jax.study import results, run_cell
 from lorasp_jax.study.held_out import EPISODES, SEED
 from tests import ROOT
@@ -59,6 +60,7 @@ def test_cells_share_demonstrations(tmp_path, collected):
         {"robot": "panda"},
         {"image_size": 32},
         {"control_dt": 0.05},
+        {"scene": Randomization(turn=(0.0, 0.1))},
         {"data": dataclasses.replace(CONFIG.data, episodes=3)},
     ],
 )
@@ -68,6 +70,11 @@ def test_other_settings_need_other_demonstrations(tmp_path, collected, changes):
         patch.setattr(Episodes, "load", lambda path, control_dt: path)
         load(tmp_path, tasks=("press",), **changes)
     assert len(collected) == 2
+
+
+def test_the_folder_of_demonstrations_keeps_its_name(tmp_path, collected):
+    load(tmp_path, tasks=("press",))
+    assert [path.name for path in (tmp_path / "demonstrations").iterdir()] == ["piper_caef2654"]
 
 
 def test_cells_at_the_same_time_collect_once(tmp_path, collected):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import envs
-from lorasp_jax.training.demonstrations import demonstrations, map_threads
+from lorasp_jax.training.demonstrations import demonstrations, fresh_demonstrations, map_threads
 from tests.runs import CONFIG, random_episodes
 
 
@@ -17,6 +17,7 @@ def test_collected_once(tmp_path, monkeypatch):
     def collect(task, **settings):
         calls.append((task, settings["robot"], settings["num_episodes"], settings["control_dt"]))
         settings["progress"](3, 3)
+        assert settings["ranges"] is None
         return random_episodes(task, len(task))
 
     monkeypatch.setattr(envs, "collect", collect)
@@ -30,6 +31,21 @@ def test_collected_once(tmp_path, monkeypatch):
     for task, episodes in second.items():
         assert episodes.task == task
         np.testing.assert_array_equal(episodes.action, first[task].action)
+
+
+def test_fresh_ones_are_randomized_too(tmp_path, monkeypatch):
+    drawn = []
+
+    def collect(task, **settings):
+        drawn.append(settings["ranges"])
+        return random_episodes(task, 0)
+
+    monkeypatch.setattr(envs, "collect", collect)
+    ranges = envs.Randomization(table_height=(0.0, 0.02))
+    config = dataclasses.replace(CONFIG, tasks=("press",), scene=ranges)
+    demonstrations(config, tmp_path, lambda *now: None)
+    fresh_demonstrations(config, 1)
+    assert drawn == [ranges, ranges]
 
 
 def test_a_cache_with_another_control_period_is_rejected(tmp_path):

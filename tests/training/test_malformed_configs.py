@@ -43,6 +43,8 @@ OPTIONS = {
     "peft.energy-target": ["0", "1.5", "nan"],
     "peft.score-function": ["x"],
     "control-dt": ["0", "-0.1", "nan"],
+    "scene.mass": ["1", "x", "nan", None],
+    "scene.wind": ["0"],
     "seed": ["-1", "99999999999", "x"],
     "image-size": ["0"],
     "name": [

@@ -5,6 +5,7 @@ import re
 
 import pytest
 
+from envs.scene.ranges import Randomization
 from lorasp_jax.config import Config
 from lorasp_jax.models.presets import PRESETS
 from lorasp_jax.peft import EnergySchedule, LoRA, LoRASP, LoRASPRelease
@@ -19,6 +20,14 @@ def test_dotted_overrides():
     assert (changed.peft.rank, changed.optim.steps, changed.tasks) == (4, 7, ("press",))
     assert type(changed) is Config
     assert override(CONFIG, []) == CONFIG
+
+
+def test_ranges():
+    options = ["--scene.camera-position", "-0.05", "0.05", "--scene.mass", "1", "2"]
+    ranges = override(CONFIG, options).scene
+    assert ranges == Randomization(camera_position=(-0.05, 0.05), mass=(1, 2))
+    assert override(CONFIG, options).ranges == ranges
+    assert override(CONFIG, ["--scene.mass", "1", "1"]).ranges is None
 
 
 def test_a_bool_is_negated():
@@ -164,5 +173,5 @@ def test_help_ignores_line_breaks_of_docstrings(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "400")
     with pytest.raises(SystemExit, match="0"):
         parse(["--help"])
-    text = "recomputes nothing (none), everything except matrix products (products) or the whole"
+    text = "recomputes nothing (none), everything except matrix products"
     assert text in capsys.readouterr().out

@@ -13,11 +13,17 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from envs.cli.errors import DISK_FULL
+from envs.scene.ranges import Randomization
 from lorasp_jax.config import Config, DataConfig
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.training import run_folder
 from lorasp_jax.training.run import Run
-from lorasp_jax.training.run_folder import MetricsLog, read_metrics, record_dataset
+from lorasp_jax.training.run_folder import (
+    MetricsLog,
+    read_metrics,
+    record_dataset,
+    recorded_ranges,
+)
 from tests import ROOT
 
 CONFIG = Config(name="a", scale="cpu", peft=LoRASP(rank=8))
@@ -100,6 +106,26 @@ def test_resume_auto_starts_or_continues(tmp_path):
     (folder / "config.json").unlink()
     with pytest.raises(ValueError, match="already contains a run"):
         open_run(CONFIG, tmp_path, resume="auto")
+
+
+def test_only_ranges_that_change_something_are_recorded(tmp_path):
+    """So that runs from before a range existed go on."""
+    assert "scene" not in run_folder.to_json(CONFIG)
+    ranges = Randomization(camera_turn=(0, 0.1), table_height=(0.02, 0.02))
+    config = dataclasses.replace(CONFIG, scene=ranges)
+    recorded = run_folder.to_json(config)
+    assert recorded["scene"] == {"camera_turn": [0, 0.1], "table_height": [0.02, 0.02]}
+    assert recorded_ranges(recorded) == config.ranges == ranges
+    assert recorded_ranges(run_folder.to_json(CONFIG)) is CONFIG.ranges is None
+    with pytest.raises(ValueError, match="unknown range 'wind': choose from position, turn"):
+        recorded_ranges({"scene": {"wind": [0, 1]}})
+    open_run(config, tmp_path, resume=False)
+    open_run(config, tmp_path, resume=True)
+    with pytest.raises(ValueError, match=r"different settings \(scene\)"):
+        open_run(CONFIG, tmp_path, resume=True)
+    other = dataclasses.replace(ranges, table_height=(0.0, 0.02))
+    with pytest.raises(ValueError, match=r"\(scene.table_height\)"):
+        open_run(dataclasses.replace(config, scene=other), tmp_path, resume=True)
 
 
 @pytest.mark.parametrize("name", ["", "a", ".a.lock/"])
