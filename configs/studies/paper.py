@@ -7,6 +7,11 @@ have the same demonstrations, batches and steps; a policy for one of four tasks 
 the steps, and so as many samples of its task. The learning rate of each method is the best of
 three, chosen for each backbone with a seed that no table uses, hence on other layouts. LoRA of any
 rank takes the rate of LoRA with r = R, and every kind of LoRA-SP that of LoRA-SP.
+
+For Figure 4, full fine-tuning also adapts to the Panda, the robot of pretraining, in a new scene.
+It is one other scene, not a range of scenes: like PiPER's, it is the same in all episodes but for
+the positions of the objects, so that the two differ in whether the base has seen the robot and not
+in how much the scene varies. It trains like full fine-tuning on PiPER, at the same rate.
 """
 
 import functools
@@ -17,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from envs import Episodes
+from envs import Episodes, Randomization
 from lorasp_jax.config import Config, DataConfig, EvaluationConfig, ModelConfig, OptimConfig
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP, Method
 from lorasp_jax.policies.policy import Policy
@@ -29,6 +34,16 @@ PILOT_SEED = 1000
 """Seed of the cells that choose learning rates."""
 ETAS = (0.5, 0.7, 0.8, 0.99)
 """Energy targets of Table IV besides the default, 0.9."""
+
+NEW_SCENE = Randomization(
+    camera_position=(0.04, 0.04),
+    camera_turn=(0.1, 0.1),
+    table_height=(0.04, 0.04),
+    position=(0.02, 0.02),
+    turn=(0.3, 0.3),
+)
+"""The Panda's new scene, relative to that of pretraining (configs/pretrain.py, no randomization):
+cameras moved and rotated, a higher table, and all objects moved and rotated on it."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +80,7 @@ def get_study(scale: str) -> Study:
         raise ValueError(f"the study has the scales {' and '.join(plans)}, got {scale!r}")
     plan = plans[scale]()
     cells = tuple(cell for backbone in plan.backbones for cell in _cells(plan, backbone))
+    cells += tuple(cell for backbone in plan.backbones for cell in _new_scene(plan, backbone))
     names = [cell.name for cell in cells]
     make_claims = runpy.run_path(str(Path(__file__).with_name("paper_claims.py")))["make_claims"]
     claims = make_claims(names, plan.rank, plan.backbones)
@@ -197,6 +213,19 @@ def _single(plan: Plan, backbone: str, method: str) -> Iterator[Cell]:
             yield _trained(plan, backbone, method, name, group, seed, tasks=(task,))
 
 
+def _new_scene(plan: Plan, backbone: str) -> Iterator[Cell]:
+    """Yield the cells of full fine-tuning on the Panda, one for each seed."""
+    group, pilots = f"{backbone}/panda/full", _pilot_names(plan, backbone, "full")
+
+    def config(seed: int, results: Results) -> Config:
+        rate, before = _best_rate(results, pilots), seed == plan.seeds[0]
+        made = _config(plan, backbone, FullFineTuning(), rate, seed, before=before)
+        return replace(made, robot="panda", scene=NEW_SCENE)
+
+    for seed in plan.seeds if "full" in plan.methods else ():
+        yield Cell(f"{group}/s{seed}", functools.partial(config, seed), pilots, group)
+
+
 def _trained(
     plan: Plan,
     backbone: str,
@@ -213,7 +242,7 @@ def _trained(
     pilots = _pilot_names(plan, backbone, _family(plan, method))
 
     def config(results: Results) -> Config:
-        rate = float(naming.best_pilot(results, pilots).rsplit("/", 1)[1])
+        rate = _best_rate(results, pilots)
         peft = _method(plan, method, _mean_rank(results, needs) if needs else 0.0)
         made = _config(plan, backbone, peft, rate, seed, tasks or plan.config.tasks, before=before)
         if method != "lora_sp_no_spectral":
@@ -267,6 +296,11 @@ def _method(plan: Plan, name: str, mean_rank: float) -> Method:
         "dora": lambda: DoRA(rank=rank),
     }
     return made[name]()
+
+
+def _best_rate(results: Results, pilots: Sequence[str]) -> float:
+    """Return the learning rate of the best pilot cell."""
+    return float(naming.best_pilot(results, pilots).rsplit("/", 1)[1])
 
 
 def _mean_rank(results: Results, cells: Sequence[str]) -> float:

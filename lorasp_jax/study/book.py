@@ -95,6 +95,15 @@ class Book:
         """Return a finished method's tasks in order of name."""
         return sorted({t for n in self.cells(prefix)[0] for t in self.results[n]["outcomes"]})
 
+    def base(self, prefix: str) -> dict[str, float] | None:
+        """Return the base's success by task, from a cell whose name begins with `prefix`.
+
+        None if no finished one evaluated the base.
+        """
+        cells = [self.results[n] for n in self.names if n.startswith(prefix) and n in self.results]
+        before = next((cell["before"] for cell in cells if "before" in cell), None)
+        return before and {task: o.count("1") / len(o) for task, o in before.items()}
+
     def measures(self, prefix: str, name: str) -> list[Any]:
         """Return a measure of every cell of a finished method; see `measures.measures`."""
         return [self.results[cell]["measures"][name] for cell in naming.flat(self.cells(prefix))]

@@ -60,6 +60,7 @@ def page(study: Study, results: Mapping[str, Any], films: Collection[str] = ()) 
             numbers=verdicts.numbers(study.claims, book, judged),
             reasons=verdicts.reasons(study.claims),
             table_2=tables.table_2(book) or _NO_CELLS,
+            robots=tables.robots(book) or _NO_CELLS,
             rates=tables.rates(book),
             where_rank_goes=where_rank_goes(book),
             films=_films(book, films),

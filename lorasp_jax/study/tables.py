@@ -77,13 +77,11 @@ def table_1(book: Book, backbone: str) -> str:
 
 def _base(book: Book, backbone: str, columns: int) -> list[str]:
     """Return the row of the base before adaptation, from the cell that evaluates it."""
-    prefix = f"{backbone}/multi/"
-    cells = [book.results[n] for n in book.names if n.startswith(prefix) and n in book.results]
-    before = next((cell["before"] for cell in cells if "before" in cell), None)
+    base = book.base(f"{backbone}/multi/")
     start = ["base, not adapted", *[NONE] * columns]
-    if before is None:
+    if base is None:
         return [*start, *[NONE] * len(TASKS), "0 of 1 runs so far"]
-    rates = {task: 100 * o.count("1") / len(o) for task, o in before.items()}
+    rates = {task: 100 * rate for task, rate in base.items()}
     mean = float(np.mean(list(rates.values())))
     return [*start, *(f"{rates[t]:.1f}" if t in rates else NONE for t in TASKS), f"{mean:.1f}"]
 
@@ -165,6 +163,23 @@ def pruning(book: Book, backbone: str) -> str:
         success = [percent(statistics.success(book.outcomes(p))) for p in (source, prefix)]
         rows.append([name, _arrow(sizes), _arrow(times), *success])
     return markdown(headers, rows) if rows else ""
+
+
+def robots(book: Book) -> str:
+    """Return success before and after full fine-tuning, on the robots of Figure 4."""
+    rows = []
+    for backbone in book.backbones:
+        for training, robot in (("panda", "Panda, seen"), ("multi", "PiPER, unseen")):
+            prefix = f"{backbone}/{training}/"
+            if not book.cells(f"{backbone}/panda/full"):
+                continue
+            base, full = book.base(prefix), f"{prefix}full"
+            before = (
+                "0 of 1 runs so far" if base is None else f"{100 * np.mean([*base.values()]):.1f}"
+            )
+            after = book.missing(full) or percent(statistics.success(book.outcomes(full)))
+            rows.append([f"{BACKBONES[backbone]}, {robot}", before, after])
+    return markdown(["", "base", "after full fine-tuning"], rows) if rows else ""
 
 
 def costs(book: Book, backbone: str) -> str:

@@ -40,12 +40,7 @@ def test_a_box_for_each_layer():
 
 
 def test_seen_and_unseen_robots():
-    results = dict(synthetic.results())
-    for backbone in ("pi0", "smolvla"):
-        for seed in range(3):
-            name = f"{backbone}/panda/full/s{seed}"
-            results[name] = synthetic.result(name, ("press",), 8)
-    figure = figures.figure_4(Book(tuple(results), results))
+    figure = figures.figure_4(BOOK)
     assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == [
         "Panda, seen",
         "PiPER, unseen",

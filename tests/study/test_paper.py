@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import re
-import runpy
 from collections import Counter
 
 import numpy as np
@@ -31,8 +30,8 @@ def test_number_of_cells(capsys):
     trained = sum(isinstance(cell, Cell) for cell in STUDY.cells)
     with capsys.disabled():
         print(f"\n{len(NAMES)} cells, {trained} trained: {dict(counts)}")
-    assert counts == {"pilot": 42, "multi": 117, "single": 192}
-    assert trained == 327
+    assert counts == {"pilot": 42, "multi": 117, "single": 192, "panda": 6}
+    assert trained == 333
 
 
 @pytest.mark.parametrize("backbone", ["pi0", "smolvla"])
@@ -108,10 +107,27 @@ def test_pilots_choose_the_rate_on_other_layouts():
         assert cell.config(results).optim.learning_rate == rate
 
 
-def test_only_one_cell_per_backbone_evaluates_the_base():
+def test_one_cell_per_backbone_and_robot_evaluates_the_base():
     cells = [cell.name for cell in STUDY.cells if isinstance(cell, Cell)]
     before = [name for name in cells if config(name).evaluation.before]
-    assert before == ["pi0/multi/lora_sp/s0", "smolvla/multi/lora_sp/s0"]
+    both = ("multi/lora_sp/s0", "panda/full/s0")
+    assert sorted(before) == [f"{b}/{name}" for b in ("pi0", "smolvla") for name in both]
+
+
+@pytest.mark.parametrize("backbone", ["pi0", "smolvla"])
+def test_the_panda_differs_only_in_robot_and_scene(backbone):
+    """Its cells come last, so that the others keep their places in shards."""
+    assert NAMES[-6:] == [f"{b}/panda/full/s{s}" for b in ("pi0", "smolvla") for s in range(3)]
+    for seed in range(3):
+        panda, piper = (config(f"{backbone}/{r}/full/s{seed}") for r in ("panda", "multi"))
+        assert panda.robot == "panda"
+        assert {*panda.scene.changed()} == {
+            "camera_position", "camera_turn", "table_height", "position", "turn"
+        }  # fmt: skip
+        evaluation = dataclasses.replace(panda.evaluation, before=False)
+        same = {"robot": "piper", "scene": piper.scene, "evaluation": evaluation}
+        assert dataclasses.replace(panda, **same) == piper
+        assert piper.ranges is None
 
 
 def test_seeds_of_a_method_are_one_group():
@@ -143,14 +159,10 @@ def test_unknown_scale():
 
 
 def test_claim_on_embodiments_compares_every_module():
-    """Its cells are not part of the study yet."""
-    names = [f"pi0/{robot}/full/s{seed}" for robot in ("multi", "panda") for seed in range(3)]
-    results = {name: synthetic.result(name, ("press",), 8) for name in names}
-    make = runpy.run_path(str(synthetic.PAPER.with_name("paper_claims.py")))["make_claims"]
-    tests = make(names, 64, ["pi0"])[4].tests["pi0"]
+    tests = STUDY.claims[4].tests["pi0"]
     assert [test.measure.split(":")[0] for test in tests] == ["vision", "language", "action"]
     for test in tests:
-        outcome = claims.judge(test, results)
+        outcome = claims.judge(test, synthetic.results())
         assert outcome.verdict == "holds"
         assert outcome.estimate.value == pytest.approx(0.2, abs=0.05)
 

@@ -132,3 +132,17 @@ def test_the_paper_has_no_number():
 def test_every_method_has_a_label():
     for name in NAMES:
         assert naming.label(name.split("/")[2], 64)
+
+
+def test_both_robots_of_figure_4():
+    lines = tables.robots(BOOK).splitlines()[2:]
+    assert [line.partition(" | 25.0 | ")[0] for line in lines] == [
+        f"| {backbone}, {robot}"
+        for backbone in ("π0", "SmolVLA")
+        for robot in ("Panda, seen", "PiPER, unseen")
+    ]
+    results = {n: r for n, r in synthetic.results().items() if n != "pi0/panda/full/s0"}
+    line = tables.robots(Book(NAMES, results)).splitlines()[2]
+    assert line == "| π0, Panda, seen | 0 of 1 runs so far | 2 of 3 runs so far |"
+    smoke = synthetic.results("smoke")
+    assert tables.robots(Book(tuple(smoke), smoke)) == ""
