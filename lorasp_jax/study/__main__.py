@@ -15,6 +15,8 @@ from lorasp_jax.study.status import BROKEN, Board, State, Status, clear_failure,
 from lorasp_jax.study.study import Study, select
 
 SCALES = ("smoke", "accelerator")
+_SHARED_MEMORY = 0.9
+"""Fraction of a device's memory that its workers share; their CUDA contexts need some, too."""
 
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.study") -> int:
@@ -117,8 +119,9 @@ def _run(
         return
     from lorasp_jax.study.workers import Workers
 
-    if options.jobs > 1:  # otherwise the first process takes most of the device's memory
-        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    if options.jobs > 1:  # by default, the first process takes most of the device's memory
+        share = f"{_SHARED_MEMORY / options.jobs:.3f}"
+        os.environ.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", share)
     load_study = functools.partial(
         results.load_study, options.config, options.scale, options.results
     )
