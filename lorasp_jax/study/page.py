@@ -136,6 +136,4 @@ def _films(book: Book, names: Collection[str]) -> str:
 
 def _total(book: Book) -> str:
     seconds = sum(cell["seconds"]["total"] for cell in book.results.values())
-    return (
-        f"All {len(book.results)} finished runs together, one by one: {seconds / 3600:.1f} hours."
-    )
+    return f"The times of all {len(book.results)} finished runs sum to {seconds / 3600:.1f} hours."
