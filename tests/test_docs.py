@@ -11,7 +11,7 @@ from lorasp_jax import peft
 from tests import ROOT, test_imports
 
 PAGES = sorted([*ROOT.glob("docs/*.md"), *ROOT.glob("docs/methods/*.md")])
-WITHOUT_EXAMPLES = {"runs", "benchmarks", "architecture"}
+WITHOUT_EXAMPLES = {"runs", "benchmarks", "architecture", "study"}
 """Reference pages."""
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 OPTION = re.compile(r"^\| `(\w+)` \| `([^`]+)` \| \S", re.MULTILINE)

@@ -44,7 +44,6 @@ def test_one_command_rebuilds_page_and_figures(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not RESULTS.exists(), reason="no results are committed yet")
 def test_the_committed_page_is_made_from_the_committed_results(tmp_path):
     docs = RESULTS.parent
     (tmp_path / "docs/figures").mkdir(parents=True)
