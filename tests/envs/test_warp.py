@@ -13,7 +13,13 @@ from envs.state import Poses
 
 pytest.importorskip("warp")
 WORLDS, SIZE = 3, 48
-RANGES = Randomization(size=(0.9, 1.1), mass=(0.5, 2.0), gains=(0.8, 1.2), latency=(0.0, 0.1))
+RANGES = Randomization(
+    size=(0.9, 1.1),
+    mass=(0.5, 2.0),
+    gains=(0.8, 1.2),
+    latency=(0.0, 0.1),
+    table_height=(-0.04, 0.04),
+)
 
 
 def make(task, **options):
