@@ -5,9 +5,11 @@ import functools
 import re
 from collections import Counter
 
+import jax
 import numpy as np
 import pytest
 
+import envs
 from lorasp_jax.config import Config
 from lorasp_jax.peft import AdaLoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP
 from lorasp_jax.study import Cell, Derived, claims, naming
@@ -165,6 +167,20 @@ def test_claim_on_embodiments_compares_every_module():
         outcome = claims.judge(test, synthetic.results())
         assert outcome.verdict == "holds"
         assert outcome.estimate.value == pytest.approx(0.2, abs=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["open_pot", "pour", "press", "pick_place"])
+def test_the_side_camera_sees_all_objects_in_the_new_scene(task):
+    ranges = config("pi0/panda/full/s0").ranges
+    env = envs.make(task, "panda", num_envs=256, image_size=8, backend="jax")
+    state = env.reset(jax.random.key(0), ranges)
+    objects = [env.model.body(name).id for name in state.info["layout"]]
+    camera = env.cameras.index("side")
+    offset = state.data.xpos[:, objects] - state.data.cam_xpos[:, camera, None]
+    x, y, z = np.einsum("wji,wbj->iwb", state.data.cam_xmat[:, camera], offset)
+    edge = -z * np.tan(np.deg2rad(env.model.cam_fovy[camera] / 2))
+    assert np.all(np.maximum(np.abs(x), np.abs(y)) < edge)
 
 
 @pytest.mark.slow
