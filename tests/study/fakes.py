@@ -72,6 +72,25 @@ def run_or_die(job) -> dict:
     return run(job)
 
 
+def many() -> Study:
+    """Twelve cells that any worker may run."""
+    return Study("many", tuple(Cell(f"c{i}", CONFIG) for i in range(12)))
+
+
+def run_with_three_others(job) -> dict:
+    """Like `run`, but only once four workers have cells; be killed in one of them."""
+    pids = job.study_folder / "pids"
+    pids.mkdir(exist_ok=True)
+    (pids / str(os.getpid())).touch()
+    deadline = time.monotonic() + 120
+    while len([*pids.iterdir()]) < 4:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    if job.cell.name == "c2":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return run(job)
+
+
 def ran(folder: Path) -> list[str]:
     """Names of the cells in the order in which they ran."""
     return (folder / "runs.txt").read_text().split() if (folder / "runs.txt").exists() else []

@@ -3,14 +3,16 @@ import io
 import pytest
 from rich.console import Console
 
-from lorasp_jax.study import workers
+from lorasp_jax.study import runner, workers
+from lorasp_jax.study.status import Board, clear_failure, record_failure
 from tests.study import fakes
 from tests.study.fakes import NAMES, ran, states
 
 
-def start(folder, run_cell, count=1):
+def start(folder, run_cell, count=1, load=fakes.study):
     console = Console(file=io.StringIO(), width=200)
-    workers.Workers(fakes.study, folder, NAMES, console, run_cell).run(count)
+    names = [cell.name for cell in load().cells]
+    workers.Workers(load, folder, names, console, run_cell).run(count)
     return console.file.getvalue()
 
 
@@ -42,6 +44,40 @@ def test_two_workers_share_the_cells(folder):
     assert set(states(folder).values()) == {"finished"}
     assert "6/6" in text
     assert {path.stem for path in (folder / "logs").rglob("*.txt")} >= {"s0", "s1", "lr"}
+
+
+@pytest.mark.slow
+def test_one_of_four_workers_is_killed(folder):
+    text = start(folder, fakes.run_with_three_others, count=4, load=fakes.many)
+    names = [cell.name for cell in fakes.many().cells]
+    assert sorted(ran(folder)) == sorted({*names} - {"c2"})
+    assert states(folder, fakes.many()) == {**dict.fromkeys(names, "finished"), "c2": "failed"}
+    assert "c2: failed the worker stopped by SIGKILL" in text
+    assert "11/12" in text
+    clear_failure(folder / "c2")
+    start(folder, fakes.run, count=4, load=fakes.many)
+    assert sorted(ran(folder)) == sorted(names)
+
+
+def time_left(folder, statuses, started, running):
+    """Return the expected time [s]; `started` are the ages of the cells that run."""
+    console = Console(file=io.StringIO())
+    pool = workers.Workers(fakes.study, folder, NAMES, console, fakes.run)
+    pool._running = dict.fromkeys(range(running))
+    return pool._expected_seconds(statuses, started)
+
+
+def test_the_time_left(folder):
+    assert time_left(folder, Board(fakes.study(), folder).read(), {}, running=1) is None
+    runner.work(fakes.study(), folder, ["lr"], fakes.run)  # takes 1 s
+    statuses = Board(fakes.study(), folder).read()
+    assert time_left(folder, statuses, {}, running=1) == 5
+    assert time_left(folder, statuses, {"sp/s0": 0.5}, running=1) == 4.5
+    # Jobs that share a device are assumed to be as slow as one after the other; of the five cells
+    # left, three are of one group.
+    assert time_left(folder, statuses, {}, running=2) == 6
+    record_failure(folder / "sp/s1", "boom", "")
+    assert time_left(folder, Board(fakes.study(), folder).read(), {}, running=1) == 1
 
 
 @pytest.mark.slow
