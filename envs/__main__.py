@@ -12,7 +12,7 @@ from rich.console import Console
 
 from envs import actions
 from envs.cli import commands
-from envs.cli.errors import INTERRUPTED, parse_arguments, report_error
+from envs.cli.errors import parse_arguments, run_command
 from envs.compilation import alarms, cache
 from envs.experts.collection import Record
 from envs.names import names
@@ -35,15 +35,8 @@ def main(
     # Preallocating GPU memory would add a second to commands that take half a minute (measured).
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     cache.enable()
-    try:
-        options.command(options, console)
-    except Exception as error:
-        return report_error(error, console)
-    except KeyboardInterrupt as stop:
-        state = str(stop) or "temporary files were removed"
-        console.print(f"interrupted; {state}", soft_wrap=True)
-        return INTERRUPTED
-    return 0
+    interrupted = "interrupted; temporary files were removed"
+    return run_command(lambda: options.command(options, console), console, interrupted)
 
 
 def parser(program: str) -> argparse.ArgumentParser:

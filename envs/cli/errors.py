@@ -9,7 +9,7 @@ import errno
 import os
 import select
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from rich.console import Console
 
@@ -45,6 +45,30 @@ def parse_arguments(
                 raise SystemExit(BROKEN_PIPE) from error
             raise
         raise
+
+
+def run_command(
+    command: Callable[[], int | None],
+    errors: Console,
+    interrupted: str = "interrupted",
+    remedy: str = "",
+) -> int:
+    """Run a command and return its exit code, after reporting why it failed.
+
+    Args:
+        command: returns the exit code; None means 0.
+        errors: console to print to.
+        interrupted: printed after Ctrl-C, unless the exception says more.
+        remedy: see `report_error`.
+    """
+    try:
+        return command() or 0
+    except Exception as error:  # prints one sentence for bad input, re-raises bugs
+        return report_error(error, errors, remedy)
+    except KeyboardInterrupt as stop:
+        text = f"interrupted; {stop}" if str(stop) else interrupted
+        errors.print(text, soft_wrap=True, highlight=False, markup=False)
+        return INTERRUPTED
 
 
 def report_error(error: Exception, errors: Console, remedy: str = "") -> int:

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from envs.cli.errors import report_error
+from envs.cli.errors import run_command
 from envs.compilation import cache
-from lorasp_jax.cli.commands import INTERRUPTED
 
 if TYPE_CHECKING:
     from lorasp_jax.training.overrides import Command
@@ -33,22 +32,20 @@ def main(arguments: Sequence[str], program: str = "python train.py") -> int:
     from lorasp_jax.training.run_folder import to_json
 
     console, errors = Console(), processes.ExitConsole(stderr=True)
-    try:
+    resume = resume_command(arguments, program)
+
+    def adapt() -> None:
         with sigterm_as_interrupt():
             if "--distributed" in arguments:
-                processes.initialize(console, f"to resume: {resume_command(arguments, program)}")
+                processes.initialize(console, f"to resume: {resume}")
                 console.quiet = not processes.is_first()
             command = parse(arguments, program)
             options = {"resume": command.resume, "dry_run": command.dry_run}
             processes.agree("settings", to_json(command.config) | options)
             _execute(command, console, started)
-    except Exception as error:  # prints one sentence for invalid input, re-raises bugs
-        return report_error(error, errors, ": free some memory or disk space and add --resume")
-    except KeyboardInterrupt:
-        message = f"stopped; to resume: {resume_command(arguments, program)}"
-        errors.print(message, soft_wrap=True, highlight=False, markup=False)
-        return INTERRUPTED
-    return 0
+
+    remedy = ": free some memory or disk space and add --resume"
+    return run_command(adapt, errors, f"stopped; to resume: {resume}", remedy)
 
 
 def parser(program: str) -> argparse.ArgumentParser:

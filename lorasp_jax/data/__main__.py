@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from envs.cli.bars import bars
-from envs.cli.errors import INTERRUPTED, parse_arguments, report_error
+from envs.cli.errors import parse_arguments, run_command
 from envs.datasets.files import check_local
 from lorasp_jax.data.keys import Keys
 
@@ -25,15 +25,9 @@ def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.data") -
     import jax  # imported here to keep --help fast
 
     jax.config.update("jax_platforms", "cpu")  # leave accelerators to other processes
-    errors = Console(stderr=True)
-    try:
-        options.command(options, Console())
-    except Exception as error:
-        return report_error(error, errors)
-    except KeyboardInterrupt:
-        errors.print("interrupted; temporary files were removed")
-        return INTERRUPTED
-    return 0
+    interrupted = "interrupted; temporary files were removed"
+    command = functools.partial(options.command, options, Console())
+    return run_command(command, Console(stderr=True), interrupted)
 
 
 def inspect(options: argparse.Namespace, console: Console) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from envs.cli.errors import INTERRUPTED, parse_arguments, report_error
+from envs.cli.errors import parse_arguments, run_command
 
 RANK_MAP = "rank-map"
 
@@ -19,15 +19,8 @@ def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.report")
         options = parse_arguments(rank_map_parser(f"{program} {RANK_MAP}"), arguments[1:])
     else:
         options = parse_arguments(parser(program), arguments)  # before slow imports
-    errors = Console(stderr=True)
-    try:
-        (_write_rank_maps if maps else _write_report)(options, Console())
-    except Exception as error:
-        return report_error(error, errors)
-    except KeyboardInterrupt:
-        errors.print("interrupted")
-        return INTERRUPTED
-    return 0
+    write = _write_rank_maps if maps else _write_report
+    return run_command(lambda: write(options, Console()), Console(stderr=True))
 
 
 def _write_report(options: argparse.Namespace, console: Console) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from envs.cli.errors import INTERRUPTED, REFUSED, parse_arguments, report_error
+from envs.cli.errors import REFUSED, parse_arguments, run_command
 from lorasp_jax.study import listing, results
 from lorasp_jax.study.status import BROKEN, Board, State, Status, clear_failure, results_of, tidy
 from lorasp_jax.study.study import Study, select
@@ -26,14 +26,8 @@ def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.study") 
     other settings; 130: stopped by a signal.
     """
     options = parse_arguments(parser(program), arguments)
-    errors = Console(stderr=True)
-    try:
-        return _execute(options, Console())
-    except Exception as error:  # prints one sentence for invalid input, re-raises bugs
-        return report_error(error, errors)
-    except KeyboardInterrupt:
-        errors.print("stopped; to resume, give the same command", highlight=False)
-        return INTERRUPTED
+    interrupted = "stopped; to resume, give the same command"
+    return run_command(lambda: _execute(options, Console()), Console(stderr=True), interrupted)
 
 
 def parser(program: str) -> argparse.ArgumentParser:
