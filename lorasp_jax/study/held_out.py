@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -12,7 +11,6 @@ from envs.datasets.episodes import Episodes
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Batch, encode, flatten, gather
 from lorasp_jax.policies.policy import Policy
-from lorasp_jax.training.demonstrations import Progress, demonstrations
 
 EPISODES = 32
 """Held-out episodes per task."""
@@ -25,17 +23,16 @@ Sample = Callable[[jax.Array], Batch]
 _encode = functools.partial(jax.jit, static_argnames="state_noise")(encode)
 
 
-def held_out(
-    config: Config, folder: Path, progress: Progress = lambda *_: None
-) -> dict[str, Episodes]:
-    """Load the held-out episodes of every task from `folder`/cache, or collect them.
+def settings(config: Config) -> Config:
+    """Return the config whose demonstrations are the held-out episodes of a run.
 
-    All runs with the same robot, tasks, image size and control period can share the folder.
+    Raises:
+        ValueError: the run has the seed of the held-out episodes.
     """
     if config.seed == SEED:
         raise ValueError(f"seed {SEED} is reserved for held-out episodes")
     data = dataclasses.replace(config.data, source="", fresh_every=0, episodes=EPISODES)
-    return demonstrations(dataclasses.replace(config, data=data, seed=SEED), folder, progress)
+    return dataclasses.replace(config, data=data, seed=SEED)
 
 
 def sampler(policy: Policy, episodes: Episodes, batch_size: int) -> Sample:

@@ -43,7 +43,7 @@ def measures(
 
     Args:
         policy: the policy at the end of a cell.
-        episodes: held-out episodes by task; see `held_out.held_out`.
+        episodes: held-out episodes by task; see `held_out.settings`.
         base: the model before full fine-tuning.
         source: for a `Derived` cell, the policy before its transformation.
         batch_size: windows per batch.

@@ -7,7 +7,7 @@ import gc
 import hashlib
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,8 @@ from envs.datasets.episodes import Episodes
 from envs.datasets.locks import locked
 from lorasp_jax.config import Config
 from lorasp_jax.evaluation.callback import Evaluation
+from lorasp_jax.study import held_out
 from lorasp_jax.study.cost import training_cost
-from lorasp_jax.study.held_out import EPISODES, held_out
 from lorasp_jax.study.measures import measures
 from lorasp_jax.study.runner import Job
 from lorasp_jax.study.study import Derived
@@ -106,18 +106,17 @@ def shared_demonstrations(
     They do not depend on the seed, and a task has the same ones whatever tasks it is trained with.
     The first cell that needs them collects them.
     """
-    collect = functools.partial(demonstrations, progress=progress)
-    return _shared(study_folder / "demonstrations", dataclasses.replace(config, seed=0), collect)
+    shared = dataclasses.replace(config, seed=0)
+    return _shared(study_folder / "demonstrations", shared, progress)
 
 
 def held_out_demonstrations(study_folder: Path, config: Config) -> dict[str, Episodes]:
-    """Load the held-out demonstrations (see `held_out.held_out`), shared in the same way."""
-    data = dataclasses.replace(config.data, episodes=EPISODES)
-    return _shared(study_folder / "held_out", dataclasses.replace(config, data=data), held_out)
+    """Load the held-out demonstrations (see `held_out.settings`), shared in the same way."""
+    return _shared(study_folder / "held_out", held_out.settings(config))
 
 
 def _shared(
-    root: Path, config: Config, collect: Callable[[Config, Path], dict[str, Episodes]]
+    root: Path, config: Config, progress: Progress = lambda *_: None
 ) -> dict[str, Episodes]:
     """Load each task's episodes from a folder named after the settings, or collect them there."""
     settings = {
@@ -133,7 +132,9 @@ def _shared(
 
     def one(task: str) -> Episodes:
         with _alone(folder / "cache" / f"{task}.npz"):
-            return collect(dataclasses.replace(config, tasks=(task,)), folder)[task]
+            return demonstrations(dataclasses.replace(config, tasks=(task,)), folder, progress)[
+                task
+            ]
 
     return dict(zip(config.tasks, map_threads(one, config.tasks), strict=True))
 

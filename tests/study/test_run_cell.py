@@ -36,7 +36,6 @@ def collected(monkeypatch):
         return {task: Episodes.load(path, control_dt=config.control_dt)}
 
     monkeypatch.setattr(run_cell, "demonstrations", demonstrations)
-    monkeypatch.setattr("lorasp_jax.study.held_out.demonstrations", demonstrations)
     return configs
 
 
