@@ -131,10 +131,9 @@ def _shared(
     folder = root / f"{Path(config.robot).stem}_{digest}"
 
     def one(task: str) -> Episodes:
+        single = dataclasses.replace(config, tasks=(task,))
         with _alone(folder / "cache" / f"{task}.npz"):
-            return demonstrations(dataclasses.replace(config, tasks=(task,)), folder, progress)[
-                task
-            ]
+            return demonstrations(single, folder, progress)[task]
 
     return dict(zip(config.tasks, map_threads(one, config.tasks), strict=True))
 
