@@ -101,7 +101,7 @@ def _results(run: Run) -> dict[str, Any]:
 def shared_demonstrations(
     study_folder: Path, config: Config, _folder: Path, progress: Progress
 ) -> dict[str, Episodes]:
-    """Load the demonstrations that all cells with the same robot and data settings share.
+    """Load the demonstrations that cells with the same robot, scene and data settings share.
 
     They do not depend on the seed, and a task has the same ones whatever tasks it is trained with.
     The first cell that needs them collects them.
