@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from envs.scene.ranges import Randomization
 from lorasp_jax.report import __main__ as command
 from lorasp_jax.report import rank_map
 from lorasp_jax.report.rank_episode import Recorder
@@ -115,14 +116,21 @@ def test_a_run_is_filmed(folder, monkeypatch):
     run.policy = with_random_adapters(run.policy)
     export.write(run)
     settings = dataclasses.replace(CONFIG.evaluation, episodes=2, num_envs=2, denoise_steps=1)
-    write_json(folder / "config.json", to_json(dataclasses.replace(CONFIG, evaluation=settings)))
+    scene = Randomization.typical()
+    config = dataclasses.replace(CONFIG, evaluation=settings, scene=scene)
+    write_json(folder / "config.json", to_json(config))
     monkeypatch.setattr(rank_map, "load_policy", lambda _: run.policy)
+    films = []
+    film = rank_map.film
+    monkeypatch.setattr(rank_map, "film", lambda *a: films.append(a[1]) or film(*a))
     tried = []
     play = Recorder.play
     monkeypatch.setattr(Recorder, "play", lambda *a: tried.append(a[-1]) or play(*a))
     prompts = run.policy.processor.prompts
-    monkeypatch.setattr(type(prompts), "select", lambda *_: prompts)
+    monkeypatch.setattr(type(prompts), "rows", lambda _, texts: np.zeros(len(texts), np.int32))
     gif = folder / "map.gif"
     assert [*rank_map.write(folder, "press", gif)] == [folder / "rank_map_press.mp4", gif]
     assert tried == [0, 1]  # random adapters never succeed
+    assert scene.size[0] <= films[0].draw.size <= scene.size[1]
+    assert films[0].draw.size != 1
     assert gif.stat().st_size <= rank_map.MAX_GIF_BYTES
