@@ -186,7 +186,8 @@ def _pilots(plan: Plan, backbone: str, family: str) -> Iterator[Cell]:
 
     for rate, name in zip(plan.rates, _pilot_names(plan, backbone, family), strict=True):
         make = functools.partial(config, rate)
-        yield Cell(name, make if needs else make({}), needs, f"{backbone}/pilot/{family}")
+        made = make if needs else make({})
+        yield Cell(name, made, needs, f"{backbone}/pilot/{family}", measured=False)
 
 
 def _multi(plan: Plan, backbone: str, method: str) -> Iterator[Cell | Derived]:
@@ -250,7 +251,8 @@ def _trained(
             return made
         return replace(made, auxiliary=replace(made.auxiliary, spectral=0.0))
 
-    return Cell(name, config, (*pilots, *needs), group)
+    # The page has costs and measures of multi-task training alone.
+    return Cell(name, config, (*pilots, *needs), group, measured=not tasks)
 
 
 def _config(

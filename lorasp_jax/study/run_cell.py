@@ -22,7 +22,7 @@ from lorasp_jax.study import held_out
 from lorasp_jax.study.cost import training_cost
 from lorasp_jax.study.measures import measures
 from lorasp_jax.study.runner import Job
-from lorasp_jax.study.study import Derived
+from lorasp_jax.study.study import Cell, Derived
 from lorasp_jax.training import loop, records, setup
 from lorasp_jax.training.base import base_model
 from lorasp_jax.training.demonstrations import Progress, demonstrations, map_threads
@@ -50,17 +50,27 @@ def run_cell(job: Job) -> dict[str, Any]:
 
 def _train(job: Job) -> dict[str, Any]:
     """Train a policy, or resume it, and evaluate it."""
+    assert isinstance(job.cell, Cell)
     console, started = Console(width=WIDTH), time.perf_counter()
     collect = functools.partial(shared_demonstrations, job.study_folder)
     with open_run(job.config, job.folder.parent, resume="auto"):
         run = setup.prepare(job.config, job.folder, console, started, collect=collect)
         loop.train(run, [Export(), Evaluation(write_video=None)], resume=True)
-        with run.timed("measure"):
-            base = base_model(job.config)[0] if job.config.peft.trains_base else None
-            episodes = held_out_demonstrations(job.study_folder, run.config)
-            measured = measures(run.policy, episodes, base=base)
-            speed = training_cost(job.folder, job.config, run.policy.model.config)
-        return {**_results(run), "speed": speed, "measures": measured}
+        found: dict[str, Any] = {"speed": {}, "measures": {}}
+        if job.cell.measured:
+            with run.timed("measure"):
+                found = _measure(job, run)
+        return {**_results(run), **found}
+
+
+def _measure(job: Job, run: Run) -> dict[str, Any]:
+    """Return the costs of training, and the measures on held-out demonstrations."""
+    base = base_model(job.config)[0] if job.config.peft.trains_base else None
+    episodes = held_out_demonstrations(job.study_folder, run.config)
+    return {
+        "speed": training_cost(job.folder, job.config, run.policy.model.config),
+        "measures": measures(run.policy, episodes, base=base),
+    }
 
 
 def _derive(job: Job) -> dict[str, Any]:

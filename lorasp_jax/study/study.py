@@ -35,12 +35,15 @@ class Cell:
         after: names of the cells that must be finished first.
         group: cells of one group are run by one process in a row, to share compiled programs; by
             default, each cell is its own group.
+        measured: whether to record the costs of training and the measures on held-out data, which
+            take programs of their own to compile; otherwise only success and active ranks.
     """
 
     name: str
     config: Config | Callable[[Results], Config]
     after: tuple[str, ...] = ()
     group: str = ""
+    measured: bool = True
 
     @property
     def needs(self) -> tuple[str, ...]:

@@ -30,7 +30,7 @@ def test_measures_of_all_seeds():
     pairs = BOOK.measures("pi0/multi/lora_sp", "direction_overlap")
     assert len(pairs) == 3
     assert len(pairs[0]) == 6
-    assert len(BOOK.measures("pi0/single/lora_sp", "rank_boxes")) == 12
+    assert len(BOOK.measures("pi0/multi/lora_sp", "rank_boxes")) == 3
 
 
 @pytest.mark.parametrize(

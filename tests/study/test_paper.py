@@ -36,6 +36,12 @@ def test_number_of_cells(capsys):
     assert trained == 333
 
 
+def test_the_page_needs_measures_of_policies_for_all_tasks():
+    for cell in STUDY.cells:
+        if isinstance(cell, Cell):
+            assert cell.measured == (cell.name.split("/")[1] in ("multi", "panda")), cell.name
+
+
 @pytest.mark.parametrize("backbone", ["pi0", "smolvla"])
 def test_tables_have_three_seeds(backbone):
     methods = ["lora_moe_top1", "lora_moe_weighted", "ada_lora", "full", "lora_sp", "dora"]

@@ -7,11 +7,15 @@ import threading
 import time
 
 import pytest
+from rich.console import Console
 
 from envs.datasets.episodes import Episodes
 from envs.scene.ranges import Randomization
 from lorasp_jax.study import results, run_cell
 from lorasp_jax.study.held_out import EPISODES, SEED
+from lorasp_jax.study.runner import Job
+from lorasp_jax.study.study import Cell
+from lorasp_jax.training.run import Run
 from tests import ROOT
 from tests.runs import random_episodes
 from tests.study.fakes import CONFIG
@@ -51,6 +55,22 @@ def test_cells_share_demonstrations(tmp_path, collected):
     assert (single["pour"].state == first["pour"].state).all()
     assert sorted(config.tasks for config in collected) == [("pour",), ("press",)]
     assert {config.seed for config in collected} == {0}
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_only_measured_cells_have_costs_and_measures(tmp_path, monkeypatch, measured):
+    run = Run(CONFIG, tmp_path, Console(quiet=True), "")
+    monkeypatch.setattr(run_cell.setup, "prepare", lambda *_, **__: run)
+    monkeypatch.setattr(run_cell.loop, "train", lambda *_, **__: None)
+    monkeypatch.setattr(run_cell, "_results", lambda _: {"outcomes": {}})
+    monkeypatch.setattr(
+        run_cell, "_measure", lambda *_: {"speed": {"x": 1.0}, "measures": {"y": 2}}
+    )
+    cell = Cell("a", CONFIG, measured=measured)
+    found = run_cell.run_cell(Job(cell, CONFIG, tmp_path, {}))
+    assert found["speed"] == ({"x": 1.0} if measured else {})
+    assert found["measures"] == ({"y": 2} if measured else {})
+    assert ("measure" in run.seconds) == measured
 
 
 @pytest.mark.parametrize(
