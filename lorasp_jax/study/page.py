@@ -106,11 +106,16 @@ def _size(book: Book) -> str:
     """Say how large the study is."""
     text = f"It has {len(book.names)} runs: policies trained, or made from trained ones"
     multi = naming.flat(book.cells(f"{book.backbones[0]}/multi/lora_sp"))
-    done = [book.results[name]["outcomes"] for name in multi if name in book.results]
+    done = [book.results[name] for name in multi if name in book.results]
     if not done:
         return f"{text}."
-    episodes = len(next(iter(done[0].values())))
-    return f"{text}; {len(multi)} seeds, and {episodes} episodes per task and seed."
+    episodes = len(next(iter(done[0]["outcomes"].values())))
+    optim, data = done[0]["config"]["optim"], done[0]["config"]["data"]
+    return (
+        f"{text}; {len(multi)} seeds, and {episodes} episodes per task and seed. A policy for all "
+        f"tasks trains for {optim['steps']:,} steps of {optim['batch_size']} samples, on "
+        f"{data['episodes']} demonstrations per task."
+    )
 
 
 def _by_backbone(book: Book, table: Callable[[Book, str], str]) -> str:

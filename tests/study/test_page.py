@@ -14,7 +14,7 @@ RESULTS = ROOT / "docs" / "study.json"
 
 @pytest.fixture(scope="module")
 def complete():
-    return page.page(synthetic.study(), synthetic.results())
+    return page.page(synthetic.study(), synthetic.cells())
 
 
 def section(text: str, title: str) -> str:
@@ -73,6 +73,7 @@ def test_claims_come_first(complete):
     assert complete.index("## Claims") < complete.index("## Tables") < complete.index("## Costs")
     rows = re.findall(r"^\| (\d+) \| ", complete.partition("###")[0], re.MULTILINE)
     assert rows == [str(number) for number in range(1, 11)]
+    assert "trains for 5,000 steps of 128 samples, on 512 demonstrations per task." in complete
     assert "{" not in complete.replace("{rank}", "?")
 
 
@@ -89,7 +90,7 @@ def test_rank_maps_are_shown_if_there_are_any(tmp_path):
 
 
 def test_missing_cells_are_counted():
-    found = dict(synthetic.results("smoke"))
+    found = dict(synthetic.cells("smoke"))
     del found["pi0/multi/lora_r4/s1"]
     text = page.page(synthetic.study("smoke"), found)
     assert "**Unfinished: 9 of 10 runs so far.**" in text
@@ -114,5 +115,5 @@ def test_a_study_without_results():
 @pytest.mark.parametrize("scale", ["accelerator", "smoke"])
 def test_every_cell_may_be_missing(scale):
     """With half of the cells, some of each table are missing."""
-    found = {n: r for i, (n, r) in enumerate(synthetic.results(scale).items()) if i % 2}
+    found = {n: r for i, (n, r) in enumerate(synthetic.cells(scale).items()) if i % 2}
     assert "so far" in page.page(synthetic.study(scale), found)

@@ -75,7 +75,7 @@ def test_single_tasks_see_as_many_samples():
     multi, single = config("pi0/multi/lora_r8/s2"), config("pi0/single/lora_r8/pour/s2")
     assert (multi.optim.steps, single.optim.steps) == (5000, 1250)
     assert single.tasks == ("pour",)
-    assert single.optim.batch_size == multi.optim.batch_size == 256
+    assert single.optim.batch_size == multi.optim.batch_size == 128
     assert single.optim.learning_rate == multi.optim.learning_rate
 
 
