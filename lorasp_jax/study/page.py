@@ -5,11 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from envs.datasets.writing import write_text
-from lorasp_jax.study import drawings, naming, tables, verdicts
+from lorasp_jax.study import drawings, findings, tables, verdicts
 from lorasp_jax.study.book import BACKBONES, NONE, Book, markdown
 from lorasp_jax.study.claims import judge_all
 from lorasp_jax.study.rank_text import where_rank_goes
-from lorasp_jax.study.study import Study
+from lorasp_jax.study.setup_table import setup_table
+from lorasp_jax.study.status import describe_config
+from lorasp_jax.study.study import Derived, Study
 
 _TRAININGS = {
     "pilot": "learning rates",
@@ -40,7 +42,6 @@ def page(study: Study, results: Mapping[str, Any], films: Collection[str] = ()) 
     judged = judge_all(study.claims, results)
     by_backbone: dict[str, Callable[[Book, str], str]] = {
         "table_1": tables.table_1,
-        "table_2_by_task": tables.table_2_by_task,
         "table_3": tables.table_3,
         "table_4": tables.table_4,
         "pruning": tables.pruning,
@@ -55,11 +56,19 @@ def page(study: Study, results: Mapping[str, Any], films: Collection[str] = ()) 
             missing=_missing(book),
             progress=_progress(book),
             size=_size(book),
+            setup=setup_table(book, _config(study, results)),
             summary=verdicts.summary(study.claims, book, judged),
             verdicts=verdicts.table(study.claims, book, judged),
             numbers=verdicts.numbers(study.claims, book, judged),
+            highest_rank=verdicts.highest_rank(book),
             reasons=verdicts.reasons(study.claims),
+            experts=findings.experts(book),
+            edges=findings.edges(book),
             table_2=tables.table_2(book) or _NO_CELLS,
+            table_2_by_task="\n".join(tables.table_2_by_task(book, b) for b in book.backbones),
+            pruned=findings.pruned(book),
+            shared_directions=findings.shared_directions(book),
+            gradients=findings.gradients(book),
             robots=tables.robots(book) or _NO_CELLS,
             rates=tables.rates(book),
             where_rank_goes=where_rank_goes(book),
@@ -103,18 +112,25 @@ def _progress(book: Book) -> str:
 
 
 def _size(book: Book) -> str:
-    """Say how large the study is."""
-    text = f"It has {len(book.names)} runs: policies trained, or made from trained ones"
-    multi = naming.flat(book.cells(f"{book.backbones[0]}/multi/lora_sp"))
-    done = [book.results[name] for name in multi if name in book.results]
-    if not done:
-        return f"{text}."
-    episodes = len(next(iter(done[0]["outcomes"].values())))
-    optim, data = done[0]["config"]["optim"], done[0]["config"]["data"]
+    """Say how large the study is, and what it has cost so far."""
+    pilots = sum("/pilot/" in name for name in book.names)
+    hours = f" {_hours(book)}" if book.results else ""
     return (
-        f"{text}; {len(multi)} seeds, and {episodes} episodes per task and seed. A policy for all "
-        f"tasks trains for {optim['steps']:,} steps of {optim['batch_size']} samples, on "
-        f"{data['episodes']} demonstrations per task."
+        f"It has {len(book.names)} policies, most trained, some cut or pruned from trained ones; "
+        f"{pilots} only serve to choose learning rates.{hours}"
+    )
+
+
+def _config(study: Study, results: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the settings of a multi-task run: a finished one's, or else those of the study."""
+    multi = [cell for cell in study.cells if cell.name.split("/")[1] in ("multi", "pilot")]
+    done = next((results[cell.name] for cell in multi if cell.name in results), None)
+    if done:
+        return done["config"]
+    return next(
+        describe_config(cell, cell.config)
+        for cell in multi
+        if not isinstance(cell, Derived) and not callable(cell.config)
     )
 
 
@@ -126,19 +142,26 @@ def _by_backbone(book: Book, table: Callable[[Book, str], str]) -> str:
 
 
 def _films(book: Book, names: Collection[str]) -> str:
-    """Show the rank maps that exist, and say how to make others."""
+    """Show the rank maps that exist; "" if there are none."""
     shown = [b for b in book.backbones if f"rank_map_{b}.gif" in names]
     images = [f"![Rank map of {BACKBONES[b]}](figures/rank_map_{b}.gif)" for b in shown]
-    films = f"{markdown([BACKBONES[b] for b in shown], [images])}\n" if shown else ""
-    command = (
-        f"python -m lorasp_jax.report rank-map runs/paper/{book.backbones[0]}/multi/lora_sp/s0"
-    )
+    if not shown:
+        return ""
     return (
-        f"{films}A rank map is a film of an episode in which each image patch is tinted by its "
-        f"active rank: `{command}`.\n"
+        "A [rank map](runs.md#rank-maps) is a film of an episode in which each image patch is "
+        f"tinted by its active rank.\n\n{markdown([BACKBONES[b] for b in shown], [images])}"
     )
 
 
 def _total(book: Book) -> str:
+    return (
+        f"{_hours(book)} They contain training, evaluation and measures, but not pretraining; they "
+        "depend on the GPU, which results do not record, and runs that shared one overlap."
+        if book.results
+        else ""
+    )
+
+
+def _hours(book: Book) -> str:
     seconds = sum(cell["seconds"]["total"] for cell in book.results.values())
-    return f"The times of all {len(book.results)} finished runs sum to {seconds / 3600:.1f} hours."
+    return f"The times of its {len(book.results)} finished runs sum to {seconds / 3600:.1f} hours."

@@ -37,7 +37,10 @@ def cell(prefix: str, rank: int) -> dict[str, Any]:
     found = _numbers()["cells"].get(f"{backbone}/{training}/{method}")
     if found is None:
         return {}
-    return {**found, "success": dict(zip(tasks(), found["success"], strict=True))}
+    exact = [
+        100 * round(rate * 0.15) / 15 for rate in found["success"]
+    ]  # all are multiples of 1/15
+    return {**found, "success": dict(zip(tasks(), exact, strict=True))}
 
 
 def rates(prefix: str, rank: int) -> np.ndarray | None:

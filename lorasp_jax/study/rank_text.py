@@ -16,13 +16,13 @@ Boxes = Mapping[tuple[str, str], np.ndarray]
 
 def where_rank_goes(book: Book) -> str:
     """Return a paragraph for each backbone."""
-    return "\n".join(f"**{BACKBONES[b]}**: {_paragraph(book, b)}\n" for b in book.backbones)
+    return "\n".join(f"**{BACKBONES[b]}**: {_paragraph(book, b)}" for b in book.backbones)
 
 
 def _paragraph(book: Book, backbone: str) -> str:
     prefix = f"{backbone}/multi/lora_sp"
     if missing := book.missing(prefix):
-        return f"{missing}."
+        return f"{missing}.\n"
     boxes = _boxes(book, prefix)
     means = {tower: book.mean(prefix, "active_rank", tower) or 0.0 for tower in TOWERS}
     spread = {
@@ -30,10 +30,12 @@ def _paragraph(book: Book, backbone: str) -> str:
     }
     high, low = _extremes(boxes)
     return (
-        f"on average, a token uses {_by_tower(means, f' of {book.rank} directions')}. "
+        f"on average, a token uses {_by_tower(means, f' of {book.rank} directions')}."
+        '\n\n<details markdown="1">\n<summary>Layers, depth and tokens</summary>\n\n'
         f"The median over tokens is highest in {high}, and lowest in {low}. "
         f"From the first layer to the last, it goes {_by_tower(_depth(boxes))}. "
         f"Within one layer, the middle half of the tokens spans {_by_tower(spread, ' ranks')}."
+        "\n\n</details>\n"
     )
 
 
@@ -55,9 +57,14 @@ def _extremes(boxes: Boxes) -> tuple[str, str]:
     """Return the kinds of layers with the highest and the lowest medians."""
     medians = {kind: float(array[..., 2].mean()) for kind, array in boxes.items()}
     ordered = sorted(medians, key=lambda kind: -medians[kind])
-    name = lambda kind: f"{kind[0]} `{kind[1]}` ({medians[kind]:.0f})"  # noqa: E731
+    name = lambda kind: f"{kind[0]} `{_short(kind[1])}` ({medians[kind]:.0f})"  # noqa: E731
     high, low = ordered[:_EXTREMES], ordered[::-1][:_EXTREMES]
     return ", ".join(map(name, high)), ", ".join(map(name, low))
+
+
+def _short(linear: str) -> str:
+    """Return the name of a linear layer as Figure 6 has it."""
+    return linear.removesuffix("_proj").replace("action_time_mlp", "time")
 
 
 def _depth(boxes: Boxes) -> dict[str, str]:

@@ -14,7 +14,10 @@ paired, so that what a layout or a seed does to both cancels.
 Three seeds say little about the spread between seeds, and no resampling can add to it. With four
 tasks of 256 episodes at 90 %, the 95 % interval contains the true rate in 99 % of studies if seeds
 do not differ, in 88 % if they differ by a standard deviation of 2 points, and in 80 % at 4 points
-(400 simulated studies; five seeds: 91 and 84 %).
+(400 simulated studies; five seeds: 91 and 84 %). For paired differences it is 100, 87 and 79 %.
+
+A standard deviation over tasks needs a correction: the noise of finite samples adds to it, most
+where it is small, and resampling adds the same noise again. See `corrected`.
 """
 
 import functools
@@ -62,14 +65,39 @@ def bootstrap(statistic: Callable[..., Any], *methods: np.ndarray) -> Estimate:
     Raises:
         ValueError: the methods differ in their seeds, tasks or layouts.
     """
+    value, draws = _draw(statistic, methods)
+    low, high = _quantiles(draws)
+    return Estimate(value, low, high)
+
+
+def corrected(statistic: Callable[..., Any], *methods: np.ndarray) -> Estimate:
+    """Estimate a biased statistic, such as a standard deviation; arguments are as for `bootstrap`.
+
+    How far draws lie from the estimate on average tells its bias, which is subtracted. The interval
+    is the basic one, the percentiles mirrored at the estimate (Davison and Hinkley,
+    Bootstrap Methods and their Application, 1997, section 5.2). For the difference of two mean
+    standard deviations over four tasks, it contains the truth in 93 to 99 % of studies, that of
+    `bootstrap` in 80 to 100 % (150 simulated studies each: equal or different deviations, rates
+    near 100 % or not, seeds that do not differ or by 2 points).
+    """
+    value, draws = _draw(statistic, methods)
+    low, high = _quantiles(draws)
+    return Estimate(2 * value - float(np.mean(draws)), 2 * value - high, 2 * value - low)
+
+
+def _draw(statistic: Callable[..., Any], methods: Sequence[np.ndarray]) -> tuple[float, np.ndarray]:
+    """Return a statistic of the methods' rates, and of those of every draw, `[DRAWS]`."""
     if len({method.shape for method in methods}) != 1:
         shapes = ", ".join(str(method.shape) for method in methods)
         raise ValueError(f"methods need the same seeds, tasks and layouts, got shapes {shapes}")
     value = float(statistic(*(method.mean((0, 2)) for method in methods)))
-    draws = statistic(*_resampled(np.stack(methods)))
+    return value, statistic(*_resampled(np.stack(methods)))
+
+
+def _quantiles(draws: np.ndarray) -> tuple[float, float]:
     tail = (1 - LEVEL) / 2
     low, high = np.quantile(draws, [tail, 1 - tail], method="inverted_cdf")
-    return Estimate(value, float(low), float(high))
+    return float(low), float(high)
 
 
 def mean(rates: np.ndarray) -> np.ndarray:
@@ -85,6 +113,11 @@ def success(method: np.ndarray) -> Estimate:
 def difference(a: np.ndarray, b: np.ndarray) -> Estimate:
     """Estimate the paired difference of success rates, a - b, averaged over tasks."""
     return bootstrap(lambda x, y: mean(x) - mean(y), a, b)
+
+
+def ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Ratio of mean success rates; the floor of one in a thousand avoids 0 / 0."""
+    return mean(a) / np.maximum(mean(b), 1e-3)
 
 
 def over_seeds(values: Sequence[float]) -> Estimate:

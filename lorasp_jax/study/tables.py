@@ -147,7 +147,7 @@ def table_4(book: Book, backbone: str) -> str:
 
 def pruning(book: Book, backbone: str) -> str:
     """Return what pruning after training saves and costs."""
-    headers = ["method", "adapters [MB]", "one call [ms]", "success", "after pruning"]
+    headers = ["method", "adapters [MB]", "action chunk [ms]", "success", "after pruning"]
     rows = []
     methods = [m for m in book.methods(backbone, "multi") if m.endswith("_pruned")]
     for method in methods:
@@ -185,7 +185,7 @@ def robots(book: Book) -> str:
 def costs(book: Book, backbone: str) -> str:
     """Return what each method of Table I costs."""
     headers = [
-        *("method", "mean success", "trainable", "GFLOP per sample", "memory [GiB]"),
+        *("method", "trainable", "GFLOP per sample", "memory [GiB]"),
         *("samples/s", "seconds per run"),
     ]
     fields = (
@@ -202,13 +202,12 @@ def costs(book: Book, backbone: str) -> str:
         prefix = f"{backbone}/multi/{method}"
         name = naming.label(method, book.rank)
         if missing := book.missing(prefix):
-            rows.append([name, missing, *[NONE] * len(fields)])
+            rows.append([name, missing, *[NONE] * (len(fields) - 1)])
             continue
-        success = f"{100 * book.outcomes(prefix).mean():.1f}"
         values = [(book.mean(prefix, *path), scale, unit) for path, scale, unit in fields]
         rows.append(
             [
-                *(name, success),
+                name,
                 *(NONE if v is None else f"{float(f'{v * s:.3g}'):,g}{u}" for v, s, u in values),
             ]
         )

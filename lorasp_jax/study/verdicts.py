@@ -2,7 +2,8 @@
 
 from collections.abc import Iterable
 
-from lorasp_jax.study.book import BACKBONES, NONE, Book, markdown
+from lorasp_jax.study import published, statistics
+from lorasp_jax.study.book import BACKBONES, NONE, Book, markdown, percent
 from lorasp_jax.study.claims import Claim, Criterion, Judged, Outcome, verdict
 
 _WORDS = {
@@ -70,6 +71,25 @@ def numbers(claims: tuple[Claim, ...], book: Book, judged: Judged) -> str:
     return markdown(["claim", "number", "must be", *titles], rows)
 
 
+def highest_rank(book: Book) -> str:
+    """Return how near LoRA with r = R comes to full fine-tuning, which claim 3 does not test."""
+    parts = []
+    for backbone in book.backbones:
+        prefixes = [f"{backbone}/multi/{method}" for method in (f"lora_r{book.rank}", "full")]
+        if book.missing(*prefixes):
+            continue
+        ratio = statistics.bootstrap(statistics.ratio, *map(book.outcomes, prefixes))
+        rates = [published.rates(prefix, book.rank) for prefix in prefixes]
+        paper = "" if any(r is None for r in rates) else f" ({100 * statistics.ratio(*rates):.1f})"
+        parts.append(f"{percent(ratio)}{paper} on {BACKBONES[backbone]}")
+    if not parts:
+        return ""
+    return (
+        "Claim 3 would also hold if no rank reached 95 % of full fine-tuning's success. LoRA with "
+        f"r = {book.rank} reaches, in %, {' and '.join(parts)}.\n"
+    )
+
+
 def reasons(claims: Iterable[Claim]) -> str:
     """Return a list of the reasons for all bounds."""
     found = dict[str, list[int]]()
@@ -102,5 +122,6 @@ def _number(value: float, test: Criterion) -> str:
     """Return a number in a criterion's unit, differences with a sign."""
     if test.unit == "%":
         return f"{100 * value:.1f}"
-    rounded = round(value * (100 if test.unit else 1), 1) + 0.0  # no minus zero
-    return f"{rounded:+.1f}".replace("-", "−")
+    points = round(100 * value, 1) + 0.0  # no minus zero
+    text = f"{points:+.1f}" if test.unit else f"{value + 0.0:+#.3g}"
+    return text.replace("-", "−")

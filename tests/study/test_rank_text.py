@@ -25,11 +25,14 @@ def test_numbers():
     text = where_rank_goes(Book(NAMES, results))
     assert text == (
         "**SmolVLA**: on average, a token uses 25.0 of 64 directions in vision, 7.0 in language "
-        "and 9.0 in action. The median over tokens is highest in vision `fc1` (30), vision `head` "
-        "(12), action `k_proj` (9), and lowest in action `state_proj` (2), language `q_proj` (7), "
-        "action `k_proj` (9). From the first layer to the last, it goes from 40 to 20 in vision, "
+        "and 9.0 in action.\n\n"
+        '<details markdown="1">\n<summary>Layers, depth and tokens</summary>\n\n'
+        "The median over tokens is highest in vision `fc1` (30), vision `head` "
+        "(12), action `k` (9), and lowest in action `state` (2), language `q` (7), "
+        "action `k` (9). From the first layer to the last, it goes from 40 to 20 in vision, "
         "from 6 to 8 in language and from 20 to 10 in action. Within one layer, the middle half "
-        "of the tokens spans 19.5 ranks in vision, 4.0 in language and 4.5 in action.\n"
+        "of the tokens spans 19.5 ranks in vision, 4.0 in language and 4.5 in action."
+        "\n\n</details>\n"
     )
 
 

@@ -99,8 +99,7 @@ def test_ranks_of_both_backbones():
 
 def test_costs():
     cells = row(tables.costs(BOOK, "pi0"), "LoRA, r = 64")
-    rate = BOOK.outcomes("pi0/multi/lora_r64").mean()
-    assert cells[1:] == [f"{100 * rate:.1f}", "5.76 M", "2.1", "5.59", "14,000", "110"]
+    assert cells[1:] == ["5.76 M", "2.1", "5.59", "14,000", "110"]
     assert "cut" not in tables.costs(BOOK, "pi0")
 
 
@@ -122,6 +121,11 @@ def test_best_rate_is_bold():
 def test_the_papers_numbers(prefix, mean):
     """The means that the paper's text and tables give."""
     assert 100 * published.rates(prefix, 64).mean() == pytest.approx(mean, abs=0.06)
+
+
+def test_the_papers_rates_are_fifteenths():
+    """12, 13, 12 and 13 of 15 have a mean of 83.33 %; the rounded rates have 83.35."""
+    assert published.rates("pi0/multi/full", 64).mean() == pytest.approx(50 / 60)
 
 
 def test_the_paper_has_no_number():

@@ -1,5 +1,7 @@
 """Verdicts on the page, and how much is missing for the others."""
 
+import re
+
 import pytest
 
 from lorasp_jax.study import verdicts
@@ -58,6 +60,20 @@ def test_numbers_of_both_backbones(some):
     assert ["6", "success with the spectral loss minus without", "above −3 points", "–"] in [
         row[:4] for row in table
     ]
+
+
+def test_the_highest_rank_is_beside_claim_3(some):
+    assert shown(lambda _, book, __: verdicts.highest_rank(book), some) == ""
+    text = shown(lambda _, book, __: verdicts.highest_rank(book), synthetic.results())
+    assert re.search(
+        r"reaches, in %, \d+\.\d \[.*\] \(72\.0\) on π0 and .*\(69\.2\) on SmolVLA", text
+    )
+
+
+def test_shares_and_ranks_have_three_digits():
+    table = rows(shown(verdicts.numbers, synthetic.results()))
+    shares = [row[3] for row in table if row[0] == "5"]
+    assert all(re.match(r"\+0\.\d{3} \[", share) for share in shares)
 
 
 def test_reasons_are_given_once():

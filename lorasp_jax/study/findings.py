@@ -1,0 +1,113 @@
+"""What tables and figures of the study's page show, in sentences made from the results."""
+
+import numpy as np
+
+from lorasp_jax.study import naming, statistics
+from lorasp_jax.study.book import BACKBONES, TASKS, Book
+
+
+def experts(book: Book) -> str:
+    """Return the sizes of LoRA-MoE; "" before its first run."""
+    for name, cell in book.results.items():
+        if "/multi/lora_moe" in name:
+            peft = cell["config"]["peft"]
+            return f"LoRA-MoE has {peft['experts']} experts of rank {peft['rank']}."
+    return ""
+
+
+def edges(book: Book) -> str:
+    """Name the methods whose best learning rate is the lowest or the highest; "" if none is."""
+    texts = []
+    for backbone in book.backbones:
+        methods = book.methods(backbone, "pilot")
+        done = [m for m in methods if not book.missing(f"{backbone}/pilot/{m}")]
+        found = [naming.label(m, book.rank) for m in done if _at_edge(book, backbone, m)]
+        if found:
+            texts.append(f"On {BACKBONES[backbone]}: {'; '.join(found)}.")
+    if not texts:
+        return ""
+    return (
+        "Where the best is the lowest or the highest of the three, a better one may lie beyond. "
+        f"{' '.join(texts)}"
+    )
+
+
+def _at_edge(book: Book, backbone: str, method: str) -> bool:
+    names = sorted(naming.flat(book.cells(f"{backbone}/pilot/{method}")), key=_rate)
+    return naming.best_pilot(book.results, names) in (names[0], names[-1])
+
+
+def _rate(name: str) -> float:
+    return float(name.rsplit("/", 1)[1])
+
+
+def pruned(book: Book) -> str:
+    """Say what pruning does to LoRA-SP; "" before its runs."""
+    texts = []
+    for backbone in book.backbones:
+        source = f"{backbone}/multi/lora_sp"
+        if book.missing(source, f"{source}_pruned"):
+            continue
+        sizes = np.mean([s["bytes"] for s in book.measures(f"{source}_pruned", "smaller")], axis=0)
+        both = book.outcomes(f"{source}_pruned"), book.outcomes(source)
+        change, low, high = (100 * x + 0.0 for x in statistics.difference(*both))
+        points = f"{change:+.1f} points [{low:+.1f}, {high:+.1f}]".replace("-", "−")
+        texts.append(
+            f"On {BACKBONES[backbone]}, it shrinks LoRA-SP's adapters by "
+            f"{100 * (1 - sizes[1] / sizes[0]):.0f} % and changes success by {points}."
+        )
+    return " ".join(texts)
+
+
+def shared_directions(book: Book) -> str:
+    """Say which tasks share most and fewest directions; "" before the runs."""
+    texts = []
+    for backbone in book.backbones:
+        prefix = f"{backbone}/multi/lora_sp"
+        if book.missing(prefix):
+            continue
+        cells = book.measures(prefix, "direction_overlap")
+        index = {pair: np.mean([cell[pair]["all"] for cell in cells], axis=0) for pair in cells[0]}
+        high, low = (choose(index, key=lambda p: index[p][0]) for choose in (max, min))
+        texts.append(
+            f"On {BACKBONES[backbone]}, {_pair(high)} share most directions (overlap "
+            f"{index[high][0]:.2f}, by chance {index[high][1]:.2f}), {_pair(low)} fewest "
+            f"({index[low][0]:.2f}, by chance {index[low][1]:.2f})."
+        )
+    return _paragraph(texts)
+
+
+def gradients(book: Book) -> str:
+    """Say how far tasks pull LoRA-SP and LoRA in the same direction; "" before the runs."""
+    texts = []
+    for backbone in book.backbones:
+        methods = ["lora_sp", f"lora_r{book.rank}"]
+        if book.missing(*(f"{backbone}/multi/{m}" for m in methods)):
+            continue
+        parts = []
+        for method in methods:
+            cells = book.measures(f"{backbone}/multi/{method}", "gradient_cosine")
+            pairs = [(*pair.split("|"), t["all"]) for cell in cells for pair, t in cell.items()]
+            two, one = (np.mean([v for a, b, v in pairs if (a == b) is s]) for s in (False, True))
+            parts.append(
+                f"{_signed(two)} between tasks and {_signed(one)} within one for "
+                f"{naming.label(method, book.rank)}"
+            )
+        texts.append(f"On {BACKBONES[backbone]}, the cosine is {_joined(parts)}.")
+    return _paragraph(texts)
+
+
+def _pair(pair: str) -> str:
+    return "“" + "” and “".join(TASKS[task] for task in pair.split("|")) + "”"
+
+
+def _joined(parts: list[str]) -> str:
+    return " and ".join([", ".join(parts[:-1]), parts[-1]] if parts[1:] else parts)
+
+
+def _paragraph(texts: list[str]) -> str:
+    return " ".join(texts) + "\n\n" if texts else ""
+
+
+def _signed(value: float) -> str:
+    return f"{value:.2f}".replace("-", "−")

@@ -1,0 +1,25 @@
+"""The setup has its numbers from the settings and results."""
+
+from lorasp_jax.study.book import Book
+from lorasp_jax.study.setup_table import setup_table
+from tests.study import synthetic
+
+CONFIG = synthetic.cells()["pi0/multi/lora_sp/s0"]["config"]
+NAMES = tuple(synthetic.cells())
+
+
+def test_numbers():
+    text = setup_table(Book(NAMES, synthetic.results()), CONFIG).replace("\u00a0", " ")
+    assert "| small versions: π0 of 9.9 M parameters and SmolVLA of 9.9 M parameters |" in text
+    assert "| 512, by a scripted expert | 120, teleoperated |" in text
+    assert "| all linear layers |" in text
+    assert "| 64 | 128 |" in text
+    assert "| 256 episodes per task and seed, 3 seeds |" in text
+    assert "within 8 to 20 s" in text
+
+
+def test_before_the_first_run():
+    text = setup_table(Book(NAMES, {}), CONFIG | {"targets": ["^action/"], "image_size": 96})
+    assert "| small versions: π0 and SmolVLA |" in text
+    assert "| ^action/ |" in text
+    assert "96 x 96 pixels" in text
