@@ -232,7 +232,7 @@ def _saturates(make: _Maker, backbone: str) -> tuple[Criterion, ...]:
     gain = make.difference(
         f"{sp}_eta_0.99",
         sp,
-        measure="η = .99 minus η = .9",
+        measure="success at η = .99 minus at η = .9",
         side="below",
         bound=0.03,
         reason=THREE_POINTS,
@@ -240,7 +240,7 @@ def _saturates(make: _Maker, backbone: str) -> tuple[Criterion, ...]:
     rise = make.difference(
         sp,
         f"{sp}_eta_0.8",
-        measure="η = .9 minus η = .8",
+        measure="success at η = .9 minus at η = .8",
         side="above",
         bound=0.0,
         reason="success that is as high at .8 saturates earlier",

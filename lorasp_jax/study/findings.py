@@ -88,7 +88,9 @@ def gradients(book: Book) -> str:
         for method in methods:
             cells = book.measures(f"{backbone}/multi/{method}", "gradient_cosine")
             pairs = [(*pair.split("|"), t["all"]) for cell in cells for pair, t in cell.items()]
-            two, one = (np.mean([v for a, b, v in pairs if (a == b) is s]) for s in (False, True))
+            two, one = (
+                float(np.mean([v for a, b, v in pairs if (a == b) is s])) for s in (False, True)
+            )
             parts.append(
                 f"{_signed(two)} between tasks and {_signed(one)} within one for "
                 f"{naming.label(method, book.rank)}"

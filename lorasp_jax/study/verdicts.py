@@ -79,8 +79,8 @@ def highest_rank(book: Book) -> str:
         if book.missing(*prefixes):
             continue
         ratio = statistics.bootstrap(statistics.ratio, *map(book.outcomes, prefixes))
-        rates = [published.rates(prefix, book.rank) for prefix in prefixes]
-        paper = "" if any(r is None for r in rates) else f" ({100 * statistics.ratio(*rates):.1f})"
+        rates = [r for p in prefixes if (r := published.rates(p, book.rank)) is not None]
+        paper = f" ({100 * statistics.ratio(*rates):.1f})" if len(rates) == 2 else ""
         parts.append(f"{percent(ratio)}{paper} on {BACKBONES[backbone]}")
     if not parts:
         return ""
