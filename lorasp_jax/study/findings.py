@@ -70,32 +70,28 @@ def shared_directions(book: Book) -> str:
         index = {pair: np.mean([cell[pair]["all"] for cell in cells], axis=0) for pair in cells[0]}
         high, low = (choose(index, key=lambda p: index[p][0]) for choose in (max, min))
         texts.append(
-            f"On {BACKBONES[backbone]}, {_pair(high)} share most directions (overlap "
-            f"{index[high][0]:.2f}, by chance {index[high][1]:.2f}), {_pair(low)} fewest "
+            f"On {BACKBONES[backbone]}, {_pair(high)} share the most directions (overlap "
+            f"{index[high][0]:.2f}, by chance {index[high][1]:.2f}), {_pair(low)} the fewest "
             f"({index[low][0]:.2f}, by chance {index[low][1]:.2f})."
         )
     return _paragraph(texts)
 
 
 def gradients(book: Book) -> str:
-    """Say how far tasks pull LoRA-SP and LoRA in the same direction; "" before the runs."""
+    """Say how far tasks pull LoRA-SP in the same direction; "" before the runs."""
     texts = []
     for backbone in book.backbones:
-        methods = ["lora_sp", f"lora_r{book.rank}"]
-        if book.missing(*(f"{backbone}/multi/{m}" for m in methods)):
+        prefix = f"{backbone}/multi/lora_sp"
+        if book.missing(prefix):
             continue
-        parts = []
-        for method in methods:
-            cells = book.measures(f"{backbone}/multi/{method}", "gradient_cosine")
-            pairs = [(*pair.split("|"), t["all"]) for cell in cells for pair, t in cell.items()]
-            two, one = (
-                float(np.mean([v for a, b, v in pairs if (a == b) is s])) for s in (False, True)
-            )
-            parts.append(
-                f"{_signed(two)} between tasks and {_signed(one)} within one for "
-                f"{naming.label(method, book.rank)}"
-            )
-        texts.append(f"On {BACKBONES[backbone]}, the cosine is {_joined(parts)}.")
+        cells = book.measures(prefix, "gradient_cosine")
+        pairs = [(*pair.split("|"), t["all"]) for cell in cells for pair, t in cell.items()]
+        means = (np.mean([v for a, b, v in pairs if (a == b) is same]) for same in (False, True))
+        two, one = (f"{mean:.2f}".replace("-", "−") for mean in means)
+        texts.append(
+            f"For LoRA-SP on {BACKBONES[backbone]}, the cosine is {two} between tasks and {one} "
+            "between two batches of one task."
+        )
     return _paragraph(texts)
 
 
@@ -103,13 +99,5 @@ def _pair(pair: str) -> str:
     return "“" + "” and “".join(TASKS[task] for task in pair.split("|")) + "”"
 
 
-def _joined(parts: list[str]) -> str:
-    return " and ".join([", ".join(parts[:-1]), parts[-1]] if parts[1:] else parts)
-
-
 def _paragraph(texts: list[str]) -> str:
     return " ".join(texts) + "\n\n" if texts else ""
-
-
-def _signed(value: float) -> str:
-    return f"{value:.2f}".replace("-", "−")

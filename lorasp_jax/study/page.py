@@ -73,7 +73,6 @@ def page(study: Study, results: Mapping[str, Any], films: Collection[str] = ()) 
             rates=tables.rates(book),
             where_rank_goes=where_rank_goes(book),
             films=_films(book, films),
-            total=_total(book),
             **{f"figure_{name}": drawings.markdown(book, name) for name in drawings.DRAWINGS},
             **{name: _by_backbone(book, table) for name, table in by_backbone.items()},
         )
@@ -153,15 +152,6 @@ def _films(book: Book, names: Collection[str]) -> str:
     )
 
 
-def _total(book: Book) -> str:
-    return (
-        f"{_hours(book)} They contain training, evaluation and measures, but not pretraining; they "
-        "depend on the GPU, which results do not record, and runs that shared one overlap."
-        if book.results
-        else ""
-    )
-
-
 def _hours(book: Book) -> str:
     seconds = sum(cell["seconds"]["total"] for cell in book.results.values())
-    return f"The times of its {len(book.results)} finished runs sum to {seconds / 3600:.1f} hours."
+    return f"The times of the {len(book.results)} finished runs sum to {seconds / 3600:.1f} hours."

@@ -49,10 +49,10 @@ def test_pairs_of_tasks():
         results[name] = results[name] | {"measures": measures}
     book = Book(tuple(n for n in NAMES if n.startswith("pi0")), results)
     assert findings.shared_directions(book) == (
-        "On π0, “pour” and “press” share most directions (overlap 0.90, by chance 0.40), "
-        "“open the pot” and “press” fewest (0.50, by chance 0.30).\n\n"
+        "On π0, “pour” and “press” share the most directions (overlap 0.90, by chance 0.40), "
+        "“open the pot” and “press” the fewest (0.50, by chance 0.30).\n\n"
     )
-    text = findings.gradients(book)
-    assert text.startswith(
-        "On π0, the cosine is −0.25 between tasks and 0.50 within one for LoRA-SP"
+    assert findings.gradients(book) == (
+        "For LoRA-SP on π0, the cosine is −0.25 between tasks and 0.50 between two batches of one "
+        "task.\n\n"
     )
