@@ -10,6 +10,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from lorasp_jax.kernels import rowwise_kernel as kernels
 from lorasp_jax.kernels.row_sharding import by_rows
+from lorasp_jax.kernels.short_attention import Launch, short_attention
 from lorasp_jax.training.distributed import mesh as meshes
 from tests.kernels.test_rowwise_kernel import WIDTHS, close, gated
 
@@ -85,3 +86,25 @@ def test_rowwise_kernel(monkeypatch):
     compiled = gradients.lower(shared, shard(x)).compile()
     assert "all-gather" not in compiled.as_text()
     jax.tree.map(close, compiled(shared, shard(x)), gradients(shared, x))
+
+
+@pytest.mark.slow
+def test_short_attention():
+    """Values and gradients of attention on a sharded batch."""
+    q = jax.random.normal(jax.random.key(0), (8, 5, 2, 16))
+    mask = jnp.tri(5, dtype=bool)[None].repeat(8, axis=0)
+
+    @jax.jit
+    def gradients(q, mask):
+        launches = (Launch(16, 16, 4),) * 2
+
+        def loss(q):
+            k, v = jnp.sin(q[:, :, :1]), jnp.cos(q[:, :, :1])
+            y = short_attention(q, k, v, mask, launches=launches, interpret=True)
+            return jnp.sin(y).sum()
+
+        return jax.value_and_grad(loss)(q)
+
+    compiled = gradients.lower(shard(q), shard(mask)).compile()
+    assert "all-gather" not in compiled.as_text()
+    jax.tree.map(close, compiled(shard(q), shard(mask)), gradients(q, mask))
