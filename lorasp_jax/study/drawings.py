@@ -38,45 +38,54 @@ def _lora_sp(_: Book, backbone: str) -> list[str]:
     return [f"{backbone}/multi/lora_sp"]
 
 
+def _table_2(book: Book, backbone: str) -> list[str]:
+    kinds = ("single", "multi")
+    return _lora(book, backbone, *kinds) + [f"{backbone}/{kind}/full" for kind in kinds]
+
+
 DRAWINGS = {
     "1": Drawing(
         figures.figure_1,
         lambda book, b: [*_lora(book, b, "multi"), f"{b}/multi/full", *_lora_sp(book, b)],
-        "Figure 1. Multi-task success relative to full fine-tuning (dotted) against rank",
-        "Bands and bars are 95 % intervals. The paper's ranks are scaled from R = 128 to {rank}.",
+        "Figure 1. Multi-task success relative to full fine-tuning, against rank",
+        "The further left a point reaches the dotted line, the less rank the method needs; bands "
+        "and bars are 95 % intervals, and the paper's ranks are scaled from R = 128 to {rank}.",
     ),
     "3": Drawing(
         figures.figure_3,
-        lambda book, b: _lora(book, b, "single", "multi"),
-        "Figure 3. Success of LoRA against rank, by task",
-        "The band spans the tasks.",
+        _table_2,
+        "Figure 3. LoRA's success against rank, with one policy per task and one for all",
+        "Above, the mean over tasks; below, how much tasks differ, corrected for the noise of "
+        "finite samples and at least 0; bands are 95 % intervals.",
     ),
     "4": Drawing(
         figures.figure_4,
         lambda _, b: [f"{b}/multi/full", f"{b}/panda/full"],
         "Figure 4. Rank of full fine-tuning's updates, for a robot that the base has seen and for "
         "one that it has not",
-        "Share of the singular values that hold 99 % of an update's energy. Boxes are over layers "
-        "and seeds.",
+        "The higher a box, the more of its singular values a layer's update needs for 99 % of its "
+        "energy; boxes are quartiles over layers and seeds, whiskers go from minimum to maximum.",
     ),
     "6": Drawing(
         figures.figure_6,
         _lora_sp,
-        "Figure 6. LoRA-SP's active rank over the tokens of held-out demonstrations, first seed",
-        "One box per layer, whiskers from minimum to maximum; layers of one kind stand side by "
-        "side, in order of depth.",
+        "Figure 6. LoRA-SP's active rank over the tokens of held-out demonstrations",
+        "For each kind of layer, dots are the medians of its layers, the bar is the middle half of "
+        "tokens, averaged over layers and seeds, and the line goes from minimum to maximum.",
     ),
     "directions": Drawing(
         task_figures.shared_directions,
         _lora_sp,
         "Figure A. Which directions tasks share in LoRA-SP",
-        "Dots are means over seeds, lines span the seeds.",
+        "The further right of its ring a dot lies, the more two tasks share; dots are means over "
+        "seeds, thick lines span the seeds.",
     ),
     "gradients": Drawing(
         task_figures.gradients,
         task_figures.gradient_methods,
         "Figure B. Cosines of gradients after multi-task training",
-        "Dots are means over pairs of tasks and seeds, lines span the seeds.",
+        "The closer a dot is to its ring, the less two tasks differ; dots are means over pairs of "
+        "tasks and seeds, thick lines span the seeds.",
     ),
 }
 """Figures by the name of their files; those of the paper have its numbers."""

@@ -1,11 +1,12 @@
 """Style of the study's figures."""
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lorasp_jax.study.book import Book
@@ -15,8 +16,10 @@ SCHEMES = {
     "dark": {"ink": "#e6edf3", "soft": "#8b949e"},
 }
 """Colors for light and dark pages; the background is transparent."""
-SERIES = ("#4269d0", "#efb118", "#ff725c", "#3ca951")
-"""Colors of tasks and of methods."""
+LORA_SP, LORA, SINGLE, FULL = "#ff725c", "#a463f2", "#9c6b4e", "#8b949e"
+"""Colors of LoRA-SP, of LoRA, of LoRA for single tasks, and of full fine-tuning in all figures."""
+WIDTH = 7.2
+"""Width of a figure [inches], that of a page, so that text keeps its size."""
 
 
 def svg(draw: Callable[[Book], Figure], book: Book, scheme: str) -> str:
@@ -25,8 +28,8 @@ def svg(draw: Callable[[Book], Figure], book: Book, scheme: str) -> str:
     style: Any = {
         **{f"{name}.color": ink for name in ("text", "xtick", "ytick", "lines")},
         **{"axes.labelcolor": ink, "axes.titlecolor": ink, "axes.edgecolor": soft},
-        **{"axes.spines.top": False, "axes.spines.right": False, "font.size": 10},
-        **{"axes.grid": True, "grid.alpha": 0.25, "grid.color": soft},
+        **{"axes.spines.top": False, "axes.spines.right": False, "font.size": 9},
+        **{"axes.titlesize": 10, "axes.grid": True, "grid.alpha": 0.25, "grid.color": soft},
         **{"axes.facecolor": "none", "legend.frameon": False},
         **{"svg.fonttype": "path", "svg.hashsalt": "lorasp_jax"},
     }
@@ -36,8 +39,23 @@ def svg(draw: Callable[[Book], Figure], book: Book, scheme: str) -> str:
     return buffer.getvalue()
 
 
-def panels(book: Book, rows: int, height: float) -> tuple[Figure, np.ndarray]:
+def panels(book: Book, rows: int, height: float, **subplots: Any) -> tuple[Figure, np.ndarray]:
     """Return a figure with a column of axes `[rows, columns]` for each backbone of a book."""
-    columns = len(book.backbones)
-    figure = Figure(figsize=(4.6 * columns, height), layout="constrained")
-    return figure, figure.subplots(rows, columns, sharey=True, squeeze=False)
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    options: Any = {"sharey": True, "squeeze": False, **subplots}
+    return figure, figure.subplots(rows, len(book.backbones), **options)
+
+
+def rows(axes: Axes, labels: Sequence[str]) -> None:
+    """Label the rows of a panel, from top to bottom."""
+    axes.set_yticks(range(len(labels)), labels)
+    axes.set_ylim(len(labels) - 0.5, -0.5)
+
+
+def legend(figure: Figure, axes: Axes, columns: int) -> None:
+    """Put the legend of a panel above the figure; entries fill one column after another."""
+    handles, labels = axes.get_legend_handles_labels()
+    entries = dict(zip(labels, handles, strict=True))
+    for label in sorted(labels, key=lambda label: label.split(",")[0] == "full fine-tuning"):
+        entries[label] = entries.pop(label)
+    figure.legend(entries.values(), entries.keys(), loc="outside upper center", ncols=columns)

@@ -1,184 +1,217 @@
 """Figures 1, 3, 4 and 6 of the paper, for the backbones of a book, whose results must be there."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from lorasp_jax.report.figures import COLORS
 from lorasp_jax.study import naming, published, statistics
-from lorasp_jax.study.book import BACKBONES, TASKS, Book
-from lorasp_jax.study.figure_style import SERIES, panels
+from lorasp_jax.study.book import BACKBONES, Book
+from lorasp_jax.study.figure_style import FULL, LORA, LORA_SP, SINGLE, legend, panels, rows
 from lorasp_jax.study.naming import TOWERS
+from lorasp_jax.study.statistics import Estimate
 
-_SEEN = {"panda": "#9498a0", "multi": "#ff725c"}
+_TRAININGS = {"single": ("one policy per task", SINGLE, "s"), "multi": ("one for all", LORA, "o")}
+_ROBOTS = {"panda": "Panda (seen), new scene", "multi": "PiPER (unseen)"}
+_FORWARD = (
+    *("patch_embed", "state_proj", "action_in_proj", "action_time_mlp_in", "action_time_mlp_out"),
+    *("q_proj", "k_proj", "v_proj", "o_proj", "out_proj", "gate_proj", "up_proj", "down_proj"),
+    *("fc1", "fc2", "head", "action_out_proj"),
+)
+"""Kinds of linear layers in the order in which a token meets them; others follow."""
 
 
 def figure_1(book: Book) -> Figure:
     """Plot multi-task success relative to full fine-tuning against rank, as in Figure 1."""
-    figure, grid = panels(book, 1, height=3.6)
+    figure, grid = panels(book, 1, height=3.3)
     for axes, backbone in zip(grid[0], book.backbones, strict=True):
         ranks = book.ranks(backbone, "multi")
         lora = [_relative_success(book, backbone, f"lora_r{rank}") for rank in ranks]
-        points = np.array(lora)
-        axes.fill_between(ranks, points[:, 1], points[:, 2], color=SERIES[0], alpha=0.2, lw=0)
-        axes.plot(ranks, points[:, 0], "o-", color=SERIES[0], label="LoRA")
-        _papers(axes, book, backbone, ranks)
+        _band(axes, ranks, lora, LORA, "o", "LoRA")
+        _paper_lora(axes, book, backbone, ranks)
         value, low, high = _relative_success(book, backbone, "lora_sp")
         errors = [[value - low], [high - value]]
         mean = book.mean(f"{backbone}/multi/lora_sp", "active_rank", "mean")
-        axes.errorbar([mean or 1], [value], errors, fmt="D", color=SERIES[2], label="LoRA-SP")
-        axes.axhline(100, color="gray", lw=1, ls=":")
+        axes.errorbar([mean or 1], [value], errors, color=LORA_SP)
+        axes.plot([mean or 1], [value], "D", color=LORA_SP, label="LoRA-SP")
+        _paper_lora_sp(axes, book, backbone)
+        axes.axhline(100, color=FULL, lw=1.5, ls=":", label="full fine-tuning")
         _rank_axis(axes, ranks)
+        axes.set_xlabel("rank (LoRA-SP: mean active rank)")
         axes.set_title(BACKBONES[backbone], loc="left")
-    grid[0][0].set_ylabel("success relative to full\nfine-tuning [%], four tasks")
-    grid[0][0].legend(loc="lower right")
+    grid[0][0].set_ylim(0)
+    grid[0][0].set_ylabel("success relative to\nfull fine-tuning [%]")
+    legend(figure, grid[0][0], columns=3)
     return figure
 
 
-def _relative_success(book: Book, backbone: str, method: str) -> np.ndarray:
+def _relative_success(book: Book, backbone: str, method: str) -> Estimate:
     """Return success relative to full fine-tuning and its interval [%]."""
     pair = (book.outcomes(f"{backbone}/multi/{m}") for m in (method, "full"))
-    return 100 * np.array(statistics.bootstrap(_relative, *pair))
+    return _percent(statistics.bootstrap(statistics.ratio, *pair))
 
 
-def _relative(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a.mean(-1) / np.maximum(b.mean(-1), 1e-3)
+def _percent(estimate: Estimate) -> Estimate:
+    return Estimate(*(100 * x for x in estimate))
 
 
-def _papers(axes: Axes, book: Book, backbone: str, ranks: list[int]) -> None:
-    """Plot the paper's points at the same fractions of R."""
-    full = published.rates(f"{backbone}/multi/full", book.rank)
-    rows = {r: published.rates(f"{backbone}/multi/lora_r{r}", book.rank) for r in ranks}
-    if full is None:
-        return
-    rows = {r: 100 * _relative(row, full) for r, row in rows.items() if row is not None}
-    axes.plot(list(rows), list(rows.values()), "s--", color="gray", ms=4, label="LoRA, paper")
-    prefix = f"{backbone}/multi/lora_sp"
-    rate, cell = published.rates(prefix, book.rank), published.cell(prefix, book.rank)
-    if rate is not None:
+def _band(
+    axes: Axes, ranks: list[int], points: Sequence[Estimate], color: str, marker: str, label: str
+) -> None:
+    """Plot estimates against rank, with a band for their intervals."""
+    values, low, high = zip(*points, strict=True)
+    axes.fill_between(ranks, low, high, color=color, alpha=0.2, lw=0)
+    axes.plot(ranks, values, f"{marker}-", color=color, ms=5, label=label)
+
+
+def _paper_lora(axes: Axes, book: Book, backbone: str, ranks: list[int]) -> None:
+    """Plot the paper's LoRA at the same fractions of R."""
+    found = {r: _paper(book, backbone, f"lora_r{r}") for r in ranks}
+    points = {rank: value for rank, value in found.items() if value is not None}
+    style = {"color": LORA, "mfc": "none", "ms": 5, "label": f"LoRA, paper{_scaled(book)}"}
+    axes.plot(list(points), list(points.values()), "o--", **style)
+
+
+def _paper_lora_sp(axes: Axes, book: Book, backbone: str) -> None:
+    value = _paper(book, backbone, "lora_sp")
+    if value is not None:
+        cell = published.cell(f"{backbone}/multi/lora_sp", book.rank)
         rank = cell["active_rank"] * book.rank / published.RANK
-        axes.plot([rank], [100 * _relative(rate, full)], "D", color="gray", label="LoRA-SP, paper")
+        label = f"LoRA-SP, paper{_scaled(book)}"
+        axes.plot([rank], [value], "D", color=LORA_SP, mfc="none", label=label)
+
+
+def _paper(book: Book, backbone: str, method: str) -> float | None:
+    """Return the paper's success relative to full fine-tuning [%]; None if it has none."""
+    rates, full = (published.rates(f"{backbone}/multi/{m}", book.rank) for m in (method, "full"))
+    return None if rates is None or full is None else 100 * float(statistics.ratio(rates, full))
+
+
+def _scaled(book: Book) -> str:
+    """Say how the paper's ranks are scaled to the size of the bank."""
+    share = published.RANK / book.rank
+    return {1: "", 2: " (ranks halved)"}.get(share, f" (ranks / {share:g})")
 
 
 def figure_3(book: Book) -> Figure:
-    """Plot the success of LoRA by task against rank, single-task and multi-task (Figure 3)."""
-    figure, grid = panels(book, 2, height=5.6)
-    for row, training in enumerate(("single", "multi")):
-        for axes, backbone in zip(grid[row], book.backbones, strict=True):
-            ranks = book.ranks(backbone, training)
-            prefixes = [f"{backbone}/{training}/lora_r{rank}" for rank in ranks]
-            rates = 100 * np.array([book.outcomes(prefix).mean((0, 2)) for prefix in prefixes])
-            axes.fill_between(ranks, rates.min(1), rates.max(1), color="gray", alpha=0.15, lw=0)
-            tasks = book.tasks(prefixes[0])
-            for task, color in zip(TASKS, SERIES, strict=True):
-                if task in tasks:
-                    values = rates[:, tasks.index(task)]
-                    axes.plot(ranks, values, "o-", color=color, ms=4, label=TASKS[task])
+    """Plot mean and deviation over tasks of LoRA's success against rank (Figure 3)."""
+    figure, grid = panels(book, 2, height=5.2, sharey="row")
+    for (top, bottom), backbone in zip(grid.T, book.backbones, strict=True):
+        ranks = book.ranks(backbone, "multi")
+        for training, (title, color, marker) in _TRAININGS.items():
+            found = [book.outcomes(f"{backbone}/{training}/lora_r{rank}") for rank in ranks]
+            means = [_percent(statistics.success(outcomes)) for outcomes in found]
+            _band(top, ranks, means, color, marker, f"LoRA, {title}")
+            spreads = [_percent(_deviation(outcomes)) for outcomes in found]
+            _band(bottom, ranks, spreads, color, marker, title)
+            full = 100 * book.outcomes(f"{backbone}/{training}/full").mean()
+            top.axhline(full, color=color, lw=1.5, ls=":", label=f"full fine-tuning, {title}")
+        for axes in (top, bottom):
             _rank_axis(axes, ranks)
-            kind = "one policy per task" if training == "single" else "one policy for all tasks"
-            axes.set_title(f"{BACKBONES[backbone]}, {kind}", loc="left")
-            axes.set_ylim(0, 103)
-        grid[row][0].set_ylabel("success of LoRA [%]")
-    grid[0][0].legend(loc="lower right")
+        top.set_title(BACKBONES[backbone], loc="left")
+        top.set_ylim(0, 103)
+    grid[1][0].set_ylim(0)
+    grid[0][0].set_ylabel("mean success [%]")
+    grid[1][0].set_ylabel("LoRA's standard deviation\nover tasks [points]")
+    legend(figure, grid[0][0], columns=2)
     return figure
+
+
+def _deviation(outcomes: np.ndarray) -> Estimate:
+    """Return the standard deviation over tasks; the correction can take it below 0, where it ends.
+
+    See `statistics.corrected`.
+    """
+    estimate = statistics.corrected(lambda rates: rates.std(-1), outcomes)
+    return Estimate(*(max(0.0, x) for x in estimate))
 
 
 def figure_4(book: Book) -> Figure:
     """Plot the share of singular values that full fine-tuning's updates need (Figure 4)."""
-    figure, grid = panels(book, 1, height=3.6)
+    figure, grid = panels(book, 1, height=3.2)
+    styles = {"panda": {"facecolor": "none"}, "multi": {"facecolor": FULL, "alpha": 0.8}}
     for axes, backbone in zip(grid[0], book.backbones, strict=True):
-        for offset, (training, color) in zip((-0.18, 0.18), _SEEN.items(), strict=True):
-            name = "Panda, seen" if training == "panda" else "PiPER, unseen"
+        for offset, (training, style) in zip((-0.18, 0.18), styles.items(), strict=True):
             shares = [_shares(book, f"{backbone}/{training}/full", tower) for tower in TOWERS]
-            boxes = axes.boxplot(
+            axes.boxplot(
                 shares,
                 positions=np.arange(len(TOWERS)) + offset,
                 widths=0.3,
+                whis=(0, 100),
                 patch_artist=True,
                 manage_ticks=False,
+                boxprops={"edgecolor": FULL, **style},
                 medianprops={"color": mpl.rcParams["text.color"]},
-                whiskerprops={"color": color},
+                whiskerprops={"color": FULL},
                 showcaps=False,
-                flierprops={"ms": 3, "markeredgecolor": color},
             )
-            for box in boxes["boxes"]:
-                box.set(facecolor=color, alpha=0.7)
-            boxes["boxes"][0].set_label(name)
         axes.set_xticks(range(len(TOWERS)), TOWERS)
-        axes.set_ylim(0, 1)
+        axes.set_ylim(0, 100)
         axes.set_title(BACKBONES[backbone], loc="left")
-    grid[0][0].set_ylabel("share of singular values\nfor 99 % of the energy")
-    grid[0][0].legend(loc="lower right")
+    grid[0][0].set_ylabel("singular values with 99 % of\nfull fine-tuning's update [%]")
+    boxes = [Patch(edgecolor=FULL, label=_ROBOTS[name], **style) for name, style in styles.items()]
+    figure.legend(handles=boxes, loc="outside upper center", ncols=2)
     return figure
 
 
 def _shares(book: Book, prefix: str, tower: str) -> list[float]:
-    """Return the shares of all layers of a tower that changed, of all seeds."""
+    """Return the shares [%] of all layers of a tower that changed, of all seeds."""
     cells = book.measures(prefix, "spectral_rank")
     layers = [row for cell in cells for row in cell[tower].values()]
-    return [share for row in layers for share in row if share is not None]
+    return [100 * share for row in layers for share in row if share is not None]
 
 
 def figure_6(book: Book) -> Figure:
-    """Plot LoRA-SP's active rank over held-out tokens, a box for each layer (Figure 6)."""
-    towers = {
-        b: [naming.by_depth(tower) for tower in _first_boxes(book, b)] for b in book.backbones
-    }
-    figure = Figure(figsize=(10, 2.5 * len(towers)), layout="constrained")
-    widths = [[sum(map(_width, tower.values())) for tower in row] for row in towers.values()]
-    grid = figure.subplots(
-        len(towers), len(TOWERS), sharey=True, squeeze=False, width_ratios=np.max(widths, axis=0)
+    """Plot LoRA-SP's active rank over held-out tokens by kind of layer (Figure 6)."""
+    found = {b: [_summaries(book, b, tower) for tower in TOWERS] for b in book.backbones}
+    kinds = [_in_order([k for row in found.values() for k in row[n]]) for n in range(len(TOWERS))]
+    heights = [len(names) + 1 for names in kinds]
+    figure, grid = panels(
+        book, len(TOWERS), 1.2 + 0.19 * sum(heights), sharey="row", height_ratios=heights
     )
-    for row, (backbone, linears) in zip(grid, towers.items(), strict=True):
-        for axes, tower, kinds in zip(row, TOWERS, linears, strict=True):
-            _boxes(axes, kinds, COLORS[tower])
+    for column, (backbone, towers) in zip(grid.T, found.items(), strict=True):
+        for axes, tower, names, layers in zip(column, TOWERS, kinds, towers, strict=True):
+            for row, name in enumerate(names):
+                if name in layers:
+                    _layers(axes, row, layers[name], COLORS[tower])
+            rows(axes, [_short(name) for name in names])
+            axes.axvline(book.rank, color=mpl.rcParams["text.color"], lw=1, ls=":")
+            axes.set_xlim(0, 1.03 * book.rank)
             axes.set_title(f"{BACKBONES[backbone]}, {tower}", loc="left")
-            axes.set_ylim(0, 1.03 * book.rank)
-        row[0].set_ylabel("active rank")
+        column[-1].set_xlabel(f"active rank (dotted: R = {book.rank})")
     return figure
 
 
-def _first_boxes(book: Book, backbone: str) -> list[dict[str, list[list[float]]]]:
-    """Return the five-number summaries of the first seed's layers, for each tower."""
-    boxes = book.measures(f"{backbone}/multi/lora_sp", "rank_boxes")[0]
-    return [boxes.get(tower, {}) for tower in TOWERS]
+def _summaries(book: Book, backbone: str, tower: str) -> dict[str, np.ndarray]:
+    """Return the five-number summaries `[S, L, 5]` of a tower's kinds of layers."""
+    cells = book.measures(f"{backbone}/multi/lora_sp", "rank_boxes")
+    seeds: list[Mapping[str, list[list[float]]]] = [
+        naming.by_depth(cell.get(tower, {})) for cell in cells
+    ]
+    return {kind: np.array([seed[kind] for seed in seeds], float) for kind in seeds[0]}
 
 
-def _width(layers: Sequence[Any]) -> int:
-    """Return the room for the boxes of some layers, their label and a gap."""
-    return max(len(layers), 2) + 1
+def _in_order(kinds: Sequence[str]) -> list[str]:
+    order = {kind: place for place, kind in enumerate(_FORWARD)}
+    return sorted(dict.fromkeys(kinds), key=lambda kind: order.get(kind, len(order)))
 
 
-def _boxes(axes: Axes, linears: dict[str, list[list[float]]], color: str) -> None:
-    """Draw a box for each layer; the layers of one linear map stand side by side."""
-    keys = ("whislo", "q1", "med", "q3", "whishi")
-    statistics, positions, ticks, start = [], [], [], 0
-    for layers in linears.values():
-        statistics += [{**dict(zip(keys, five, strict=True)), "fliers": []} for five in layers]
-        positions += range(start, start + len(layers))
-        ticks.append(start + (len(layers) - 1) / 2)
-        start += _width(layers)
-    if not statistics:
-        return
-    axes.bxp(
-        statistics,
-        positions=positions,
-        widths=0.7,
-        showcaps=False,
-        patch_artist=True,
-        manage_ticks=False,
-        boxprops={"facecolor": color, "alpha": 0.8, "lw": 0.5},
-        medianprops={"color": mpl.rcParams["text.color"], "lw": 1},
-        whiskerprops={"color": color, "lw": 0.8},
-    )
-    names = [name.removesuffix("_proj").replace("action_time_mlp", "time") for name in linears]
-    axes.set_xticks(ticks, names, rotation=60, ha="right", rotation_mode="anchor", fontsize=8)
-    axes.set_xlim(-1, start - 1)
-    axes.grid(visible=False, axis="x")
+def _short(kind: str) -> str:
+    return kind.removesuffix("_proj").replace("action_time_mlp", "time")
+
+
+def _layers(axes: Axes, row: int, layers: np.ndarray, color: str) -> None:
+    """Draw the ranks in all layers of a kind: extremes, mean quartiles, each layer's median."""
+    low, high = layers[..., 0].min(), layers[..., 4].max()
+    axes.plot([low, high], [row, row], color=color, lw=1)
+    left, right = layers[..., 1].mean(), layers[..., 3].mean()
+    axes.barh(row, right - left, left=left, height=0.7, color=color, alpha=0.6)
+    medians = layers[..., 2].mean(0)
+    axes.plot(medians, [row] * len(medians), "o", color=mpl.rcParams["text.color"], ms=2.5)
 
 
 def _rank_axis(axes: Axes, ranks: list[int]) -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -10,7 +11,7 @@ from matplotlib.figure import Figure
 from lorasp_jax.report.figures import COLORS
 from lorasp_jax.study import naming
 from lorasp_jax.study.book import BACKBONES, TASKS, Book
-from lorasp_jax.study.figure_style import SERIES, panels
+from lorasp_jax.study.figure_style import FULL, LORA_SP, legend, panels, rows
 from lorasp_jax.study.naming import TOWERS
 
 _ROW = 0.26
@@ -31,12 +32,12 @@ def shared_directions(book: Book) -> Figure:
                 measured, chance = zip(*values, strict=True)
                 _dots(axes, row + offset, measured, float(np.mean(chance)), COLORS[tower])
             axes.plot([], [], "o", color=COLORS[tower], label=tower)
-        _rows(axes, [_title(pair) for pair in pairs[backbone]])
+        rows(axes, [_title(pair) for pair in pairs[backbone]])
+        axes.plot([], [], "o", mfc="none", color=FULL, label="by chance")
         axes.set_xlim(0, 1)
         axes.set_title(BACKBONES[backbone], loc="left")
-        axes.set_xlabel("overlap of directions in use")
-    grid[0][0].plot([], [], "o", mfc="none", color="gray", label="by chance")
-    _legend(figure, grid[0][0])
+        axes.set_xlabel("overlap of directions in use\n(0 none, 1 the same)")
+    legend(figure, grid[0][0], columns=4)
     return figure
 
 
@@ -48,16 +49,17 @@ def gradients(book: Book) -> Figure:
         for row, method in enumerate(methods[backbone]):
             cells = book.measures(f"{backbone}/multi/{method}", "gradient_cosine")
             other, same = ([_mean(cell, same=same) for cell in cells] for same in (False, True))
-            color = SERIES[2] if method == "lora_sp" else SERIES[0]
+            color = LORA_SP if method == "lora_sp" else mpl.rcParams["text.color"]
             _dots(axes, row, other, float(np.mean(same)), color)
-        _rows(axes, [naming.label(method, book.rank) for method in methods[backbone]])
+        rows(axes, [naming.label(method, book.rank) for method in methods[backbone]])
         axes.axvline(0, color="gray", lw=1)
         axes.set_title(BACKBONES[backbone], loc="left")
         axes.set_xlabel("cosine of two gradients")
-    axes = grid[0][0]
-    axes.plot([], [], "o", color=SERIES[0], label="of two tasks")
-    axes.plot([], [], "o", mfc="none", color=SERIES[0], label="of one task")
-    _legend(figure, axes)
+    axes, ink = grid[0][0], mpl.rcParams["text.color"]
+    axes.plot([], [], "o", color=ink, label="two tasks")
+    axes.plot([], [], "o", color=LORA_SP, label="two tasks, LoRA-SP")
+    axes.plot([], [], "o", mfc="none", color=FULL, label="two batches of one task")
+    legend(figure, axes, columns=3)
     return figure
 
 
@@ -74,19 +76,11 @@ def _mean(cosines: dict[str, dict[str, float]], *, same: bool) -> float:
 
 
 def _dots(axes: Axes, row: float, measured: Sequence[float], reference: float, color: str) -> None:
-    """Draw the mean over seeds, their range, and a hollow dot to compare it with."""
+    """Draw the mean over seeds, their range, and a gray ring to compare it with."""
+    axes.plot([np.mean(measured), reference], [row, row], color=FULL, lw=0.5)
     axes.plot([min(measured), max(measured)], [row, row], color=color, lw=1.5)
-    axes.plot([np.mean(measured)], [row], "o", color=color, ms=6)
-    axes.plot([reference], [row], "o", color=color, ms=6, mfc="none")
-
-
-def _rows(axes: Axes, labels: Sequence[str]) -> None:
-    axes.set_yticks(range(len(labels)), labels)
-    axes.set_ylim(len(labels) - 0.5, -0.5)
-
-
-def _legend(figure: Figure, axes: Axes) -> None:
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    axes.plot([np.mean(measured)], [row], "o", color=color, ms=5)
+    axes.plot([reference], [row], "o", color=FULL, ms=5, mfc="none")
 
 
 def _pairs(cells: Sequence[dict[str, Any]]) -> list[str]:
@@ -96,4 +90,4 @@ def _pairs(cells: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def _title(pair: str) -> str:
-    return ", ".join(TASKS[task] for task in pair.split("|"))
+    return " + ".join(TASKS[task] for task in pair.split("|"))

@@ -2,6 +2,9 @@
 
 import xml.etree.ElementTree
 
+import numpy as np
+import pytest
+
 from lorasp_jax.study import figure_style, figures
 from lorasp_jax.study.book import Book
 from tests.study import synthetic
@@ -19,29 +22,59 @@ def test_figures_are_readable_on_light_and_dark_pages():
         assert "fill: #ffffff" not in text
 
 
+def test_all_figures_fill_the_page():
+    draw = (figures.figure_1, figures.figure_3, figures.figure_4, figures.figure_6)
+    for book in (BOOK, BOOK.of(["pi0"])):
+        assert {f(book).get_figwidth() for f in draw} == {figure_style.WIDTH}
+
+
 def test_success_against_rank():
-    axes = figures.figure_1(BOOK).axes[0]
+    figure = figures.figure_1(BOOK)
+    axes = figure.axes[0]
     lines = {line.get_label(): line for line in axes.lines}
     assert list(lines["LoRA"].get_xdata()) == [2, 4, 8, 16, 32, 64]
-    assert list(lines["LoRA, paper"].get_xdata()) == [4, 8, 16, 32, 64]
-    assert list(lines["LoRA-SP, paper"].get_xdata()) == [38]
-    assert len(figures.figure_3(BOOK).axes) == 4
+    assert list(lines["LoRA, paper (ranks halved)"].get_xdata()) == [4, 8, 16, 32, 64]
+    assert list(lines["LoRA-SP, paper (ranks halved)"].get_xdata()) == [38]
+    assert axes.get_ylim()[0] == 0
+    (legend,) = figure.legends
+    texts = [text.get_text() for text in legend.get_texts()]
+    assert texts[-1] == "full fine-tuning"
+    assert len(texts) == 5
 
 
-def test_a_box_for_each_layer():
+def test_mean_and_deviation_over_tasks():
+    figure = figures.figure_3(BOOK)
+    assert len(figure.axes) == 4
+    lines = {line.get_label(): line.get_ydata() for line in figure.axes[0].lines}
+    rates = 100 * BOOK.outcomes("pi0/single/lora_r8").mean((0, 2))
+    assert lines["LoRA, one policy per task"][2] == pytest.approx(rates.mean())
+    full = 100 * BOOK.outcomes("pi0/multi/full").mean()
+    assert list(lines["full fine-tuning, one for all"]) == pytest.approx([full, full])
+    below = {line.get_label(): line.get_ydata() for line in figure.axes[2].lines}
+    assert below["one policy per task"][2] < rates.std()
+
+
+def test_a_row_for_each_kind_of_layer():
     panels = figures.figure_6(BOOK).axes
     assert len(panels) == 6
-    for axes, tower in zip(panels[3:], ("vision", "language", "action"), strict=True):
-        boxes = BOOK.measures("smolvla/multi/lora_sp", "rank_boxes")[0][tower]
-        assert len(axes.patches) == sum(len(layers) for layers in boxes.values())
-    labels = [text.get_text() for text in panels[5].get_xticklabels()]
-    assert labels[:3] == ["q", "k", "v"]
-    assert "time_in" in labels
+    labels = [text.get_text() for text in panels[4].get_yticklabels()]
+    assert labels[:5] == ["state", "action_in", "time_in", "time_out", "q"]
+    assert labels[-1] == "action_out"
+    cells = BOOK.measures("pi0/multi/lora_sp", "rank_boxes")
+    layers = np.array([cell["action"]["q_proj"] for cell in cells])
+    (line, dots) = (line for line in panels[4].lines if line.get_ydata()[0] == 4)
+    assert list(line.get_xdata()) == [layers[..., 0].min(), layers[..., 4].max()]
+    assert list(dots.get_xdata()) == pytest.approx(layers[..., 2].mean(0))
+
+
+def test_layers_have_one_order():
+    assert figures._in_order(["new", "o_proj", "q_proj", "o_proj"]) == ["q_proj", "o_proj", "new"]
 
 
 def test_seen_and_unseen_robots():
     figure = figures.figure_4(BOOK)
-    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == [
-        "Panda, seen",
-        "PiPER, unseen",
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+        "Panda (seen), new scene",
+        "PiPER (unseen)",
     ]
+    assert figure.axes[0].get_ylim() == (0, 100)

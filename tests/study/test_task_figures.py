@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lorasp_jax.study import task_figures
+from lorasp_jax.study import figure_style, task_figures
 from lorasp_jax.study.book import Book
 from tests.study import synthetic
 
@@ -11,7 +11,7 @@ BOOK = Book(tuple(synthetic.results()), synthetic.results())
 
 
 def dots(axes, row):
-    """Positions of the dots in a row, filled ones first."""
+    """Positions of the dots in a row, the filled one first."""
     found = [line for line in axes.lines if list(line.get_ydata()) == [row]]
     found.sort(key=lambda line: line.get_markerfacecolor() == "none")
     return [float(line.get_xdata()[0]) for line in found]
@@ -20,11 +20,22 @@ def dots(axes, row):
 def test_shared_directions():
     first, axes = task_figures.shared_directions(BOOK).axes
     labels = [text.get_text() for text in first.get_yticklabels()]
-    assert labels[0] == "open the pot, pour"
-    assert labels[-1] == "press, pick and place"
+    assert labels[0] == "open the pot + pour"
+    assert labels[-1] == "press + pick and place"
     cells = BOOK.measures("smolvla/multi/lora_sp", "direction_overlap")
     values = np.array([cell["open_pot|press"]["language"] for cell in cells])
     assert dots(axes, 1) == pytest.approx(values.mean(0))
+
+
+def test_rings_have_the_color_of_the_legend():
+    for draw in (task_figures.shared_directions, task_figures.gradients):
+        figure = draw(BOOK)
+        rings = [x for x in figure.axes[0].lines if x.get_markerfacecolor() == "none"]
+        assert {ring.get_color() for ring in rings} == {figure_style.FULL}
+        assert figure.legends[0].get_texts()[-1].get_text() in (
+            "by chance",
+            "two batches of one task",
+        )
 
 
 def test_gradients_by_method():
