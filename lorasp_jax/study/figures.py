@@ -94,7 +94,9 @@ def _paper(book: Book, backbone: str, method: str) -> float | None:
 def _scaled(book: Book) -> str:
     """Say how the paper's ranks are scaled to the size of the bank."""
     share = published.RANK / book.rank
-    return {1: "", 2: " (ranks halved)"}.get(share, f" (ranks / {share:g})")
+    if share == 1:
+        return ""
+    return " (ranks halved)" if share == 2 else f" (ranks / {share:g})"
 
 
 def figure_3(book: Book) -> Figure:

@@ -77,7 +77,7 @@ def _mean(cosines: dict[str, dict[str, float]], *, same: bool) -> float:
 
 def _dots(axes: Axes, row: float, measured: Sequence[float], reference: float, color: str) -> None:
     """Draw the mean over seeds, their range, and a gray ring to compare it with."""
-    axes.plot([np.mean(measured), reference], [row, row], color=FULL, lw=0.5)
+    axes.plot([float(np.mean(measured)), reference], [row, row], color=FULL, lw=0.5)
     axes.plot([min(measured), max(measured)], [row, row], color=color, lw=1.5)
     axes.plot([np.mean(measured)], [row], "o", color=color, ms=5)
     axes.plot([reference], [row], "o", color=FULL, ms=5, mfc="none")

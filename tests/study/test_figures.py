@@ -32,9 +32,15 @@ def test_success_against_rank():
     figure = figures.figure_1(BOOK)
     axes = figure.axes[0]
     lines = {line.get_label(): line for line in axes.lines}
-    assert list(lines["LoRA"].get_xdata()) == [2, 4, 8, 16, 32, 64]
-    assert list(lines["LoRA, paper (ranks halved)"].get_xdata()) == [4, 8, 16, 32, 64]
-    assert list(lines["LoRA-SP, paper (ranks halved)"].get_xdata()) == [38]
+    assert np.asarray(lines["LoRA"].get_xdata()).tolist() == [2, 4, 8, 16, 32, 64]
+    assert np.asarray(lines["LoRA, paper (ranks halved)"].get_xdata()).tolist() == [
+        4,
+        8,
+        16,
+        32,
+        64,
+    ]
+    assert np.asarray(lines["LoRA-SP, paper (ranks halved)"].get_xdata()).tolist() == [38]
     assert axes.get_ylim()[0] == 0
     (legend,) = figure.legends
     texts = [text.get_text() for text in legend.get_texts()]
@@ -45,12 +51,14 @@ def test_success_against_rank():
 def test_mean_and_deviation_over_tasks():
     figure = figures.figure_3(BOOK)
     assert len(figure.axes) == 4
-    lines = {line.get_label(): line.get_ydata() for line in figure.axes[0].lines}
+    lines = {line.get_label(): np.asarray(line.get_ydata()) for line in figure.axes[0].lines}
     rates = 100 * BOOK.outcomes("pi0/single/lora_r8").mean((0, 2))
     assert lines["LoRA, one policy per task"][2] == pytest.approx(rates.mean())
     full = 100 * BOOK.outcomes("pi0/multi/full").mean()
-    assert list(lines["full fine-tuning, one for all"]) == pytest.approx([full, full])
-    below = {line.get_label(): line.get_ydata() for line in figure.axes[2].lines}
+    assert np.asarray(lines["full fine-tuning, one for all"]).tolist() == pytest.approx(
+        [full, full]
+    )
+    below = {line.get_label(): np.asarray(line.get_ydata()) for line in figure.axes[2].lines}
     assert below["one policy per task"][2] < rates.std()
 
 
@@ -62,9 +70,9 @@ def test_a_row_for_each_kind_of_layer():
     assert labels[-1] == "action_out"
     cells = BOOK.measures("pi0/multi/lora_sp", "rank_boxes")
     layers = np.array([cell["action"]["q_proj"] for cell in cells])
-    (line, dots) = (line for line in panels[4].lines if line.get_ydata()[0] == 4)
-    assert list(line.get_xdata()) == [layers[..., 0].min(), layers[..., 4].max()]
-    assert list(dots.get_xdata()) == pytest.approx(layers[..., 2].mean(0))
+    (line, dots) = (line for line in panels[4].lines if np.asarray(line.get_ydata())[0] == 4)
+    assert np.asarray(line.get_xdata()).tolist() == [layers[..., 0].min(), layers[..., 4].max()]
+    assert np.asarray(dots.get_xdata()).tolist() == pytest.approx(layers[..., 2].mean(0))
 
 
 def test_layers_have_one_order():

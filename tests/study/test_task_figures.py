@@ -12,7 +12,7 @@ BOOK = Book(tuple(synthetic.results()), synthetic.results())
 
 def dots(axes, row):
     """Positions of the dots in a row, the filled one first."""
-    found = [line for line in axes.lines if list(line.get_ydata()) == [row]]
+    found = [line for line in axes.lines if np.asarray(line.get_ydata()).tolist() == [row]]
     found.sort(key=lambda line: line.get_markerfacecolor() == "none")
     return [float(line.get_xdata()[0]) for line in found]
 
