@@ -303,7 +303,7 @@ def _method(plan: Plan, name: str, mean_rank: float) -> Method:
 
 def _best_rate(results: Results, pilots: Sequence[str]) -> float:
     """Return the learning rate of the best pilot cell."""
-    return float(naming.best_pilot(results, pilots).rsplit("/", 1)[1])
+    return naming.rate(naming.best_pilot(results, pilots))
 
 
 def _mean_rank(results: Results, cells: Sequence[str]) -> float:

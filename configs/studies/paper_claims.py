@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from lorasp_jax.study import naming, published, statistics
+from lorasp_jax.study.book import Book
 from lorasp_jax.study.claims import Claim, Criterion
 from lorasp_jax.study.naming import TOWERS
 from lorasp_jax.study.statistics import Estimate
@@ -60,7 +61,7 @@ class _Maker:
 
     def difference(self, a: str, b: str, **fields: Any) -> tuple[Criterion, ...]:
         """Make a criterion on the success of one method minus that of another."""
-        return self.success(_minus, (a, b), **fields)
+        return self.success(statistics.minus, (a, b), **fields)
 
     def seeds(
         self, values: Callable[..., list[float]], prefixes: Sequence[str], **fields: Any
@@ -81,10 +82,6 @@ def _outcomes(
 
 def _over_seeds(values: Any, methods: Sequence[naming.Seeds], results: Results) -> Estimate:
     return statistics.over_seeds(values(results, *methods))
-
-
-def _minus(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a.mean(-1) - b.mean(-1)
 
 
 def _beats_lora(make: _Maker, backbone: str) -> tuple[Criterion, ...]:
@@ -124,11 +121,7 @@ def _needs_rank(make: _Maker, backbone: str) -> tuple[Criterion, ...]:
 
 def _multi_task(make: _Maker, backbone: str) -> tuple[Criterion, ...]:
     """Return criteria on LoRA of all ranks but R: [multi..., single...]."""
-    ranks = sorted(
-        int(name.split("/")[2].removeprefix("lora_r"))
-        for name in {n.rsplit("/", 1)[0] for n in make.names}
-        if name.startswith(f"{backbone}/multi/lora_r")
-    )
+    ranks = Book(make.names, {}).ranks(backbone, "multi")
     lora = [[f"{backbone}/{kind}/lora_r{r}" for r in ranks] for kind in ("multi", "single")]
     # The paper has no rank of R/32.
     lora = [[p for p in ps if published.cell(p, make.rank)] for ps in lora]

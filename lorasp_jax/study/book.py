@@ -87,6 +87,10 @@ class Book:
             return ""
         return f"{sum(finished)} of {len(finished)} runs so far"
 
+    def complete(self, *methods: str) -> list[str]:
+        """Return the backbones on which some methods, such as "multi/full", are finished."""
+        return [b for b in self.backbones if not self.missing(*(f"{b}/{m}" for m in methods))]
+
     def outcomes(self, prefix: str) -> np.ndarray:
         """Return a method's episodes, bool `[S, T, N]`, tasks in order of name."""
         return naming.outcomes(self.results, self.cells(prefix))
@@ -95,18 +99,44 @@ class Book:
         """Return a finished method's tasks in order of name."""
         return sorted({t for n in self.cells(prefix)[0] for t in self.results[n]["outcomes"]})
 
-    def base(self, prefix: str) -> dict[str, float] | None:
+    def base(self, prefix: str) -> dict[str, float]:
         """Return the base's success by task, from a cell whose name begins with `prefix`.
 
-        None if no finished one evaluated the base.
+        Empty if no finished one evaluated the base.
         """
         cells = [self.results[n] for n in self.names if n.startswith(prefix) and n in self.results]
-        before = next((cell["before"] for cell in cells if "before" in cell), None)
-        return before and {task: o.count("1") / len(o) for task, o in before.items()}
+        before = next((cell["before"] for cell in cells if "before" in cell), {})
+        return {task: o.count("1") / len(o) for task, o in before.items()}
 
     def measures(self, prefix: str, name: str) -> list[Any]:
         """Return a measure of every cell of a finished method; see `measures.measures`."""
         return [self.results[cell]["measures"][name] for cell in naming.flat(self.cells(prefix))]
+
+    def rank_boxes(self, prefix: str) -> dict[str, dict[str, np.ndarray]]:
+        """Return the active ranks of a finished method: tower -> kind of layer -> `[S, L, 5]`.
+
+        See `directions.rank_boxes` for the five numbers, `naming.by_depth` for the layers.
+        """
+        seeds = [
+            {tower: naming.by_depth(linears) for tower, linears in cell.items()}
+            for cell in self.measures(prefix, "rank_boxes")
+        ]
+        return {
+            tower: {kind: np.array([seed[tower][kind] for seed in seeds], float) for kind in kinds}
+            for tower, kinds in seeds[0].items()
+        }
+
+    def cosines(self, prefix: str) -> tuple[list[float], list[float]]:
+        """Return mean cosines of the gradients of two tasks, and of two batches of one, by seed."""
+        cells = [
+            [(*pair.split("|"), towers["all"]) for pair, towers in cell.items()]
+            for cell in self.measures(prefix, "gradient_cosine")
+        ]
+        two, one = (
+            [float(np.mean([v for a, b, v in cell if (a == b) is same])) for cell in cells]
+            for same in (False, True)
+        )
+        return two, one
 
     def mean(self, prefix: str, *path: str) -> float | None:
         """Return a number of the results, averaged over a method's cells; None if it is absent."""

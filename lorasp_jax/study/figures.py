@@ -1,6 +1,6 @@
 """Figures 1, 3, 4 and 6 of the paper, for the backbones of a book, whose results must be there."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import matplotlib as mpl
 import numpy as np
@@ -169,18 +169,18 @@ def _shares(book: Book, prefix: str, tower: str) -> list[float]:
 
 def figure_6(book: Book) -> Figure:
     """Plot LoRA-SP's active rank over held-out tokens by kind of layer (Figure 6)."""
-    found = {b: [_summaries(book, b, tower) for tower in TOWERS] for b in book.backbones}
-    kinds = [_in_order([k for row in found.values() for k in row[n]]) for n in range(len(TOWERS))]
+    found = {b: book.rank_boxes(f"{b}/multi/lora_sp") for b in book.backbones}
+    kinds = [_in_order([kind for boxes in found.values() for kind in boxes[t]]) for t in TOWERS]
     heights = [len(names) + 1 for names in kinds]
     figure, grid = panels(
         book, len(TOWERS), 1.2 + 0.19 * sum(heights), sharey="row", height_ratios=heights
     )
-    for column, (backbone, towers) in zip(grid.T, found.items(), strict=True):
-        for axes, tower, names, layers in zip(column, TOWERS, kinds, towers, strict=True):
+    for column, (backbone, boxes) in zip(grid.T, found.items(), strict=True):
+        for axes, tower, names in zip(column, TOWERS, kinds, strict=True):
             for row, name in enumerate(names):
-                if name in layers:
-                    _layers(axes, row, layers[name], COLORS[tower])
-            rows(axes, [_short(name) for name in names])
+                if name in boxes[tower]:
+                    _layers(axes, row, boxes[tower][name], COLORS[tower])
+            rows(axes, [naming.short_kind(name) for name in names])
             axes.axvline(book.rank, color=mpl.rcParams["text.color"], lw=1, ls=":")
             axes.set_xlim(0, 1.03 * book.rank)
             axes.set_title(f"{BACKBONES[backbone]}, {tower}", loc="left")
@@ -188,22 +188,9 @@ def figure_6(book: Book) -> Figure:
     return figure
 
 
-def _summaries(book: Book, backbone: str, tower: str) -> dict[str, np.ndarray]:
-    """Return the five-number summaries `[S, L, 5]` of a tower's kinds of layers."""
-    cells = book.measures(f"{backbone}/multi/lora_sp", "rank_boxes")
-    seeds: list[Mapping[str, list[list[float]]]] = [
-        naming.by_depth(cell.get(tower, {})) for cell in cells
-    ]
-    return {kind: np.array([seed[kind] for seed in seeds], float) for kind in seeds[0]}
-
-
 def _in_order(kinds: Sequence[str]) -> list[str]:
     order = {kind: place for place, kind in enumerate(_FORWARD)}
     return sorted(dict.fromkeys(kinds), key=lambda kind: order.get(kind, len(order)))
-
-
-def _short(kind: str) -> str:
-    return kind.removesuffix("_proj").replace("action_time_mlp", "time")
 
 
 def _layers(axes: Axes, row: int, layers: np.ndarray, color: str) -> None:

@@ -1,5 +1,7 @@
 """What tables and figures of the study's page show, in sentences made from the results."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from lorasp_jax.study import naming, statistics
@@ -33,71 +35,62 @@ def edges(book: Book) -> str:
 
 
 def _at_edge(book: Book, backbone: str, method: str) -> bool:
-    names = sorted(naming.flat(book.cells(f"{backbone}/pilot/{method}")), key=_rate)
+    names = sorted(naming.flat(book.cells(f"{backbone}/pilot/{method}")), key=naming.rate)
     return naming.best_pilot(book.results, names) in (names[0], names[-1])
-
-
-def _rate(name: str) -> float:
-    return float(name.rsplit("/", 1)[1])
 
 
 def pruned(book: Book) -> str:
     """Say what pruning does to LoRA-SP; "" before its runs."""
-    texts = []
-    for backbone in book.backbones:
-        source = f"{backbone}/multi/lora_sp"
-        if book.missing(source, f"{source}_pruned"):
-            continue
-        sizes = np.mean([s["bytes"] for s in book.measures(f"{source}_pruned", "smaller")], axis=0)
-        both = book.outcomes(f"{source}_pruned"), book.outcomes(source)
-        change, low, high = (100 * x + 0.0 for x in statistics.difference(*both))
-        points = f"{change:+.1f} points [{low:+.1f}, {high:+.1f}]".replace("-", "−")
-        texts.append(
-            f"On {BACKBONES[backbone]}, it shrinks LoRA-SP's adapters by "
-            f"{100 * (1 - sizes[1] / sizes[0]):.0f} % and changes success by {points}."
-        )
-    return " ".join(texts)
+    done = book.complete("multi/lora_sp", "multi/lora_sp_pruned")
+    return " ".join(_pruned(book, backbone) for backbone in done)
+
+
+def _pruned(book: Book, backbone: str) -> str:
+    source = f"{backbone}/multi/lora_sp"
+    sizes = np.mean([s["bytes"] for s in book.measures(f"{source}_pruned", "smaller")], axis=0)
+    both = book.outcomes(f"{source}_pruned"), book.outcomes(source)
+    change, low, high = (100 * x + 0.0 for x in statistics.difference(*both))
+    points = f"{change:+.1f} points [{low:+.1f}, {high:+.1f}]".replace("-", "−")
+    return (
+        f"On {BACKBONES[backbone]}, it shrinks LoRA-SP's adapters by "
+        f"{100 * (1 - sizes[1] / sizes[0]):.0f} % and changes success by {points}."
+    )
 
 
 def shared_directions(book: Book) -> str:
     """Say which tasks share most and fewest directions; "" before the runs."""
-    texts = []
-    for backbone in book.backbones:
-        prefix = f"{backbone}/multi/lora_sp"
-        if book.missing(prefix):
-            continue
-        cells = book.measures(prefix, "direction_overlap")
-        index = {pair: np.mean([cell[pair]["all"] for cell in cells], axis=0) for pair in cells[0]}
-        high, low = (choose(index, key=lambda p: index[p][0]) for choose in (max, min))
-        texts.append(
-            f"On {BACKBONES[backbone]}, {_pair(high)} share the most directions (overlap "
-            f"{index[high][0]:.2f}, by chance {index[high][1]:.2f}), {_pair(low)} the fewest "
-            f"({index[low][0]:.2f}, by chance {index[low][1]:.2f})."
-        )
-    return _paragraph(texts)
+    return _paragraph(_shared_directions(book, b) for b in book.complete("multi/lora_sp"))
+
+
+def _shared_directions(book: Book, backbone: str) -> str:
+    cells = book.measures(f"{backbone}/multi/lora_sp", "direction_overlap")
+    index = {pair: np.mean([cell[pair]["all"] for cell in cells], axis=0) for pair in cells[0]}
+    high, low = (choose(index, key=lambda p: index[p][0]) for choose in (max, min))
+    return (
+        f"On {BACKBONES[backbone]}, {_pair(high)} share the most directions (overlap "
+        f"{index[high][0]:.2f}, by chance {index[high][1]:.2f}), {_pair(low)} the fewest "
+        f"({index[low][0]:.2f}, by chance {index[low][1]:.2f})."
+    )
 
 
 def gradients(book: Book) -> str:
     """Say how far tasks pull LoRA-SP in the same direction; "" before the runs."""
-    texts = []
-    for backbone in book.backbones:
-        prefix = f"{backbone}/multi/lora_sp"
-        if book.missing(prefix):
-            continue
-        cells = book.measures(prefix, "gradient_cosine")
-        pairs = [(*pair.split("|"), t["all"]) for cell in cells for pair, t in cell.items()]
-        means = (np.mean([v for a, b, v in pairs if (a == b) is same]) for same in (False, True))
-        two, one = (f"{mean:.2f}".replace("-", "−") for mean in means)
-        texts.append(
-            f"For LoRA-SP on {BACKBONES[backbone]}, the cosine is {two} between tasks and {one} "
-            "between two batches of one task."
-        )
-    return _paragraph(texts)
+    return _paragraph(_gradients(book, b) for b in book.complete("multi/lora_sp"))
+
+
+def _gradients(book: Book, backbone: str) -> str:
+    cosines = map(np.mean, book.cosines(f"{backbone}/multi/lora_sp"))
+    two, one = (f"{cosine:.2f}".replace("-", "−") for cosine in cosines)
+    return (
+        f"For LoRA-SP on {BACKBONES[backbone]}, the cosine is {two} between tasks and {one} "
+        "between two batches of one task."
+    )
 
 
 def _pair(pair: str) -> str:
     return "“" + "” and “".join(TASKS[task] for task in pair.split("|")) + "”"
 
 
-def _paragraph(texts: list[str]) -> str:
-    return " ".join(texts) + "\n\n" if texts else ""
+def _paragraph(sentences: Iterable[str]) -> str:
+    text = " ".join(sentences)
+    return text and f"{text}\n\n"

@@ -68,6 +68,11 @@ def by_depth(linears: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
     return found
 
 
+def short_kind(kind: str) -> str:
+    """Return the name of a kind of linear layer on the page, such as "q" for "q_proj"."""
+    return kind.removesuffix("_proj").replace("action_time_mlp", "time")
+
+
 def label(method: str, rank: int) -> str:
     """Return a method's name on the page; `rank` is the bank's size R."""
     stem = method.removesuffix("_pruned")
@@ -91,6 +96,11 @@ _LABELS = {
     "lora_cut": "LoRA, r = {rank}, cut to LoRA-SP's rank",
     "lora_sp_no_spectral": "LoRA-SP without spectral loss",
 }
+
+
+def rate(pilot: str) -> float:
+    """Return the learning rate of a pilot cell."""
+    return float(pilot.rsplit("/", 1)[1])
 
 
 def best_pilot(results: Mapping[str, Any], pilots: Sequence[str]) -> str:

@@ -16,11 +16,6 @@ def _numbers() -> dict[str, Any]:
     return json.loads(Path(__file__).with_name("paper.json").read_text())
 
 
-def tasks() -> tuple[str, ...]:
-    """Return the tasks in the paper's order."""
-    return tuple(_numbers()["tasks"])
-
-
 def cell(prefix: str, rank: int) -> dict[str, Any]:
     """Return the paper's row for a method, such as "pi0/multi/lora_r16"; {} if it has none.
 
@@ -37,10 +32,9 @@ def cell(prefix: str, rank: int) -> dict[str, Any]:
     found = _numbers()["cells"].get(f"{backbone}/{training}/{method}")
     if found is None:
         return {}
-    exact = [
-        100 * round(rate * 0.15) / 15 for rate in found["success"]
-    ]  # all are multiples of 1/15
-    return {**found, "success": dict(zip(tasks(), exact, strict=True))}
+    # All are multiples of 1/15.
+    exact = [100 * round(rate * 0.15) / 15 for rate in found["success"]]
+    return {**found, "success": dict(zip(_numbers()["tasks"], exact, strict=True))}
 
 
 def rates(prefix: str, rank: int) -> np.ndarray | None:

@@ -10,8 +10,8 @@ from lorasp_jax.study.naming import TOWERS
 
 _EXTREMES = 3
 """Kinds of layers to name at each end."""
-Boxes = Mapping[tuple[str, str], np.ndarray]
-"""(tower, kind of linear layer) -> five-number summaries `[S, L, 5]`."""
+Boxes = Mapping[str, Mapping[str, np.ndarray]]
+"""See `Book.rank_boxes`."""
 
 
 def where_rank_goes(book: Book) -> str:
@@ -23,10 +23,11 @@ def _paragraph(book: Book, backbone: str) -> str:
     prefix = f"{backbone}/multi/lora_sp"
     if missing := book.missing(prefix):
         return f"{missing}.\n"
-    boxes = _boxes(book, prefix)
+    boxes = book.rank_boxes(prefix)
     means = {tower: book.mean(prefix, "active_rank", tower) or 0.0 for tower in TOWERS}
     spread = {
-        t: float(np.mean([(b[..., 3] - b[..., 1]).mean() for b in _of(boxes, t)])) for t in TOWERS
+        t: float(np.mean([(b[..., 3] - b[..., 1]).mean() for b in boxes[t].values()]))
+        for t in TOWERS
     }
     high, low = _extremes(boxes)
     return (
@@ -39,39 +40,24 @@ def _paragraph(book: Book, backbone: str) -> str:
     )
 
 
-def _boxes(book: Book, prefix: str) -> Boxes:
-    """Return the summaries of all seeds."""
-    seeds = book.measures(prefix, "rank_boxes")
-    return {
-        (tower, kind): np.array([naming.by_depth(seed[tower])[kind] for seed in seeds], float)
-        for tower in seeds[0]
-        for kind in naming.by_depth(seeds[0][tower])
-    }
-
-
-def _of(boxes: Boxes, tower: str) -> list[np.ndarray]:
-    return [array for (name, _), array in boxes.items() if name == tower]
-
-
 def _extremes(boxes: Boxes) -> tuple[str, str]:
     """Return the kinds of layers with the highest and the lowest medians."""
-    medians = {kind: float(array[..., 2].mean()) for kind, array in boxes.items()}
-    ordered = sorted(medians, key=lambda kind: -medians[kind])
-    name = lambda kind: f"{kind[0]} `{_short(kind[1])}` ({medians[kind]:.0f})"  # noqa: E731
-    high, low = ordered[:_EXTREMES], ordered[::-1][:_EXTREMES]
-    return ", ".join(map(name, high)), ", ".join(map(name, low))
-
-
-def _short(linear: str) -> str:
-    """Return the name of a linear layer as Figure 6 has it."""
-    return linear.removesuffix("_proj").replace("action_time_mlp", "time")
+    medians = {
+        f"{tower} `{naming.short_kind(kind)}`": float(array[..., 2].mean())
+        for tower, kinds in boxes.items()
+        for kind, array in kinds.items()
+    }
+    ordered = sorted(medians, key=lambda name: -medians[name])
+    ends = ordered[:_EXTREMES], ordered[::-1][:_EXTREMES]
+    high, low = (", ".join(f"{name} ({medians[name]:.0f})" for name in end) for end in ends)
+    return high, low
 
 
 def _depth(boxes: Boxes) -> dict[str, str]:
     """Return the medians of the first and the last layers, averaged over kinds, by tower."""
     found = {}
     for tower in TOWERS:
-        stacks = [array[..., 2].mean(0) for array in _of(boxes, tower) if array.shape[1] > 1]
+        stacks = [array[..., 2].mean(0) for array in boxes[tower].values() if array.shape[1] > 1]
         if stacks:
             first, last = (np.mean([stack[end] for stack in stacks]) for end in (0, -1))
             found[tower] = f"from {first:.0f} to {last:.0f}"

@@ -105,6 +105,11 @@ def mean(rates: np.ndarray) -> np.ndarray:
     return rates.mean(-1)
 
 
+def minus(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Difference of mean success rates, a - b."""
+    return mean(a) - mean(b)
+
+
 def success(method: np.ndarray) -> Estimate:
     """Estimate a method's success rate, averaged over tasks."""
     return bootstrap(mean, method)
@@ -112,7 +117,7 @@ def success(method: np.ndarray) -> Estimate:
 
 def difference(a: np.ndarray, b: np.ndarray) -> Estimate:
     """Estimate the paired difference of success rates, a - b, averaged over tasks."""
-    return bootstrap(lambda x, y: mean(x) - mean(y), a, b)
+    return bootstrap(minus, a, b)
 
 
 def ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:

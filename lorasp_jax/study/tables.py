@@ -19,6 +19,8 @@ def success_table(
     training: str,
     labels: Mapping[str, str],
     columns: Sequence[Column] = (),
+    *,
+    with_base: bool = False,
 ) -> str:
     """Return success by method and task, the paper's numbers in brackets, after other columns.
 
@@ -30,13 +32,13 @@ def success_table(
         training: "multi" or "single".
         labels: methods and their names in the table.
         columns: further columns.
+        with_base: whether to begin with the base before adaptation.
     """
     prefixes = [f"{backbone}/{training}/{method}" for method in labels]
     if all(book.missing(prefix) for prefix in prefixes):
         return f"{book.missing(*prefixes)}.\n"
-    titles = [TASKS[task] for task in TASKS]
-    headers = ["method", *(title for title, _ in columns), *titles, "mean [95 % interval]"]
-    rows = []
+    headers = ["method", *(t for t, _ in columns), *TASKS.values(), "mean [95 % interval]"]
+    rows = [_base(book, backbone, len(columns))] if with_base else []
     for prefix, name in zip(prefixes, labels.values(), strict=True):
         paper = published.cell(prefix, book.rank).get("success", {})
         if missing := book.missing(prefix):
@@ -48,9 +50,13 @@ def success_table(
         for task in TASKS:
             ours = f"{100 * rates[task]:.1f}" if task in rates else ""
             cells.append(_with(ours, paper.get(task)))
-        mean = percent(statistics.success(book.outcomes(prefix)))
-        rows.append([name, *cells, _with(mean, _mean(paper))])
+        rows.append([name, *cells, _with(_success(book, prefix), _mean(paper))])
     return markdown(headers, rows)
+
+
+def _success(book: Book, prefix: str) -> str:
+    """Return a method's mean success and its interval, or how many of its runs there are."""
+    return book.missing(prefix) or percent(statistics.success(book.outcomes(prefix)))
 
 
 def _with(ours: str, paper: float | None, digits: int = 1) -> str:
@@ -67,23 +73,19 @@ def table_1(book: Book, backbone: str) -> str:
     """Return Table I: methods, their size, active rank and multi-task success, after the base's."""
     methods = _labels(book, book.table_1_methods(backbone))
     columns = [("trainable %", _trainable(book)), ("active rank", _rank(book))]
-    table = success_table(book, backbone, "multi", methods, columns)
-    if not table.startswith("|"):
-        return table
-    headers, rule, *rows = table.splitlines(keepends=True)
-    base = f"| {' | '.join(_base(book, backbone, len(columns)))} |\n"
-    return "".join([headers, rule, base, *rows])
+    return success_table(book, backbone, "multi", methods, columns, with_base=True)
 
 
 def _base(book: Book, backbone: str, columns: int) -> list[str]:
     """Return the row of the base before adaptation, from the cell that evaluates it."""
-    base = book.base(f"{backbone}/multi/")
-    start = ["base, not adapted", *[NONE] * columns]
-    if base is None:
-        return [*start, *[NONE] * len(TASKS), "0 of 1 runs so far"]
-    rates = {task: 100 * rate for task, rate in base.items()}
-    mean = float(np.mean(list(rates.values())))
-    return [*start, *(f"{rates[t]:.1f}" if t in rates else NONE for t in TASKS), f"{mean:.1f}"]
+    rates = book.base(f"{backbone}/multi/")
+    tasks = (f"{100 * rates[task]:.1f}" if task in rates else NONE for task in TASKS)
+    return ["base, not adapted", *[NONE] * columns, *tasks, _base_success(rates)]
+
+
+def _base_success(rates: Mapping[str, float]) -> str:
+    """Return the base's mean success."""
+    return f"{100 * np.mean([*rates.values()]):.1f}" if rates else "0 of 1 runs so far"
 
 
 def table_2(book: Book) -> str:
@@ -103,9 +105,8 @@ def table_2(book: Book) -> str:
         row = [naming.label(method, book.rank)]
         for backbone, training in kinds:
             prefix = f"{backbone}/{training}/{method}"
-            ours = book.missing(prefix) or percent(statistics.success(book.outcomes(prefix)))
             paper = published.cell(prefix, book.rank).get("success", {})
-            row.append(_with(ours, _mean(paper)))
+            row.append(_with(_success(book, prefix), _mean(paper)))
         rows.append(row)
     return markdown(["method", *headers], rows)
 
@@ -160,25 +161,20 @@ def pruning(book: Book, backbone: str) -> str:
         smaller = book.measures(prefix, "smaller")
         sizes = np.mean([s["bytes"] for s in smaller], axis=0) / 1e6
         times = np.mean([s["milliseconds"] for s in smaller], axis=0)
-        success = [percent(statistics.success(book.outcomes(p))) for p in (source, prefix)]
-        rows.append([name, _arrow(sizes), _arrow(times), *success])
+        rows.append(
+            [name, _arrow(sizes), _arrow(times), _success(book, source), _success(book, prefix)]
+        )
     return markdown(headers, rows) if rows else ""
 
 
 def robots(book: Book) -> str:
     """Return success before and after full fine-tuning, on the robots of Figure 4."""
     rows = []
-    for backbone in book.backbones:
+    for backbone in (b for b in book.backbones if book.methods(b, "panda")):
         for training, robot in (("panda", "Panda, seen"), ("multi", "PiPER, unseen")):
             prefix = f"{backbone}/{training}/"
-            if not book.cells(f"{backbone}/panda/full"):
-                continue
-            base, full = book.base(prefix), f"{prefix}full"
-            before = (
-                "0 of 1 runs so far" if base is None else f"{100 * np.mean([*base.values()]):.1f}"
-            )
-            after = book.missing(full) or percent(statistics.success(book.outcomes(full)))
-            rows.append([f"{BACKBONES[backbone]}, {robot}", before, after])
+            success = _base_success(book.base(prefix)), _success(book, f"{prefix}full")
+            rows.append([f"{BACKBONES[backbone]}, {robot}", *success])
     return markdown(["", "base", "after full fine-tuning"], rows) if rows else ""
 
 

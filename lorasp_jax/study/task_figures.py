@@ -1,7 +1,6 @@
 """Figures that the paper lacks: what tasks share. See `figures` for their argument."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 import matplotlib as mpl
 import numpy as np
@@ -20,19 +19,17 @@ _ROW = 0.26
 
 def shared_directions(book: Book) -> Figure:
     """Plot how far each pair of tasks uses the same directions, by tower, and what chance gives."""
-    pairs = {
-        b: _pairs(book.measures(f"{b}/multi/lora_sp", "direction_overlap")) for b in book.backbones
-    }
-    figure, grid = panels(book, 1, 1.0 + 2 * _ROW * max(map(len, pairs.values())))
-    for axes, backbone in zip(grid[0], book.backbones, strict=True):
-        cells = book.measures(f"{backbone}/multi/lora_sp", "direction_overlap")
+    overlaps = {b: book.measures(f"{b}/multi/lora_sp", "direction_overlap") for b in book.backbones}
+    figure, grid = panels(book, 1, 1.0 + 2 * _ROW * max(len(o[0]) for o in overlaps.values()))
+    for axes, (backbone, cells) in zip(grid[0], overlaps.items(), strict=True):
+        pairs = _in_order(cells[0])
         for offset, tower in zip((-0.22, 0, 0.22), TOWERS, strict=True):
-            for row, pair in enumerate(pairs[backbone]):
+            for row, pair in enumerate(pairs):
                 values = [cell[pair][tower] for cell in cells]
                 measured, chance = zip(*values, strict=True)
                 _dots(axes, row + offset, measured, float(np.mean(chance)), COLORS[tower])
             axes.plot([], [], "o", color=COLORS[tower], label=tower)
-        rows(axes, [_title(pair) for pair in pairs[backbone]])
+        rows(axes, [_title(pair) for pair in pairs])
         axes.plot([], [], "o", mfc="none", color=FULL, label="by chance")
         axes.set_xlim(0, 1)
         axes.set_title(BACKBONES[backbone], loc="left")
@@ -47,10 +44,9 @@ def gradients(book: Book) -> Figure:
     figure, grid = panels(book, 1, 1.0 + 1.2 * _ROW * max(map(len, methods.values())))
     for axes, backbone in zip(grid[0], book.backbones, strict=True):
         for row, method in enumerate(methods[backbone]):
-            cells = book.measures(f"{backbone}/multi/{method}", "gradient_cosine")
-            other, same = ([_mean(cell, same=same) for cell in cells] for same in (False, True))
+            two, one = book.cosines(f"{backbone}/multi/{method}")
             color = LORA_SP if method == "lora_sp" else mpl.rcParams["text.color"]
-            _dots(axes, row, other, float(np.mean(same)), color)
+            _dots(axes, row, two, float(np.mean(one)), color)
         rows(axes, [naming.label(method, book.rank) for method in methods[backbone]])
         axes.axvline(0, color="gray", lw=1)
         axes.set_title(BACKBONES[backbone], loc="left")
@@ -69,12 +65,6 @@ def gradient_methods(book: Book, backbone: str) -> list[str]:
     return [f"{backbone}/multi/{method}" for method in methods if method != "lora_cut"]
 
 
-def _mean(cosines: dict[str, dict[str, float]], *, same: bool) -> float:
-    """Return the mean cosine over pairs of different tasks, or of the same task."""
-    pairs = [(pair.split("|"), towers["all"]) for pair, towers in cosines.items()]
-    return float(np.mean([value for (a, b), value in pairs if (a == b) is same]))
-
-
 def _dots(axes: Axes, row: float, measured: Sequence[float], reference: float, color: str) -> None:
     """Draw the mean over seeds, their range, and a gray ring to compare it with."""
     axes.plot([float(np.mean(measured)), reference], [row, row], color=FULL, lw=0.5)
@@ -83,10 +73,10 @@ def _dots(axes: Axes, row: float, measured: Sequence[float], reference: float, c
     axes.plot([reference], [row], "o", color=FULL, ms=5, mfc="none")
 
 
-def _pairs(cells: Sequence[dict[str, Any]]) -> list[str]:
-    """Return the pairs of tasks, such as "pour|press", in the paper's order of tasks."""
+def _in_order(pairs: Iterable[str]) -> list[str]:
+    """Return pairs of tasks, such as "pour|press", in the paper's order of tasks."""
     order = [*TASKS]
-    return sorted(cells[0], key=lambda pair: sorted(order.index(task) for task in pair.split("|")))
+    return sorted(pairs, key=lambda pair: sorted(order.index(task) for task in pair.split("|")))
 
 
 def _title(pair: str) -> str:

@@ -44,7 +44,7 @@ def _shown(claim: Claim, book: Book, judged: Judged, backbone: str) -> str:
     """Return a claim's verdict, or how many of its runs there are."""
     found = _verdict(judged, claim, backbone)
     if found == "not yet run":
-        return book.missing_cells({n: 0 for test in claim.tests[backbone] for n in test.cells})
+        return book.missing_cells({n for test in claim.tests[backbone] for n in test.cells})
     return found if found == NONE else f"**{found}**"
 
 
@@ -74,10 +74,9 @@ def numbers(claims: tuple[Claim, ...], book: Book, judged: Judged) -> str:
 def highest_rank(book: Book) -> str:
     """Return how near LoRA with r = R comes to full fine-tuning, which claim 3 does not test."""
     parts = []
-    for backbone in book.backbones:
-        prefixes = [f"{backbone}/multi/{method}" for method in (f"lora_r{book.rank}", "full")]
-        if book.missing(*prefixes):
-            continue
+    methods = f"multi/lora_r{book.rank}", "multi/full"
+    for backbone in book.complete(*methods):
+        prefixes = [f"{backbone}/{method}" for method in methods]
         ratio = statistics.bootstrap(statistics.ratio, *map(book.outcomes, prefixes))
         rates = [r for p in prefixes if (r := published.rates(p, book.rank)) is not None]
         paper = f" ({100 * statistics.ratio(*rates):.1f})" if len(rates) == 2 else ""
