@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from envs.datasets.writing import write_text
+from lorasp_jax.config import Config
 from lorasp_jax.study import drawings, findings, tables, verdicts
 from lorasp_jax.study.book import BACKBONES, NONE, Book, markdown
 from lorasp_jax.study.claims import judge_all
 from lorasp_jax.study.rank_text import where_rank_goes
 from lorasp_jax.study.setup_table import setup_table
-from lorasp_jax.study.status import describe_config
-from lorasp_jax.study.study import Derived, Study
+from lorasp_jax.study.study import Cell, Study
 
 _TRAININGS = {
     "pilot": "learning rates",
@@ -40,13 +40,7 @@ def page(study: Study, results: Mapping[str, Any], films: Collection[str] = ()) 
     """Return the page in Markdown; `films` are the names of the rank maps in figures/."""
     book = _book(study, results)
     judged = judge_all(study.claims, results)
-    by_backbone: dict[str, Callable[[Book, str], str]] = {
-        "table_1": tables.table_1,
-        "table_3": tables.table_3,
-        "table_4": tables.table_4,
-        "pruning": tables.pruning,
-        "costs": tables.costs,
-    }
+    by_backbone = tables.table_1, tables.table_3, tables.table_4, tables.pruning, tables.costs
     return (
         Path(__file__)
         .with_name("page.md")
@@ -56,7 +50,7 @@ def page(study: Study, results: Mapping[str, Any], films: Collection[str] = ()) 
             missing=_missing(book),
             progress=_progress(book),
             size=_size(book),
-            setup=setup_table(book, _config(study, results)),
+            setup=setup_table(book, _config(study)),
             summary=verdicts.summary(study.claims, book, judged),
             verdicts=verdicts.table(study.claims, book, judged),
             numbers=verdicts.numbers(study.claims, book, judged),
@@ -74,7 +68,7 @@ def page(study: Study, results: Mapping[str, Any], films: Collection[str] = ()) 
             where_rank_goes=where_rank_goes(book),
             films=_films(book, films),
             **{f"figure_{name}": drawings.markdown(book, name) for name in drawings.DRAWINGS},
-            **{name: _by_backbone(book, table) for name, table in by_backbone.items()},
+            **{table.__name__: _by_backbone(book, table) for table in by_backbone},
         )
     )
 
@@ -90,8 +84,8 @@ def _missing(book: Book) -> str:
     """Say that runs are missing; "" if none is."""
     missing = book.missing_cells(book.names)
     return missing and (
-        f"**Unfinished: {missing}.** The others wait for GPU time. Where a method lacks some of "
-        "its seeds, the page has no number for it, but says how many of its runs there are.\n\n"
+        f"**Unfinished: {missing}.** Where a method lacks some of its seeds, the page has no "
+        "number for it, but says how many of its runs there are.\n\n"
     )
 
 
@@ -120,17 +114,10 @@ def _size(book: Book) -> str:
     )
 
 
-def _config(study: Study, results: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the settings of a multi-task run: a finished one's, or else those of the study."""
-    multi = [cell for cell in study.cells if cell.name.split("/")[1] in ("multi", "pilot")]
-    done = next((results[cell.name] for cell in multi if cell.name in results), None)
-    if done:
-        return done["config"]
-    return next(
-        describe_config(cell, cell.config)
-        for cell in multi
-        if not isinstance(cell, Derived) and not callable(cell.config)
-    )
+def _config(study: Study) -> Config:
+    """Return the config of a run for all tasks, the first that does not depend on results."""
+    configs = (cell.config for cell in study.cells if isinstance(cell, Cell))
+    return next(config for config in configs if isinstance(config, Config))
 
 
 def _by_backbone(book: Book, table: Callable[[Book, str], str]) -> str:

@@ -1,26 +1,25 @@
 """The setup of the paper's study beside that of the paper."""
 
 import importlib
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable
 
+from lorasp_jax.config import Config
 from lorasp_jax.study import naming, published
 from lorasp_jax.study.book import BACKBONES, NONE, Book, markdown
 
 
-def setup_table(book: Book, config: Mapping[str, Any]) -> str:
+def setup_table(book: Book, config: Config) -> str:
     """Return the table of the study's setup and the paper's.
 
     Args:
         book: the results; the sizes of the models are theirs.
-        config: settings of a multi-task run, as in cell.json.
+        config: that of a run for all tasks.
     """
-    optim, data, images = config["optim"], config["data"], config["image_size"]
-    evaluation, limits = config["evaluation"], _time_limits(config["tasks"])
+    optim, images = config.optim, config.image_size
     seeds = len(book.cells(f"{book.backbones[0]}/multi/lora_sp"))
-    layers = "all linear layers" if config["targets"] == [".*"] else ", ".join(config["targets"])
-    training = f"{optim['steps']:,} steps of {optim['batch_size']} samples, AdamW"
-    episodes = f"{evaluation['episodes']} episodes per task and seed, {seeds} seeds"
+    layers = "all linear layers" if config.targets == (".*",) else ", ".join(config.targets)
+    training = f"{optim.steps:,} steps of {optim.batch_size} samples, AdamW"
+    episodes = f"{config.evaluation.episodes} episodes per task and seed, {seeds} seeds"
     rows = [
         ["models", _models(book), "π0 of 3.5 billion parameters, and SmolVLA"],
         ["pretraining", "from scratch, the same four tasks on the Panda", "as published"],
@@ -28,14 +27,14 @@ def setup_table(book: Book, config: Mapping[str, Any]) -> str:
         ["cameras", f"side and wrist, {images} x {images} pixels", "side and wrist"],
         [
             "demonstrations per task",
-            f"{data['episodes']}, by a scripted expert",
+            f"{config.data.episodes}, by a scripted expert",
             "120, teleoperated",
         ],
         ["training, all tasks", training, NONE],
         ["adapted layers", layers, "not stated; the parameter counts fit all linear layers"],
         ["R, size of LoRA-SP's bank", str(book.rank), str(published.RANK)],
         ["evaluation", episodes, "probably 15 episodes per task"],
-        ["success", f"state of the simulation, within {limits} s", NONE],
+        ["success", f"state of the simulation, within {_time_limits(config.tasks)} s", NONE],
     ]
     return markdown(["", "here", "in the paper"], rows)
 
@@ -51,6 +50,6 @@ def _models(book: Book) -> str:
     return "small versions: " + " and ".join(texts)
 
 
-def _time_limits(tasks: list[str]) -> str:
+def _time_limits(tasks: Iterable[str]) -> str:
     limits = [importlib.import_module(f"envs.tasks.{task}").TASK.time_limit for task in tasks]
     return f"{min(limits):g} to {max(limits):g}"

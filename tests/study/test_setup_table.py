@@ -1,10 +1,12 @@
 """The setup has its numbers from the settings and results."""
 
+import dataclasses
+
 from lorasp_jax.study.book import Book
 from lorasp_jax.study.setup_table import setup_table
 from tests.study import synthetic
 
-CONFIG = synthetic.cells()["pi0/multi/lora_sp/s0"]["config"]
+CONFIG = synthetic.study()["pi0/pilot/lora_sp/0.001"].config
 NAMES = tuple(synthetic.cells())
 
 
@@ -19,7 +21,8 @@ def test_numbers():
 
 
 def test_before_the_first_run():
-    text = setup_table(Book(NAMES, {}), CONFIG | {"targets": ["^action/"], "image_size": 96})
+    config = dataclasses.replace(CONFIG, targets=("^action/",), image_size=96)
+    text = setup_table(Book(NAMES, {}), config)
     assert "| small versions: π0 and SmolVLA |" in text
     assert "| ^action/ |" in text
     assert "96 x 96 pixels" in text
