@@ -122,7 +122,7 @@ def _smoke() -> Plan:
             scale="smoke",
             peft=LoRASP(),
             tasks=("press", "pick_place"),
-            targets=("^action/.*(q|v)_proj",),
+            targets=("(q|v)_proj",),  # in every module, because claim 8 compares them
             data=DataConfig(episodes=4, num_envs=8),
             optim=OptimConfig(steps=4, batch_size=8, warmup_steps=1),
             evaluation=EvaluationConfig(episodes=8, num_envs=8, before=False),

@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 
 import envs
+from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config
 from lorasp_jax.peft import AdaLoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP
 from lorasp_jax.study import Cell, Derived, claims, naming
 from lorasp_jax.training import setup
+from lorasp_jax.training.base import base_model
+from lorasp_jax.training.cost import preflight
 from tests.study import synthetic
 
 STUDY = synthetic.study()
@@ -157,6 +160,14 @@ def test_smoke_has_the_same_structure():
     }
     assert len(config("pi0/multi/lora_sp/s0", "smoke").tasks) == 2
     assert [claim.number for claim in smoke.claims if claim.tests] == [1, 8, 10]
+
+
+def test_smoke_adapts_every_module():
+    """Claims and figures compare them."""
+    smoke = config("pi0/multi/lora_sp/s0", "smoke")
+    base = base_model(smoke, abstract=True)[0].config
+    paths = adaptation.methods(preflight.abstract_model(smoke, base))
+    assert {path.partition("/")[0] for path in paths} == {*naming.TOWERS}
 
 
 def test_unknown_scale():
