@@ -21,12 +21,14 @@ class Drawing:
         needs: returns the methods that it shows for a backbone, such as "pi0/multi/lora_r2".
         title: its name and what it shows.
         caption: how to read it.
+        alt: what a reader who cannot see it should know.
     """
 
     draw: Callable[[Book], Figure]
     needs: Callable[[Book, str], list[str]]
     title: str
     caption: str
+    alt: str
 
 
 def _lora(book: Book, backbone: str, *kinds: str) -> list[str]:
@@ -50,6 +52,8 @@ DRAWINGS = {
         "Figure 1. Multi-task success relative to full fine-tuning, against rank",
         "The further left a point reaches the dotted line, the less rank the method needs; bands "
         "and bars are 95 % intervals, and the paper's ranks are scaled from R = 128 to {rank}.",
+        alt="LoRA's success as a line over ranks, LoRA-SP's as a point at its mean active rank, "
+        "and a horizontal line at 100 %.",
     ),
     "3": Drawing(
         figures.figure_3,
@@ -57,6 +61,8 @@ DRAWINGS = {
         "Figure 3. LoRA's success against rank, with one policy per task and one for all",
         "Above, the mean over tasks; below, how much tasks differ, corrected for the noise of "
         "finite samples and at least 0; bands are 95 % intervals.",
+        alt="Lines of LoRA's success and of its standard deviation over tasks, against rank, for "
+        "one task and for all.",
     ),
     "4": Drawing(
         figures.figure_4,
@@ -65,6 +71,8 @@ DRAWINGS = {
         "one that it has not",
         "The higher a box, the more of its singular values a layer's update needs for 99 % of its "
         "energy; boxes are quartiles over layers and seeds, whiskers go from minimum to maximum.",
+        alt="For vision, language and action, a box of shares from 0 to 1 for the Panda, and one "
+        "for the PiPER.",
     ),
     "6": Drawing(
         figures.figure_6,
@@ -72,6 +80,8 @@ DRAWINGS = {
         "Figure 6. LoRA-SP's active rank over the tokens of held-out demonstrations",
         "For each kind of layer, dots are the medians of its layers, the bar is the middle half of "
         "tokens, averaged over layers and seeds, and the line goes from minimum to maximum.",
+        alt="For each kind of linear layer in vision, language and action, the spread of active "
+        "ranks from 0 to R.",
     ),
     "directions": Drawing(
         task_figures.shared_directions,
@@ -79,6 +89,8 @@ DRAWINGS = {
         "Figure A. Which directions tasks share in LoRA-SP",
         "The further right of its ring a dot lies, the more two tasks share; dots are means over "
         "seeds, thick lines span the seeds.",
+        alt="For each pair of tasks and each module, a dot for the overlap of directions, and a "
+        "ring for what chance gives.",
     ),
     "gradients": Drawing(
         task_figures.gradients,
@@ -86,6 +98,8 @@ DRAWINGS = {
         "Figure B. Cosines of gradients after multi-task training",
         "The closer a dot is to its ring, the less two tasks differ; dots are means over pairs of "
         "tasks and seeds, thick lines span the seeds.",
+        alt="For each method, a dot for the cosine between two tasks, and a ring for that between "
+        "two batches of one task.",
     ),
 }
 """Figures by the name of their files; those of the paper have its numbers."""
@@ -118,7 +132,7 @@ def markdown(book: Book, name: str) -> str:
     dark, light = (f"figures/{_file(name, scheme)}" for scheme in ("dark", "light"))
     return (
         f'<picture>\n  <source media="(prefers-color-scheme: dark)" srcset="{dark}">\n'
-        f'  <img alt="{drawn.title}" src="{light}">\n</picture>\n\n{caption}{lacks}\n'
+        f'  <img alt="{drawn.alt}" src="{light}">\n</picture>\n\n{caption}{lacks}\n'
     )
 
 

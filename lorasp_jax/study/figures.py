@@ -152,19 +152,19 @@ def figure_4(book: Book) -> Figure:
                 showcaps=False,
             )
         axes.set_xticks(range(len(TOWERS)), TOWERS)
-        axes.set_ylim(0, 100)
+        axes.set_ylim(0, 1)
         axes.set_title(BACKBONES[backbone], loc="left")
-    grid[0][0].set_ylabel("singular values with 99 % of\nfull fine-tuning's update [%]")
+    grid[0][0].set_ylabel("share of singular values with\n99 % of full fine-tuning's update")
     boxes = [Patch(edgecolor=FULL, label=_ROBOTS[name], **style) for name, style in styles.items()]
     figure.legend(handles=boxes, loc="outside upper center", ncols=2)
     return figure
 
 
 def _shares(book: Book, prefix: str, tower: str) -> list[float]:
-    """Return the shares [%] of all layers of a tower that changed, of all seeds."""
+    """Return the shares of all layers of a tower that changed, of all seeds."""
     cells = book.measures(prefix, "spectral_rank")
     layers = [row for cell in cells for row in cell[tower].values()]
-    return [100 * share for row in layers for share in row if share is not None]
+    return [share for row in layers for share in row if share is not None]
 
 
 def figure_6(book: Book) -> Figure:

@@ -42,3 +42,11 @@ def test_a_finished_figure_lacks_nothing():
 def test_a_figure_without_cells():
     book = Book(tuple(n for n in NAMES if "/panda/" not in n), {})
     assert drawings.markdown(book, "4").endswith("**The study has no runs for this.**\n")
+
+
+def test_every_figure_says_what_it_shows_to_who_cannot_see_it():
+    for name, drawing in drawings.DRAWINGS.items():
+        assert drawing.alt.endswith(".")
+        text = drawings.markdown(Book(NAMES, synthetic.results()), name)
+        assert f'<img alt="{drawing.alt}" src=' in text
+        assert '"' not in drawing.alt

@@ -4,6 +4,7 @@ import xml.etree.ElementTree
 
 import numpy as np
 import pytest
+from matplotlib.patches import PathPatch
 
 from lorasp_jax.study import figure_style, figures
 from lorasp_jax.study.book import Book
@@ -85,4 +86,7 @@ def test_seen_and_unseen_robots():
         "Panda (seen), new scene",
         "PiPER (unseen)",
     ]
-    assert figure.axes[0].get_ylim() == (0, 100)
+    assert figure.axes[0].get_ylim() == (0, 1)
+    boxes = [patch for patch in figure.axes[0].patches if isinstance(patch, PathPatch)]
+    shares = np.array([box.get_path().vertices[:, 1] for box in boxes])
+    assert 0.3 < shares.min() < shares.max() < 0.7
