@@ -54,8 +54,5 @@ def rows(axes: Axes, labels: Sequence[str]) -> None:
 
 def legend(figure: Figure, axes: Axes, columns: int) -> None:
     """Put the legend of a panel above the figure; entries fill one column after another."""
-    handles, labels = axes.get_legend_handles_labels()
-    entries = dict(zip(labels, handles, strict=True))
-    for label in sorted(labels, key=lambda label: label.split(",")[0] == "full fine-tuning"):
-        entries[label] = entries.pop(label)
-    figure.legend(entries.values(), entries.keys(), loc="outside upper center", ncols=columns)
+    entries = axes.get_legend_handles_labels()
+    figure.legend(*entries, loc="outside upper center", ncols=columns)

@@ -110,6 +110,7 @@ def figure_3(book: Book) -> Figure:
             _band(top, ranks, means, color, marker, f"LoRA, {title}")
             spreads = [_percent(_deviation(outcomes)) for outcomes in found]
             _band(bottom, ranks, spreads, color, marker, title)
+        for training, (title, color, _) in _TRAININGS.items():  # the legend's second column
             full = 100 * book.outcomes(f"{backbone}/{training}/full").mean()
             top.axhline(full, color=color, lw=1.5, ls=":", label=f"full fine-tuning, {title}")
         for axes in (top, bottom):

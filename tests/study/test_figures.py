@@ -52,6 +52,8 @@ def test_success_against_rank():
 def test_mean_and_deviation_over_tasks():
     figure = figures.figure_3(BOOK)
     assert len(figure.axes) == 4
+    entries = [text.get_text().split(",")[0] for text in figure.legends[0].get_texts()]
+    assert entries == ["LoRA", "LoRA", "full fine-tuning", "full fine-tuning"]
     lines = {line.get_label(): np.asarray(line.get_ydata()) for line in figure.axes[0].lines}
     rates = 100 * BOOK.outcomes("pi0/single/lora_r8").mean((0, 2))
     assert lines["LoRA, one policy per task"][2] == pytest.approx(rates.mean())

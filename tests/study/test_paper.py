@@ -17,6 +17,7 @@ from lorasp_jax.study import Cell, Derived, claims, naming
 from lorasp_jax.training import setup
 from lorasp_jax.training.base import base_model
 from lorasp_jax.training.cost import preflight
+from tests import ROOT
 from tests.study import synthetic
 
 STUDY = synthetic.study()
@@ -139,6 +140,19 @@ def test_the_panda_differs_only_in_robot_and_scene(backbone):
         same = {"robot": "piper", "scene": piper.scene, "evaluation": evaluation}
         assert dataclasses.replace(panda, **same) == piper
         assert piper.ranges is None
+
+
+def test_the_page_has_the_numbers_of_the_settings():
+    text = " ".join((ROOT / "lorasp_jax/study/page.md").read_text().split())
+    scene = {name: low for name, (low, _) in config("pi0/panda/full/s0").scene.changed().items()}
+    assert (
+        f"cameras shifted by {100 * scene['camera_position']:g} cm along each of their axes and "
+        f"rotated by {scene['camera_turn']:g} rad about each, a table "
+        f"{100 * scene['table_height']:g} cm higher, and objects shifted by "
+        f"{100 * scene['position']:g} cm each way and rotated by {scene['turn']:g} rad."
+    ) in text
+    (scale,) = {config(f"pi0/multi/lora_r{rank}/s0").peft.scale for rank in (2, 16, 64)}
+    assert f"LoRA's scale is {scale:g} at every rank." in text
 
 
 def test_seeds_of_a_method_are_one_group():
