@@ -5,6 +5,9 @@ import functools
 import jax
 import jax.numpy as jnp
 
+from lorasp_jax.kernels.platform import platform
+from lorasp_jax.kernels.short_attention import HEAD_DIMS, MAX_KEYS, short_attention
+
 MASKED = -2.3819763e38
 """Logit of a masked key. Finite, so that a fully masked row gets a uniform softmax, not NaN."""
 
@@ -21,7 +24,9 @@ CUDNN_MULTIPLE = 8
 
 
 def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) -> jax.Array:
-    """Grouped-query attention with fp32 softmax; uses cuDNN for long 16-bit float inputs on GPUs.
+    """Grouped-query attention with fp32 softmax; 16-bit floats on GPUs use faster kernels.
+
+    These are cuDNN for long inputs, and `kernels.short_attention` for few keys.
 
     cuDNN accumulates gradients in nondeterministic order: two runs differ by rounding errors.
 
@@ -41,6 +46,8 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) 
             q, k, v, mask = _pad_for_cudnn(q, k, v, mask)
         y = attend(q, k, v, mask=None if mask is None else mask[:, None])
         return y[:, :tokens].reshape(batch, tokens, heads * size)
+    if _use_short_attention(q, k):
+        return short_attention(q, k, v, mask)
     k, v, mask = _pad_keys(k, v, mask)
     # For K = 1, this axis order needs no transposes of q, the weights or the result.
     q = q.reshape(batch, tokens, k.shape[2], -1, size)
@@ -70,6 +77,17 @@ def _use_cudnn(q: jax.Array, k: jax.Array, mask: jax.Array | None) -> bool:
     supported = CUDNN_MIN_HEAD_DIM <= head_dim <= 256 and head_dim % 8 == 0 and even
     large = queries >= CUDNN_MIN_QUERIES
     return jax.default_backend() == "gpu" and half_precision and supported and large
+
+
+def _use_short_attention(q: jax.Array, k: jax.Array) -> bool:
+    """Whether the kernel supports these arrays."""
+    half_precision = q.dtype in (jnp.bfloat16, jnp.float16)
+    return (
+        platform() == "gpu"
+        and half_precision
+        and q.shape[3] in HEAD_DIMS
+        and k.shape[1] <= MAX_KEYS
+    )
 
 
 def _pad_for_cudnn(

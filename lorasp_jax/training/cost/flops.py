@@ -21,6 +21,9 @@ _CUDNN = {"dot_product_attention_fwd_wrapper": 4, "dot_product_attention_bwd_wra
 """FLOPs of cuDNN attention in units of batch size x heads x queries x keys x head size. The forward
 pass has two matrix products, the backward pass four; a fifth is recomputation and not counted."""
 
+_SHORT_ATTENTION = {"short_attention_forward": 4, "short_attention_backward": 8}
+"""The same for `kernels.short_attention`."""
+
 
 def count(function: Callable, *arguments: Any) -> float:
     """Count the FLOPs of one call, two per multiply-add.
@@ -58,6 +61,9 @@ def _equation_flops(equation: Any) -> float:
         query, key = (v.aval.shape for v in equation.invars[:2])
         batch, tokens, heads, size = query
         return float(_CUDNN[name] * batch * heads * tokens * key[1] * size)
+    if name == "pallas_call" and params.get("name") in _SHORT_ATTENTION:
+        query, key = (v.aval.shape for v in equation.invars[:2])
+        return float(_SHORT_ATTENTION[params["name"]] * math.prod(query) * key[1])
     if name == "cond":
         return max(_jaxpr_flops(branch.jaxpr) for branch in params["branches"])
     if name == "while":  # the number of iterations is unknown: count one
