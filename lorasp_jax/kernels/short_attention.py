@@ -23,6 +23,10 @@ MAX_KEYS = 256
 """Maximum number of keys: their logits must fit in registers."""
 HEAD_DIMS = (16, 32, 64, 128)
 """Supported head sizes."""
+MAX_KEY_ELEMENTS = 8192
+"""Maximum number of keys times head size in general use. Up to here, the backward pass needs at
+most 88 KiB of shared memory on GPUs with 99 KiB, compiled with Triton 3.9; twice as many need 120.
+"""
 
 
 class Launch(NamedTuple):

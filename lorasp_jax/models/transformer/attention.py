@@ -6,7 +6,12 @@ import jax
 import jax.numpy as jnp
 
 from lorasp_jax.kernels.platform import platform
-from lorasp_jax.kernels.short_attention import HEAD_DIMS, MAX_KEYS, short_attention
+from lorasp_jax.kernels.short_attention import (
+    HEAD_DIMS,
+    MAX_KEY_ELEMENTS,
+    MAX_KEYS,
+    short_attention,
+)
 
 MASKED = -2.3819763e38
 """Logit of a masked key. Finite, so that a fully masked row gets a uniform softmax, not NaN."""
@@ -29,6 +34,7 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) 
     These are cuDNN for long inputs, and `kernels.short_attention` for few keys.
 
     cuDNN accumulates gradients in nondeterministic order: two runs differ by rounding errors.
+    Neither kernel has a forward-mode or second derivative.
 
     Args:
         q: `[B, T, N, H]`, already scaled.
@@ -80,14 +86,11 @@ def _use_cudnn(q: jax.Array, k: jax.Array, mask: jax.Array | None) -> bool:
 
 
 def _use_short_attention(q: jax.Array, k: jax.Array) -> bool:
-    """Whether the kernel supports these arrays."""
+    """Whether the kernel supports these arrays, on all GPUs since Ampere."""
+    head_dim, keys = q.shape[3], k.shape[1]
     half_precision = q.dtype in (jnp.bfloat16, jnp.float16)
-    return (
-        platform() == "gpu"
-        and half_precision
-        and q.shape[3] in HEAD_DIMS
-        and k.shape[1] <= MAX_KEYS
-    )
+    few = keys <= MAX_KEYS and keys * head_dim <= MAX_KEY_ELEMENTS
+    return platform() == "gpu" and half_precision and head_dim in HEAD_DIMS and few
 
 
 def _pad_for_cudnn(

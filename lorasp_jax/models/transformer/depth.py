@@ -13,7 +13,8 @@ from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models.config import Remat
 
 _EXPENSIVE_TO_RECOMPUTE = ("dot_product_attention_fwd_wrapper", "custom_vmap_call")
-"""Primitives of cuDNN attention and of the adapters' fused kernel (`kernels.row_sharding`)."""
+"""Primitives of cuDNN attention and of kernels on sharded rows (`kernels.row_sharding`), which are
+`short_attention` and the adapters' fused kernel."""
 _SAVED = "saved"
 
 

@@ -62,8 +62,9 @@ def _equation_flops(equation: Any) -> float:
         batch, tokens, heads, size = query
         return float(_CUDNN[name] * batch * heads * tokens * key[1] * size)
     if name == "pallas_call" and params.get("name") in _SHORT_ATTENTION:
-        query, key = (v.aval.shape for v in equation.invars[:2])
-        return float(_SHORT_ATTENTION[params["name"]] * math.prod(query) * key[1])
+        # Only the outputs always have the axes of jax.vmap. The first one has the shape of q.
+        size, keys = equation.outvars[0].aval.size, equation.invars[1].aval.shape[-3]
+        return float(_SHORT_ATTENTION[params["name"]] * size * keys)
     if name == "cond":
         return max(_jaxpr_flops(branch.jaxpr) for branch in params["branches"])
     if name == "while":  # the number of iterations is unknown: count one

@@ -1,10 +1,37 @@
-"""Padding of keys and queries does not change attention."""
+"""Padding of keys and queries does not change attention, nor do the kernels for few keys."""
+
+import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import nnx
 
+from lorasp_jax.kernels.short_attention import short_attention
+from lorasp_jax.models import pi0, smolvla
+from lorasp_jax.models.transformer import attention as module
 from lorasp_jax.models.transformer.attention import MASKED, attention
+from tests.models.random_models import observation, random_backbone
+
+ALLOW_TRITON = pytest.mark.filterwarnings(
+    "ignore:The Pallas Triton backend is deprecated:DeprecationWarning"
+)
+
+
+def target(platform):
+    """Trace for this platform on a host without it."""
+    device = jax.sharding.AbstractDevice("", num_cores=None, platform=platform)
+    return jax.sharding.use_abstract_mesh(
+        jax.sharding.AbstractMesh((), (), abstract_device=device)
+    )
+
+
+def shapes(keys, head_dim, dtype="bfloat16", *, tokens=11, heads=4, kv_heads=2):
+    """Return the shapes of q, k, v and the mask."""
+    q = jax.ShapeDtypeStruct((2, tokens, heads, head_dim), dtype)
+    k = jax.ShapeDtypeStruct((2, keys, kv_heads, head_dim), dtype)
+    return q, k, k, jax.ShapeDtypeStruct((2, tokens, keys), "bool")
 
 
 @pytest.mark.parametrize("keys", [512, 600])
@@ -40,3 +67,81 @@ def test_token_counts_are_padded_for_cudnn(monkeypatch):
     actual = attention(q, k, v, mask)
     assert sizes == [(136, 144)]
     np.testing.assert_allclose(actual.astype("f4"), expected.astype("f4"), atol=0.02)
+
+
+@ALLOW_TRITON
+@pytest.mark.parametrize(
+    ("platform", "keys", "head_dim", "dtype", "expected"),
+    [
+        ("cuda", 149, 32, "bfloat16", True),
+        ("cuda", 37, 16, "float16", True),
+        ("cuda", 128, 64, "bfloat16", True),
+        ("cuda", 256, 32, "bfloat16", True),
+        ("cuda", 129, 64, "bfloat16", False),  # might need too much shared memory
+        ("cuda", 257, 16, "bfloat16", False),
+        ("cuda", 37, 72, "bfloat16", False),  # pi0's vision tower
+        ("cuda", 37, 256, "bfloat16", False),  # pi0's experts
+        ("cuda", 37, 32, "float32", False),
+        ("cpu", 37, 32, "bfloat16", False),
+        ("tpu", 37, 32, "bfloat16", False),
+    ],
+)
+def test_few_keys_use_kernels_on_gpus(platform, keys, head_dim, dtype, expected):
+    run = jax.jit(lambda *arrays: attention(*arrays))
+    with target(platform):
+        traced = run.trace(*shapes(keys, head_dim, dtype))
+        text = traced.lower(lowering_platforms=(platform,)).as_text()
+    assert ('"short_attention_forward"' in text) == expected
+
+
+def small_policy(backbone, dtype, remat):
+    """Return a loss, its trainable arrays and their shapes' model."""
+    config = dataclasses.replace(backbone.Config.dummy(), dtype=dtype, remat=remat)
+    graphdef, parameters = nnx.split(random_backbone(config))
+    obs, actions = observation(config, 2), jnp.ones((2, config.chunk, config.action_dim))
+
+    def loss(parameters):
+        model = nnx.merge(graphdef, parameters)
+        return model.loss(jax.random.key(0), obs, actions)[0].mean()
+
+    return loss, parameters
+
+
+@ALLOW_TRITON
+@pytest.mark.parametrize("backbone", [pi0, smolvla], ids=["pi0", "smolvla"])
+@pytest.mark.parametrize("remat", ["none", "products", "full"])
+def test_kernels_in_a_policy(backbone, remat):
+    """Of the scans over layers, only "full" has another forward kernel, in the backward pass."""
+    loss, parameters = small_policy(backbone, "bfloat16", remat)
+    kernels = {}
+    for platform in ("cuda", "cpu"):
+        with target(platform):
+            traced = jax.jit(lambda p: jax.grad(loss)(p)).trace(parameters)
+            text = traced.lower(lowering_platforms=(platform,)).as_text()
+        names = ("forward", "backward")
+        kernels[platform] = [text.count(f'"short_attention_{name}"') for name in names]
+    scans = {pi0: 3, smolvla: 4}[backbone]
+    assert kernels["cuda"] == [2 * scans if remat == "full" else scans, scans]
+    assert kernels["cpu"] == [0, 0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backbone", [pi0, smolvla], ids=["pi0", "smolvla"])
+def test_kernels_change_a_policy_by_rounding_errors_only(backbone, monkeypatch):
+    """Loss and gradients are as close to those in fp32 as without the kernels."""
+    run = jax.jit(lambda loss, parameters: jax.value_and_grad(loss)(parameters), static_argnums=0)
+    exact = run(*small_policy(backbone, "float32", "none"))
+    xla = run(*small_policy(backbone, "bfloat16", "products"))
+    calls = []
+
+    def interpreted(*arrays):
+        calls.append(arrays)
+        return short_attention(*arrays, interpret=True)
+
+    monkeypatch.setattr(module, "platform", lambda: "gpu")
+    monkeypatch.setattr(module, "short_attention", interpreted)
+    kernels = run(*small_policy(backbone, "bfloat16", "products"))
+    assert calls
+    for actual, reference, expected in zip(*map(jax.tree.leaves, (kernels, xla, exact)), strict=True):
+        error, rounding = (np.linalg.norm(a - expected) for a in (actual, reference))
+        assert error <= 1.5 * rounding + 1e-3 * np.linalg.norm(expected)
