@@ -89,8 +89,9 @@ def test_rowwise_kernel(monkeypatch):
 
 
 @pytest.mark.slow
-def test_short_attention():
-    """Values and gradients of attention on a sharded batch."""
+@pytest.mark.parametrize("batch", [1, 6, 8])
+def test_short_attention(batch):
+    """Values and gradients of attention on a sharded batch, also one that does not divide."""
     q = jax.random.normal(jax.random.key(0), (8, 5, 2, 16))
     mask = jnp.tri(5, dtype=bool)[None].repeat(8, axis=0)
 
@@ -100,11 +101,13 @@ def test_short_attention():
 
         def loss(q):
             k, v = jnp.sin(q[:, :, :1]), jnp.cos(q[:, :, :1])
-            y = short_attention(q, k, v, mask, launches=launches, interpret=True)
+            arrays = (a[:batch] for a in (q, k, v, mask))
+            y = short_attention(*arrays, launches=launches, interpret=True)
             return jnp.sin(y).sum()
 
         return jax.value_and_grad(loss)(q)
 
     compiled = gradients.lower(shard(q), shard(mask)).compile()
-    assert "all-gather" not in compiled.as_text()
+    if batch == 8:
+        assert "all-gather" not in compiled.as_text()
     jax.tree.map(close, compiled(shard(q), shard(mask)), gradients(q, mask))

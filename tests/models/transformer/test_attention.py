@@ -22,9 +22,7 @@ ALLOW_TRITON = pytest.mark.filterwarnings(
 def target(platform):
     """Trace for this platform on a host without it."""
     device = jax.sharding.AbstractDevice("", num_cores=None, platform=platform)
-    return jax.sharding.use_abstract_mesh(
-        jax.sharding.AbstractMesh((), (), abstract_device=device)
-    )
+    return jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), (), abstract_device=device))
 
 
 def shapes(keys, head_dim, dtype="bfloat16", *, tokens=11, heads=4, kv_heads=2):
@@ -87,7 +85,7 @@ def test_token_counts_are_padded_for_cudnn(monkeypatch):
     ],
 )
 def test_few_keys_use_kernels_on_gpus(platform, keys, head_dim, dtype, expected):
-    run = jax.jit(lambda *arrays: attention(*arrays))
+    run = jax.jit(attention)
     with target(platform):
         traced = run.trace(*shapes(keys, head_dim, dtype))
         text = traced.lower(lowering_platforms=(platform,)).as_text()
@@ -95,7 +93,7 @@ def test_few_keys_use_kernels_on_gpus(platform, keys, head_dim, dtype, expected)
 
 
 def small_policy(backbone, dtype, remat):
-    """Return a loss, its trainable arrays and their shapes' model."""
+    """Return a loss and its parameters."""
     config = dataclasses.replace(backbone.Config.dummy(), dtype=dtype, remat=remat)
     graphdef, parameters = nnx.split(random_backbone(config))
     obs, actions = observation(config, 2), jnp.ones((2, config.chunk, config.action_dim))
@@ -109,29 +107,31 @@ def small_policy(backbone, dtype, remat):
 
 @ALLOW_TRITON
 @pytest.mark.parametrize("backbone", [pi0, smolvla], ids=["pi0", "smolvla"])
-@pytest.mark.parametrize("remat", ["none", "products", "full"])
+@pytest.mark.parametrize(
+    "remat",
+    [
+        pytest.param("none", marks=pytest.mark.slow),
+        "products",
+        pytest.param("full", marks=pytest.mark.slow),
+    ],
+)
 def test_kernels_in_a_policy(backbone, remat):
     """Of the scans over layers, only "full" has another forward kernel, in the backward pass."""
     loss, parameters = small_policy(backbone, "bfloat16", remat)
-    kernels = {}
-    for platform in ("cuda", "cpu"):
-        with target(platform):
-            traced = jax.jit(lambda p: jax.grad(loss)(p)).trace(parameters)
-            text = traced.lower(lowering_platforms=(platform,)).as_text()
-        names = ("forward", "backward")
-        kernels[platform] = [text.count(f'"short_attention_{name}"') for name in names]
+    with target("cuda"):
+        traced = jax.jit(jax.grad(loss)).trace(parameters)
+        text = traced.lower(lowering_platforms=("cuda",)).as_text()
+    kernels = [text.count(f'"short_attention_{name}"') for name in ("forward", "backward")]
     scans = {pi0: 3, smolvla: 4}[backbone]
-    assert kernels["cuda"] == [2 * scans if remat == "full" else scans, scans]
-    assert kernels["cpu"] == [0, 0]
+    assert kernels == [2 * scans if remat == "full" else scans, scans]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("backbone", [pi0, smolvla], ids=["pi0", "smolvla"])
 def test_kernels_change_a_policy_by_rounding_errors_only(backbone, monkeypatch):
-    """Loss and gradients are as close to those in fp32 as without the kernels."""
-    run = jax.jit(lambda loss, parameters: jax.value_and_grad(loss)(parameters), static_argnums=0)
-    exact = run(*small_policy(backbone, "float32", "none"))
-    xla = run(*small_policy(backbone, "bfloat16", "products"))
+    """XLA's own bf16 gradients differ as much from fp32: by up to 3% of a parameter's gradient."""
+    loss, parameters = small_policy(backbone, "bfloat16", "products")
+    expected = jax.jit(jax.value_and_grad(loss))(parameters)
     calls = []
 
     def interpreted(*arrays):
@@ -140,8 +140,9 @@ def test_kernels_change_a_policy_by_rounding_errors_only(backbone, monkeypatch):
 
     monkeypatch.setattr(module, "platform", lambda: "gpu")
     monkeypatch.setattr(module, "short_attention", interpreted)
-    kernels = run(*small_policy(backbone, "bfloat16", "products"))
+    actual = jax.jit(jax.value_and_grad(loss))(parameters)
     assert calls
-    for actual, reference, expected in zip(*map(jax.tree.leaves, (kernels, xla, exact)), strict=True):
-        error, rounding = (np.linalg.norm(a - expected) for a in (actual, reference))
-        assert error <= 1.5 * rounding + 1e-3 * np.linalg.norm(expected)
+    np.testing.assert_allclose(actual[0], expected[0], rtol=5e-3)
+    for a, b in zip(*map(jax.tree.leaves, (actual, expected)), strict=True):
+        # The gradient of a key's bias is 0, except for rounding errors.
+        assert np.linalg.norm(a - b) <= 0.04 * np.linalg.norm(b) + 1e-3
