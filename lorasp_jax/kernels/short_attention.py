@@ -7,6 +7,10 @@ row's softmax denominator (FlashAttention-2, Dao, arXiv 2307.08691).
 
 All sums run in a fixed order: two runs give the same bits, unlike cuDNN's backward pass. In that
 pass, one program handles all queries of a key head and sums the gradients of its keys and values.
+
+Forward and backward pass on an H200, bf16, batch size 128: small pi0's language model (138 tokens,
+8 heads of 32, one key head) takes 265 us, 398 in XLA and 355 in cuDNN; small SmolVLA's (43 tokens)
+50, 97 and 119; the vision tower of both (256 images, 64 patches, 4 heads of 64) 45, 92 and 133.
 """
 
 import functools
