@@ -67,7 +67,8 @@ def _execute(options: argparse.Namespace, console: Console) -> int:
     if not options.no_run:
         _run(options, board, folder, names, console)
     statuses = board.read()
-    _print(console, *listing.problems(names, statuses))
+    # Only after a run is it news that a cell still waits.
+    _print(console, *listing.problems(names, statuses, waiting=not options.no_run))
     path = _write(study, options.results or folder / results.RESULTS_FILE, statuses)
     _print(console, listing.totals(study, names, statuses), f"see {path}")
     return REFUSED if any(statuses[name].state in BROKEN for name in names) else 0

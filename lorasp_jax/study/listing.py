@@ -56,9 +56,9 @@ def totals(study: Study, names: Collection[str], statuses: Mapping[str, Status])
     return f"{study.name}: {', '.join(parts)}{time}"
 
 
-def problems(names: Collection[str], statuses: Mapping[str, Status]) -> list[str]:
-    """Return a line for every named cell that needs attention or waits."""
-    states = {*BROKEN, State.WAITING}
+def problems(names: Collection[str], statuses: Mapping[str, Status], *, waiting: bool) -> list[str]:
+    """Return a line for every named cell that needs attention and, if `waiting`, that waits."""
+    states = {*BROKEN, State.WAITING} if waiting else BROKEN
     return [
         f"{name}: {statuses[name].state} {statuses[name].reason}"
         for name in statuses

@@ -59,6 +59,7 @@ def test_parts_of_a_study(start, folder):
     code, text = start("--only", "lora/*")
     assert (code, ran(folder)) == (0, [])
     assert "lora/s0: waiting for sp/s0 (runnable), sp/s1 (runnable)" in text
+    assert "waiting for" not in start("--only", "lora/*", "--no-run")[1]
     assert start("--only", "sp/*")[0] == 0
     assert ran(folder) == ["sp/s0", "sp/s1"]
     assert start("--shard", "2/2")[0] == 0
