@@ -47,6 +47,8 @@ class ModelConfig:
     bundled tokenizer of the nano and small sizes."""
     max_tokens: int = 0
     """Maximum instruction length [tokens]; 0: the default of the model size."""
+    chunk: int = 0
+    """Actions per predicted chunk; 0: the default of the model size. No parameter depends on it."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Compute dtype of matrix products."""
     param_dtype: Literal["float32", "bfloat16"] = "float32"
@@ -69,7 +71,7 @@ class ModelConfig:
     def __post_init__(self) -> None:
         """Validate the fields."""
         _fields.check_fields(self)
-        _at_least(0, self, "max_tokens")
+        _at_least(0, self, "max_tokens", "chunk")
 
 
 @dataclass(frozen=True)
@@ -128,6 +130,9 @@ class OptimConfig:
     0.999; the average is then evaluated and exported. 0: no average."""
     state_noise: float = 0.02
     """Standard deviation of the noise added to normalized robot states during training."""
+    rtc_max_delay: int = 0
+    """Train for execution under latency (training-time real-time chunking): the first d actions of
+    each chunk are given, d uniform in 0, ..., this number of control steps. 0: none are."""
     max_skipped: int = 10
     """Stop after skipping this many consecutive steps (loss or gradient non-finite or spiking)."""
     spike: float = 0.0
@@ -139,7 +144,7 @@ class OptimConfig:
         _fields.check_fields(self)
         _at_least(1, self, "steps", "batch_size", "accumulate", "max_skipped")
         _at_least(0, self, "learning_rate", "final_learning_rate", "warmup_steps")
-        _at_least(0, self, "weight_decay", "state_noise")
+        _at_least(0, self, "weight_decay", "state_noise", "rtc_max_delay")
         if self.clip_norm <= 0:
             raise ValueError(f"clip_norm must be above 0, got {self.clip_norm}")
         if not 0 <= self.b2 < 1:

@@ -87,7 +87,7 @@ class Backbone(nnx.Module):
 
         Args:
             x_t: `[B, C, A]`.
-            flow_time: `[B]`.
+            flow_time: `[B]`, or `[B, C]` with one time per action.
             action_valid: `[B, C]` bool, False excludes an action from aux.
 
         Returns:
@@ -96,7 +96,7 @@ class Backbone(nnx.Module):
         aux: LayerAux = {}
         x_t, token_mask = x_t.astype(jnp.float32), action_valid
         h, aux["action_in_proj"] = self.action_in_proj(x_t, token_mask=token_mask, return_aux=True)
-        time = time_embedding(flow_time, h.shape[-1])[:, None]
+        time = time_embedding(flow_time, h.shape[-1])
         h = jnp.concatenate([h, jnp.broadcast_to(time, h.shape)], axis=-1)
         h, in_aux = self.action_time_mlp_in(h, token_mask=token_mask, return_aux=True)
         h = jax.nn.silu(h)
@@ -121,7 +121,7 @@ class Backbone(nnx.Module):
             prefix: result of `run_prefix` for `obs`.
             obs: the observation.
             x_t: `[B, C, A]`.
-            flow_time: `[B]`.
+            flow_time: `[B]`, or `[B, C]` with one time per action.
             action_valid: `[B, C]` bool, False excludes an action from aux.
         """
         raise NotImplementedError
@@ -150,7 +150,10 @@ class Backbone(nnx.Module):
         return tokens, valid, {"vision": aux}
 
     def velocity(self, obs: Observation, x_t: jax.Array, flow_time: jax.Array) -> jax.Array:
-        """Compute v_t `[B, C, A]` at x_t `[B, C, A]` and flow_time `[B]` (1 = noise, 0 = data)."""
+        """Compute v_t `[B, C, A]` at x_t `[B, C, A]` and flow_time (1 = noise, 0 = data).
+
+        `flow_time` is `[B]`, or `[B, C]` with one time per action.
+        """
         prefix, _ = self.run_prefix(obs)
         return self.run_suffix(prefix, obs, x_t, flow_time)[0]
 
@@ -174,7 +177,7 @@ class Backbone(nnx.Module):
                 loss. Slots that are never valid in a chunk are zero in x_t. Actions without valid
                 slots are excluded from the adapters' aux.
             noise: `[B, C, A]`.
-            flow_time: `[B]`.
+            flow_time: `[B]`, or `[B, C]` with one time per action; see `flow_matching.draw`.
 
         Returns:
             `[B, C, A]` f32 per-element squared errors, and the adapters' aux.

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 Velocity = Callable[[jax.Array, jax.Array], tuple[jax.Array, Any]]
-"""(x_t `[B, C, A]`, flow_time `[B]`) -> (v_t `[B, C, A]`, aux)."""
+"""(x_t `[B, C, A]`, flow_time `[B]` or `[B, C]`) -> (v_t `[B, C, A]`, aux)."""
 
 
 def sample_time(key: jax.Array, batch: int) -> jax.Array:
@@ -22,14 +22,33 @@ def sample_time(key: jax.Array, batch: int) -> jax.Array:
     return 0.999 * jax.random.uniform(key, (batch,)) ** (1 / 1.5) + 0.001
 
 
-def draw(key: jax.Array, actions: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Sample noise `[B, C, A]` f32 and flow times `[B]` for actions `[B, C, A]`.
+def draw(key: jax.Array, actions: jax.Array, max_delay: int = 0) -> tuple[jax.Array, jax.Array]:
+    """Sample noise `[B, C, A]` f32 and flow times for actions `[B, C, A]`.
 
     Do not reuse `key`.
+
+    Args:
+        key: typed PRNG key.
+        actions: only their shape matters.
+        max_delay: D of training-time real-time chunking (arXiv 2512.05964). If above 0, the first
+            d actions of a chunk have time 0: they are given without noise, as actions that the
+            robot already executes while it waits for the rest. d is uniform in 0, ..., D.
+
+    Returns:
+        The noise, and times `[B]`, or `[B, C]` if `max_delay` is above 0.
     """
     noise_key, time_key = jax.random.split(key)
     noise = jax.random.normal(noise_key, actions.shape)
-    return noise, sample_time(time_key, actions.shape[0])
+    time = sample_time(time_key, actions.shape[0])
+    if not max_delay:
+        return noise, time
+    delay = jax.random.randint(jax.random.fold_in(key, 2), time.shape, 0, max_delay + 1)
+    return noise, jnp.where(first(delay, actions.shape[1]), 0, time[:, None])
+
+
+def first(length: jax.Array, chunk: int) -> jax.Array:
+    """Mask the first `length` actions of a chunk, bool `[..., C]` for lengths `[...]`."""
+    return jnp.arange(chunk) < length[..., None]
 
 
 def interpolate(
@@ -40,9 +59,9 @@ def interpolate(
     Args:
         noise: `[B, C, A]`.
         actions: `[B, C, A]`.
-        flow_time: t, `[B]`.
+        flow_time: t, `[B]` or `[B, C]`.
     """
-    t = flow_time[:, None, None]
+    t = flow_time[:, None, None] if flow_time.ndim == 1 else flow_time[:, :, None]
     return t * noise + (1 - t) * actions, noise - actions
 
 
@@ -64,7 +83,7 @@ def loss(
         slots: bool broadcastable to `[B, C, A]`, False for unused slots, where x_t is zero. None
             uses all slots.
         noise: `[B, C, A]` standard normal.
-        flow_time: `[B]`.
+        flow_time: `[B]`, or `[B, C]` with one time per action.
 
     Returns:
         `[B, C, A]` f32, and the model's aux.

@@ -10,7 +10,7 @@ from flax import nnx
 
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.layers import prepared
-from lorasp_jax.models import flow_matching
+from lorasp_jax.models import flow_matching, real_time_chunking
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.transformer.depth import unstack
@@ -80,6 +80,9 @@ class Sampler:
         noise: jax.Array | None = None,
         slots: jax.Array | None = None,
         return_aux: bool = False,
+        prefix: jax.Array | None = None,
+        prefix_length: jax.Array | int = 0,
+        guidance: float | None = None,
     ) -> Any:
         """Sample action chunks.
 
@@ -91,9 +94,17 @@ class Sampler:
             slots: `[A]` bool, slots to sample; the others stay zero. None samples all slots.
             return_aux: also return the adapters' aux. `aux["action"]` has a step axis before the
                 layer axis. The aux of action layers that run only once is broadcast over steps.
+            prefix: `[B, P, A]` normalized actions that the chunk must continue, P from 1 to C: what
+                remains of the previous chunk. See `real_time_chunking.sample`.
+            prefix_length: d, `[]` or `[B]`, number of actions in the prefix that the robot executes
+                before it switches to the new chunk, from 0 to P.
+            guidance: β of guided real-time chunking; None: the policy is trained for prefixes.
 
         Returns:
             `[B, C, A]` f32 normalized actions, or (actions, aux).
+
+        Raises:
+            ValueError: the prefix has the wrong shape.
         """
         if noise is None:
             shape = (obs.state.shape[0], self.config.chunk, self.config.action_dim)
@@ -101,9 +112,13 @@ class Sampler:
         graphdefs, tree = self.structure
         states = jax.tree.unflatten(tree, self.weights)
         prefix_model, suffix_model = map(nnx.merge, graphdefs, states)
-        prefix, aux = prefix_model.run_prefix(obs)
-        actions, action_aux = flow_matching.sample(
-            lambda x_t, t: suffix_model.run_suffix(prefix, obs, x_t, t),
+        encoded, aux = prefix_model.run_prefix(obs)
+        sample = flow_matching.sample
+        if prefix is not None:
+            condition = {"prefix": prefix, "length": prefix_length, "guidance": guidance}
+            sample = functools.partial(real_time_chunking.sample, **condition)
+        actions, action_aux = sample(
+            lambda x_t, t: suffix_model.run_suffix(encoded, obs, x_t, t),
             noise,
             num_steps=num_steps,
             slots=slots,

@@ -40,6 +40,9 @@ class Policy:
         *,
         num_steps: int = 10,
         return_aux: bool = False,
+        previous: jax.Array | None = None,
+        prefix_length: jax.Array | int = 0,
+        guidance: float | None = None,
     ) -> Any:
         """Sample one action chunk per row; `key` is consumed.
 
@@ -49,16 +52,25 @@ class Policy:
             instruction: `[B]` int32, rows of the processor's prompt table.
             num_steps: Euler steps of the flow-matching sampler.
             return_aux: also return the adapters' `Aux`; see the backbone's `sample_actions`.
+            previous: `[B, P, J+1]` actions [rad, m] that the robot would execute from now on, which
+                the chunk then continues: real-time chunking, see `Sampler.sample_actions`.
+            prefix_length: number of these actions that the robot will execute in any case.
+            guidance: see `Sampler.sample_actions`.
 
         Returns:
             `[B, C, J+1]` f32 joint targets [rad] and gripper opening [m], or (chunk, aux).
         """
+        condition = {}
+        if previous is not None:
+            prefix = self.processor.normalize_actions(previous, observation["state"])
+            condition = {"prefix": prefix, "prefix_length": prefix_length, "guidance": guidance}
         chunk, aux = self.model.sample_actions(
             key,
             self.processor.encode(observation, instruction),
             num_steps=num_steps,
             slots=self.processor.flow_slots,
             return_aux=True,
+            **condition,
         )
         actions = self.processor.decode(chunk, observation["state"])
         return (actions, aux) if return_aux else actions

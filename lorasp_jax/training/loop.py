@@ -133,6 +133,7 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
         parts=optim.accumulate,
         ema=optim.ema,
         spike=optim.spike,
+        max_delay=optim.rtc_max_delay,
     )
     chunk = run.policy.model.config.chunk
     sample = functools.partial(sample_batch, batch_size=optim.batch_size, chunk=chunk)

@@ -38,12 +38,19 @@ STOPPED = "stopped.json"
 """File with the reason why training stopped; removed when training continues."""
 
 
+ADDED = (("model", "chunk"), ("optim", "rtc_max_delay"))
+"""Settings that earlier versions lack; like them, `to_json` omits those that are 0, the default."""
+
+
 def to_json(config: Config) -> dict[str, Any]:
     """Convert a config to JSON values, including the name of the adapter method.
 
     `scene` has only the ranges that differ from the defaults, and is absent if none do.
     """
     fields = json.loads(json.dumps(dataclasses.asdict(config)))
+    for group, name in ADDED:
+        if not fields[group][name]:
+            del fields[group][name]
     scene = fields.pop("scene")
     if changed := config.scene.changed():
         fields["scene"] = {name: scene[name] for name in changed}

@@ -102,7 +102,8 @@ def build(
     use_bundled = abstract and hub.is_remote(config.model.tokenizer)
     tokenizer = load_tokenizer("" if use_bundled else config.model.tokenizer)
     base, base_hash = load_base(config, abstract=abstract)
-    base = with_config(base, max_tokens=config.model.max_tokens or base.config.max_tokens)
+    chosen = {name: getattr(config.model, name) for name in ("max_tokens", "chunk")}
+    base = with_config(base, **{name: value for name, value in chosen.items() if value})
     source = open_dataset(config, base.config, folder) if config.data.source else None
     prompts, joints = _prompts_and_joints(source, environments, tokenizer, base.config)
     _check_sizes(config, base.config.chunk)
@@ -210,6 +211,10 @@ def _check_sizes(config: Config, chunk: int) -> None:
             f"{config.evaluation.execute_steps}"
         )
     optim, devices = config.optim, jax.device_count()
+    if optim.rtc_max_delay >= chunk:
+        raise ValueError(
+            f"optim.rtc_max_delay must be below the chunk length {chunk}, got {optim.rtc_max_delay}"
+        )
     if optim.batch_size % (devices * optim.accumulate):
         micro = f" x {optim.accumulate} micro-batches" if optim.accumulate > 1 else ""
         raise ValueError(

@@ -89,22 +89,25 @@ def loss_fn(
     valid: jax.Array | None = None,
     noise: jax.Array | None = None,
     flow_time: jax.Array | None = None,
+    max_delay: int = 0,
 ) -> tuple[jax.Array, Metrics]:
     """Return the flow-matching loss plus weighted auxiliary losses (arXiv 2603.07404, eq. 14).
 
-    The task loss is the mean over the elements that `batch.action_mask` marks as valid; `valid`
-    overrides their number. `key` seeds the adapters' dropout and the sampling of noise and flow
-    time; `noise` and `flow_time` override the samples. The metrics include the unweighted
-    auxiliary losses.
+    The task loss is the mean over the elements that `batch.action_mask` marks as valid, without
+    given actions (see `flow_matching.draw`); `valid` overrides their number. `key` seeds the
+    adapters' dropout and the sampling of noise and flow time; `noise` and `flow_time` override the
+    samples. The metrics include the unweighted auxiliary losses.
     """
     model = adaptation.with_dropout(nnx.merge(graphdef, adapters, frozen), key)
-    mask = batch.action_mask
+    if max_delay and flow_time is None:
+        noise, flow_time = flow_matching.draw(key, batch.actions, max_delay)
+    mask = _scored(batch, flow_time)
     valid = jnp.sum(mask) if valid is None else valid
     per_element, aux = model.loss(
         key,
         batch.observation,
         batch.actions,
-        action_mask=mask,
+        action_mask=batch.action_mask,
         noise=noise,
         flow_time=flow_time,
     )
@@ -112,6 +115,13 @@ def loss_fn(
     losses = auxiliary_losses(aux) | adaptation.penalties(model)
     total = task + sum(weights[name] * value for name, value in losses.items())
     return total, {"loss": total, "task": task, **losses, **active_ranks(aux)}
+
+
+def _scored(batch: Batch, flow_time: jax.Array | None) -> jax.Array:
+    """Return the mask `[B, C, A]` of the task loss; times per action are 0 for given actions."""
+    if flow_time is None or flow_time.ndim == 1:
+        return batch.action_mask
+    return batch.action_mask & (flow_time > 0)[..., None]
 
 
 def gradients(
@@ -122,18 +132,20 @@ def gradients(
     key: jax.Array,
     weights: Metrics,
     parts: int = 1,
+    max_delay: int = 0,
 ) -> tuple[Any, Metrics]:
     """Return the gradient and the metrics of `loss_fn`, accumulated over `parts` micro-batches.
 
     Up to rounding, the task loss is that of the whole batch. Auxiliary losses and active ranks are
-    means over the micro-batches.
+    means over the micro-batches. For `max_delay` see `flow_matching.draw`.
     """
     gradient = jax.grad(loss_fn, has_aux=True)
     if parts == 1:
-        return gradient(adapters, frozen, graphdef, batch, key, weights)
+        return gradient(adapters, frozen, graphdef, batch, key, weights, max_delay=max_delay)
     # Row i goes into micro-batch i % parts, so that no row moves to another device.
     split = lambda x: jnp.swapaxes(x.reshape(-1, parts, *x.shape[1:]), 0, 1)  # noqa: E731
-    valid = jnp.sum(batch.action_mask) / parts
+    drawn = flow_matching.draw(key, batch.actions, max_delay)
+    valid = jnp.sum(_scored(batch, drawn[1])) / parts
 
     def add(total: Any, part: Any) -> tuple[Any, Metrics]:
         rows, (noise, flow_time), part_key = part
@@ -142,7 +154,7 @@ def gradients(
         return jax.tree.map(jnp.add, total, grads), metrics
 
     zeros = jax.tree.map(jnp.zeros_like, adapters)
-    micro_batches = jax.tree.map(split, (batch, flow_matching.draw(key, batch.actions)))
+    micro_batches = jax.tree.map(split, (batch, drawn))
     total, metrics = jax.lax.scan(add, zeros, (*micro_batches, jax.random.split(key, parts)))
     mean = lambda tree: jax.tree.map(lambda x: x.mean(0), tree)  # noqa: E731
     return jax.tree.map(lambda x: x / parts, total), mean(metrics)
@@ -160,14 +172,15 @@ def train_step(
     parts: int = 1,
     ema: float = 0.0,
     spike: float = 0.0,
+    max_delay: int = 0,
 ) -> tuple[TrainState, Metrics]:
     """Take one step on the global batch, split into `parts` micro-batches; do not reuse `key`.
 
     `ema` is the decay factor of the moving average, if one is kept. A step that `guard.check_step`
-    rejects changes only the step count and the guard.
+    rejects changes only the step count and the guard. For `max_delay` see `flow_matching.draw`.
     """
     now = {name: jnp.asarray(schedule(state.step)) for name, schedule in weights.items()}
-    grads, metrics = gradients(state.adapters, frozen, graphdef, batch, key, now, parts)
+    grads, metrics = gradients(state.adapters, frozen, graphdef, batch, key, now, parts, max_delay)
     grad_norm = optax.tree.norm(grads)
     accept, guard = guards.check_step(state.guard, metrics["loss"], grad_norm, spike)
     updates, opt_state = optimizer.update(grads, state.opt_state, state.adapters)

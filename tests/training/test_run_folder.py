@@ -108,6 +108,22 @@ def test_resume_auto_starts_or_continues(tmp_path):
         open_run(CONFIG, tmp_path, resume="auto")
 
 
+def test_settings_that_earlier_versions_lack_are_recorded_only_if_used(tmp_path):
+    """So that runs from before these settings existed go on, and studies find them unchanged."""
+    plain = run_folder.to_json(CONFIG)
+    assert "rtc_max_delay" not in plain["optim"]
+    assert "chunk" not in plain["model"]
+    config = dataclasses.replace(
+        CONFIG,
+        optim=dataclasses.replace(CONFIG.optim, rtc_max_delay=3),
+        model=dataclasses.replace(CONFIG.model, chunk=16),
+    )
+    used = run_folder.to_json(config)
+    assert (used["optim"]["rtc_max_delay"], used["model"]["chunk"]) == (3, 16)
+    assert run_folder.changed_settings(plain, used) == ["model.chunk", "optim.rtc_max_delay"]
+    assert not run_folder.changed_settings(plain, run_folder.to_json(CONFIG))
+
+
 def test_only_ranges_that_change_something_are_recorded(tmp_path):
     """So that runs from before a range existed go on."""
     assert "scene" not in run_folder.to_json(CONFIG)

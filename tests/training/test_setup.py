@@ -30,7 +30,7 @@ from lorasp_jax.training.overrides import override
 from lorasp_jax.training.run import Run
 from tests import GOLDEN
 from tests.data.lerobots import golden
-from tests.models.random_models import random_backbone
+from tests.models.random_models import observation, random_backbone
 from tests.runs import CONFIG, leaves, random_episodes
 
 TARGETS = ("patch_embed", "language.*q_proj", "action_out_proj")
@@ -115,6 +115,18 @@ def test_lerobot_policies_are_preprocessed_as_their_config_says(config, tmp_path
     found = random_backbone(dataclasses.replace(Pi0Config.dummy(), inputs=two_arms))
     with pytest.raises(ValueError, match="has 14 entries, but the robot's actions have 7"):
         prepare(config, tmp_path, load_base=lambda *_, **__: (found, ""))
+
+
+def test_the_chunk_length_on_the_command_line(config, tmp_path):
+    """It limits how many actions can be given in training."""
+    longer = override(config, ["--model.chunk", "6", "--optim.rtc-max-delay", "5"])
+    longer = override(longer, ["--peft.initialization", "kaiming"])
+    run = prepare(longer, tmp_path)
+    model, obs = run.policy.model, observation(run.policy.model.config, 2)
+    chunk = jax.eval_shape(lambda: model.sample_actions(jax.random.key(0), obs))
+    assert chunk.shape == (2, 6, 8)
+    with pytest.raises(ValueError, match="rtc_max_delay must be below the chunk length 4, got 5"):
+        prepare(override(longer, ["--model.chunk", "0"]), tmp_path)
 
 
 def test_unrolling_on_the_command_line(monkeypatch):

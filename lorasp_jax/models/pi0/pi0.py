@@ -237,14 +237,14 @@ class Pi05(Pi0):
         return h, {"action_in_proj": aux}
 
     def norm_condition(self, flow_time: jax.Array) -> tuple[jax.Array, LayerAux]:
-        """Embed flow times `[B]` as the condition for adaptive norms.
+        """Embed flow times as the condition for adaptive norms.
 
         Returns:
-            `[B, 1, D]` f32, and the adapters' aux.
+            `[B, 1, D]` f32 for times `[B]`, `[B, C, D]` for times `[B, C]`, and the adapters' aux.
         """
         aux: LayerAux = {}
-        valid = jnp.ones((flow_time.shape[0], 1), bool)
-        h = time_embedding(flow_time, self.config.action.width)[:, None]
+        h = time_embedding(flow_time, self.config.action.width)
+        valid = jnp.ones(h.shape[:2], bool)
         h, aux["time_mlp_in"] = self.time_mlp_in(h, token_mask=valid, return_aux=True)
         h = jax.nn.silu(h)
         h, aux["time_mlp_out"] = self.time_mlp_out(h, token_mask=valid, return_aux=True)

@@ -99,7 +99,7 @@ class ExpertBlock(nnx.Module):
             mask: `[B, T, S + T]` bool over the cached keys followed by this layer's keys.
             cache: keys and values of preceding tokens, or None (S = 0).
             token_mask: `[B, T]` bool, False excludes a token from aux.
-            condition: `[B, 1, D]` for adaptive norms, or None.
+            condition: `[B, 1, D]` or `[B, T, D]` for adaptive norms, or None.
 
         Returns:
             x, and a pair: this layer's keys and values, and the adapters' aux.
@@ -169,7 +169,7 @@ class Expert(nnx.Module):
             mask: `[B, T, S + T]` bool over the cached keys followed by this expert's keys.
             cache: keys and values `[L, B, S, K, H]` of preceding tokens, or None (S = 0).
             token_mask: `[B, T]` bool, False excludes a token from aux.
-            condition: `[B, 1, D]` for adaptive norms, or None.
+            condition: `[B, 1, D]` or `[B, T, D]` for adaptive norms, or None.
 
         Returns:
             `[B, T, D]`, this expert's keys and values `[L, B, T, K, H]`, and the adapters' aux,

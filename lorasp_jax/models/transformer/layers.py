@@ -81,10 +81,11 @@ class AdaptiveRMSNorm(nnx.Module):
 
         Args:
             x: `[B, T, D]`.
-            condition: `[B, 1, D]`.
+            condition: `[B, 1, D]`, or `[B, T, D]` with one condition per token.
 
         Returns:
-            y `[B, T, D]` and gate `[B, 1, D]` in the dtype of x, and the aux of `dense`.
+            y `[B, T, D]` and the gate, shaped like the condition, in the dtype of x, and the aux
+            of `dense`.
         """
         assert condition is not None  # models with adaptive norms always pass one
         valid = jnp.ones(condition.shape[:2], bool)
@@ -205,11 +206,15 @@ def rope(x: jax.Array, table: tuple[jax.Array, jax.Array], scale: float = 1.0) -
 
 
 def time_embedding(flow_time: jax.Array, width: int) -> jax.Array:
-    """Compute sinusoidal embeddings `[B, width]` f32 of times `[B]`, with periods from 4e-3 to 4.
+    """Compute sinusoidal embeddings of flow times, with periods from 4e-3 to 4.
 
     Sines come first, then cosines. The periods match openpi's `create_sinusoidal_pos_embedding`
     (models/pi0.py).
+
+    Returns:
+        f32 `[B, 1, width]` for times `[B]`, `[B, C, width]` for times `[B, C]`.
     """
     period = 4e-3 * (4.0 / 4e-3) ** np.linspace(0, 1, width // 2)
-    angle = flow_time[:, None].astype(jnp.float32) * (2 * math.pi / period).astype(np.float32)
-    return jnp.concatenate([jnp.sin(angle), jnp.cos(angle)], axis=-1)
+    angle = flow_time[..., None].astype(jnp.float32) * (2 * math.pi / period).astype(np.float32)
+    embedding = jnp.concatenate([jnp.sin(angle), jnp.cos(angle)], axis=-1)
+    return embedding[:, None] if flow_time.ndim == 1 else embedding

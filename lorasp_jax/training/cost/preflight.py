@@ -147,7 +147,8 @@ def abstract_step(config: Config, backbone: BackboneConfig, batch_size: int) -> 
     weights: Any = dict.fromkeys(auxiliary_weights(config.auxiliary, 1), 0.0)
 
     def loss(adapters: Any, frozen: Any, batch: Batch) -> tuple[jax.Array, Metrics]:
-        return loss_fn(adapters, frozen, graphdef, batch, jax.random.key(0), weights)
+        key, delay = jax.random.key(0), config.optim.rtc_max_delay
+        return loss_fn(adapters, frozen, graphdef, batch, key, weights, max_delay=delay)
 
     return AbstractStep(loss, adapters, frozen, abstract_batch(backbone, batch_size))
 

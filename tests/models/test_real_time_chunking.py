@@ -1,0 +1,175 @@
+"""Continuing the previous chunk, trained and guided, and flow times per action."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lorasp_jax.models import flow_matching, real_time_chunking
+from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.models.smolvla import SmolVLAConfig
+from tests.models.random_models import observation, random_backbone
+
+CONFIGS = {
+    "pi0": Pi0Config.dummy(),
+    "pi05": dataclasses.replace(Pi0Config.dummy(), pi05=True),
+    "smolvla": SmolVLAConfig.dummy(),
+}
+BATCH, STEPS = 2, 3
+SHAPE = (BATCH, CONFIGS["pi0"].chunk, CONFIGS["pi0"].action_dim)
+NOISE, PREVIOUS = (jax.random.normal(jax.random.key(i), SHAPE) for i in (1, 2))
+
+
+@pytest.fixture(scope="module", params=CONFIGS)
+def model(request):
+    return random_backbone(CONFIGS[request.param])
+
+
+@pytest.fixture(scope="module")
+def obs(model):
+    return observation(model.config, BATCH)
+
+
+@pytest.fixture(scope="module")
+def sample(model, obs):
+    """(prefix, d) -> chunk; d is traced."""
+
+    def sample(prefix, length, guidance=None):
+        options = {"prefix": prefix, "prefix_length": length, "guidance": guidance}
+        key = jax.random.key(0)
+        return sampler.sample_actions(key, obs, num_steps=STEPS, noise=NOISE, **options)
+
+    sampler = model.sampler()
+    return jax.jit(sample, static_argnums=2)
+
+
+def test_equal_times_per_action_are_one_time(model, obs):
+    velocity, time = jax.jit(model.velocity), jnp.array([0.3, 0.9])
+    expected = velocity(obs, NOISE, time)
+    found = velocity(obs, NOISE, jnp.broadcast_to(time[:, None], SHAPE[:2]))
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    other = velocity(obs, NOISE, jnp.array([[0.3, 0.3, 0.3, 0.5], [0.9, 0.9, 0.9, 0.9]]))
+    assert np.abs(other - expected)[0, 3].max() > 1e-3
+    np.testing.assert_allclose(other[1], expected[1], atol=1e-6)
+
+
+def test_without_delay_sampling_is_as_without_prefix(model, obs, sample):
+    plain = jax.jit(lambda m: m.sample_actions(None, obs, num_steps=STEPS, noise=NOISE))
+    np.testing.assert_allclose(sample(PREVIOUS, 0), plain(model), atol=1e-6)
+
+
+def test_a_trained_policy_continues_the_prefix(sample):
+    """The chunk starts with the given actions; later ones depend on these, but on no others."""
+    chunks = {d: np.asarray(sample(PREVIOUS, d)) for d in range(SHAPE[1] + 1)}
+    assert sample._cache_size() == 1  # d is traced
+    for d, chunk in chunks.items():
+        np.testing.assert_array_equal(chunk[:, :d], PREVIOUS[:, :d])
+        if d < SHAPE[1]:
+            assert (chunk[:, d] != PREVIOUS[:, d]).any()
+    later = PREVIOUS.at[:, 2:].add(1)
+    np.testing.assert_array_equal(sample(later, 2), chunks[2])
+    earlier = PREVIOUS.at[:, 0].add(1)
+    assert (np.abs(sample(earlier, 2) - chunks[2])[:, 2:].max(-1) > 1e-4).all()
+
+
+def test_each_row_may_have_its_own_delay(sample):
+    found = sample(PREVIOUS, jnp.array([1, 3]))
+    for row, d in enumerate((1, 3)):
+        np.testing.assert_allclose(found[row], sample(PREVIOUS, d)[row], atol=1e-6)
+
+
+def test_a_guided_chunk_equals_the_papers_algorithm(model, obs, sample):
+    """Eqs. 1 to 5 in the paper's time, with gradients through the whole model."""
+    overlap, d, beta = 3, 1, 2.0
+    target = np.zeros(SHAPE, np.float32)
+    target[:, :overlap] = PREVIOUS[:, :overlap]
+    c = [(overlap - i) / (overlap - d + 1) for i in range(overlap)]
+    decay = [c[i] * (math.e ** c[i] - 1) / (math.e - 1) for i in range(d, overlap)]
+    weights = np.array([1.0] * d + decay + [0.0] * (SHAPE[1] - overlap), np.float32)
+
+    @jax.jit
+    def correction(actions, tau):
+        time = jnp.full(BATCH, 1 - tau)
+        estimate = lambda a: a - (1 - tau) * model.velocity(obs, a, time)  # noqa: E731
+        value, vjp = jax.vjp(estimate, actions)
+        return -model.velocity(obs, actions, time), vjp(weights[:, None] * (target - value))[0]
+
+    actions = NOISE
+    for tau in np.arange(STEPS) / STEPS:
+        v, gradient = correction(actions, tau)
+        r2 = (1 - tau) ** 2 / (tau**2 + (1 - tau) ** 2)
+        weight = min(beta, (1 - tau) / (tau * r2)) if tau else beta
+        actions = actions + (v + weight * gradient) / STEPS
+    found = sample(PREVIOUS[:, :overlap], d, beta)
+    np.testing.assert_allclose(found, actions, rtol=1e-4, atol=1e-4)
+    assert np.abs(found - sample(PREVIOUS[:, :overlap], d, 0.0)).max() > 1e-2
+
+
+@pytest.mark.parametrize("limit", [0.5, 5.0])
+def test_guidance_of_a_linear_velocity_in_float64(limit):
+    """v = M x + t, whose Jacobian is M, over the flattened chunk; some slots are unused."""
+    rng, steps, overlap, d = np.random.default_rng(0), 7, 3, 2
+    shape = (1, 4, 3)
+    matrix, slots = 0.3 * rng.normal(size=(12, 12)), np.array([True, False, True])
+    noise, previous = rng.normal(size=(2, *shape))
+    flat = jnp.asarray(matrix, jnp.float32)
+
+    def velocity(x_t, time):
+        return (flat @ x_t.reshape(12)).reshape(shape) + time[:, None, None], None
+
+    found, _ = real_time_chunking.sample(
+        velocity,
+        jnp.asarray(noise),
+        prefix=jnp.asarray(previous[:, :overlap]),
+        length=jnp.int32(d),
+        guidance=limit,
+        num_steps=steps,
+        slots=jnp.asarray(slots),
+    )
+    used = np.tile(slots, 4)
+    weights = np.repeat([1, 1, 0.5 * (math.e**0.5 - 1) / (math.e - 1), 0], 3) * used
+    x = noise.reshape(12) * used
+    for t in 1 - np.arange(steps) / steps:
+        v = matrix @ x + t
+        error = weights * (previous.reshape(12) - (x - t * v))
+        gradient = (np.eye(12) - t * matrix).T @ error
+        weight = min(limit, (t**2 + (1 - t) ** 2) / (t * (1 - t))) if t < 1 else limit
+        x = (x - (v - weight * gradient) / steps) * used
+    np.testing.assert_allclose(np.asarray(found).reshape(12), x, atol=1e-5)
+
+
+def test_soft_mask():
+    """Ones, a decay from below one to above zero, zeros; a hard mask if nothing else overlaps."""
+    mask = np.asarray(real_time_chunking.soft_mask(jnp.array([0, 2, 6]), 6, 8))
+    np.testing.assert_array_equal(mask[1, :2], 1)
+    np.testing.assert_array_equal(mask[:, 6:], 0)
+    assert (np.diff(mask[0, :7]) < 0).all()
+    assert 0 < mask[0, 5] < mask[0, 0] < 1
+    np.testing.assert_array_equal(mask[2, :6], 1)
+
+
+def test_times_of_training():
+    """The first d actions have time 0, with d uniform; without a delay, there is one time a row."""
+    actions, key = jnp.zeros((3000, 5, 2)), jax.random.key(0)
+    noise, time = flow_matching.draw(key, actions)
+    assert time.shape == (3000,)
+    same_noise, times = flow_matching.draw(key, actions, 3)
+    np.testing.assert_array_equal(noise, same_noise)
+    delay = np.asarray((times == 0).sum(1))
+    np.testing.assert_allclose(np.bincount(delay, minlength=6)[:4] / 3000, 0.25, atol=0.03)
+    assert delay.max() == 3
+    expected = np.where(np.arange(5) < delay[:, None], 0, np.asarray(time)[:, None])
+    np.testing.assert_array_equal(times, expected)
+    data = jax.random.normal(key, (3000, 5, 2))
+    x_t, _ = flow_matching.interpolate(noise, data, times)
+    np.testing.assert_array_equal((x_t == data).all(2), expected == 0)
+
+
+def test_wrong_prefixes_are_refused():
+    options = {"length": jnp.int32(0), "guidance": None, "num_steps": 1}
+    for shape in ((BATCH, 5, 8), (BATCH, 0, 8), (1, 4, 8), (BATCH, 4, 7)):
+        with pytest.raises(ValueError, match=r"shape \(2, P, 8\) with P from 1 to 4, got \("):
+            real_time_chunking.sample(None, NOISE, prefix=jnp.zeros(shape), **options)
