@@ -24,6 +24,7 @@ PACKAGES = [
     "lorasp_jax.evaluation",
     "lorasp_jax.report",
     "lorasp_jax.study",
+    "lorasp_jax.serving",
     "lorasp_jax.cli",
 ]
 PRIVATE = re.compile(r"(jax|flax|optax|orbax)(\..*)?\._|jaxlib\b|jax\.interpreters\b")

@@ -1,4 +1,4 @@
-"""The console command: `lorasp-jax train | study | envs | data | report | completion`."""
+"""The console command: `lorasp-jax train | study | envs | data | report | serve | completion`."""
 
 import argparse
 import importlib
@@ -19,6 +19,7 @@ COMMANDS = {
         "lorasp_jax.report.__main__",
         "rebuild the report of a run, or film its active ranks",
     ),
+    "serve": ("lorasp_jax.serving.__main__", "serve a policy to robots over websockets"),
     "completion": ("lorasp_jax.cli.completion", "print a shell completion script"),
 }
 """Module and help text of each command. A module has `main(arguments, program)`, which returns the

@@ -102,6 +102,25 @@ class PromptTable:
         start = Ids(*(array[rows] for array in self.start))
         return dataclasses.replace(self, start=start, instructions=tuple(instructions))
 
+    def with_instructions(self, words: Tokenizer, instructions: Sequence[str]) -> "PromptTable":
+        """Return a table of other instructions, as long as these.
+
+        Args:
+            words: the tokenizer that the table was made with.
+            instructions: P strings.
+
+        Raises:
+            ValueError: the tokenizer rejects an instruction.
+        """
+        max_tokens = self.start.ids.shape[1]
+        if self.numbers is None:
+            start = words.encode(instructions, max_tokens)
+        else:
+            starts = [prompts.pi05_start(text) for text in instructions]
+            ids, mask = _encode_complete(words, starts, max_tokens)
+            start = ids[:, :max_tokens], mask[:, :max_tokens]
+        return dataclasses.replace(self, start=_ids(*start), instructions=tuple(instructions))
+
     def encode(self, instruction: jax.Array, state: jax.Array) -> Ids:
         """Return the prompts `[B, T]`.
 

@@ -93,11 +93,7 @@ def load_policy(
             differs from the one used in training.
     """
     folder = Path(folder)
-    is_full = (folder / BASE).is_dir()
-    path = folder / BASE / TRAINING if is_full else folder / native.DESCRIPTION
-    if not path.is_file():
-        raise ValueError(f"{folder} contains no policy: no run has finished there")
-    metadata = read_json(path) if is_full else native.read_description(folder)["metadata"]
+    metadata, path, is_full = _read_metadata(folder)
     try:
         policy = metadata["policy"]
         config = backbone.find(policy["backbone"]).from_dict(policy["config"])
@@ -117,6 +113,25 @@ def load_policy(
         return Policy(model, _processor(policy, config, words))
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path} does not describe a policy") from error
+
+
+def describe(folder: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return what a finished run recorded about its policy: robot, tasks, periods, processor.
+
+    Raises:
+        ValueError: the run is not finished, or its files are corrupt.
+    """
+    return _read_metadata(Path(folder))[0]
+
+
+def _read_metadata(folder: Path) -> tuple[dict[str, Any], Path, bool]:
+    """Return a run's metadata, their file, and whether the run trained its base."""
+    is_full = (folder / BASE).is_dir()
+    path = folder / BASE / TRAINING if is_full else folder / native.DESCRIPTION
+    if not path.is_file():
+        raise ValueError(f"{folder} contains no policy: no run has finished there")
+    metadata = read_json(path) if is_full else native.read_description(folder)["metadata"]
+    return metadata, path, is_full
 
 
 def _processor(policy: Mapping[str, Any], config: Any, words: str) -> Processor:

@@ -1,0 +1,6 @@
+"""Serve policies over websockets in openpi's protocol, and ask such servers for actions.
+
+    python -m lorasp_jax.serving runs/NAME
+
+`client` and `wire` need only NumPy, msgpack and websockets.
+"""

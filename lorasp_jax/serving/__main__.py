@@ -1,0 +1,179 @@
+"""Serve a policy: `python -m lorasp_jax.serving runs/NAME`."""
+
+import argparse
+import asyncio
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from envs.cli.errors import parse_arguments, run_command
+
+
+def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.serving") -> int:
+    """Serve until SIGINT or SIGTERM; return the exit code, one of `envs.cli.errors`."""
+    options = parse_arguments(parser(program), arguments)
+    console = Console(stderr=True)
+    return run_command(lambda: _serve(options, Console()), console)
+
+
+def parser(program: str) -> argparse.ArgumentParser:
+    """Return the argument parser of this command."""
+    parser = argparse.ArgumentParser(
+        prog=program,
+        description="Serve a policy over websockets, in openpi's protocol.",
+        epilog="Pages on the same port: /healthz and /metrics. See docs/serving.md.",
+    )
+    add = parser.add_argument
+    add(
+        "policy",
+        nargs="+",
+        metavar="[NAME=]POLICY",
+        help="folder of a finished run, or a published checkpoint (folder, hf://owner/name or "
+        "gs://bucket/folder). Several runs: requests choose by NAME, the first is the default",
+    )
+    add("--host", default="127.0.0.1", help="address to listen on; others than the default need a "
+        "token (default: %(default)s)")  # fmt: skip
+    add("--port", type=int, default=8000, help="default: %(default)s")
+    add(
+        "--token-file", type=Path, metavar="FILE", help="file with the token that clients must send"
+    )
+    add("--certificate", type=Path, metavar="FILE", help="PEM certificate chain, for wss://")
+    add("--key", type=Path, metavar="FILE", help="PEM private key of the certificate")
+    add("--prompt", default="", help="instruction of requests that have none")
+    add("--max-batch", type=int, default=8, help="largest batch (default: %(default)s)")
+    add("--num-steps", type=int, default=10, help="flow steps (default: %(default)s)")
+    add("--seed", type=int, default=0, help="seed of the flow's noise (default: %(default)s)")
+    add("--base", default="", help="the run's base, if it has moved")
+    add("--tokenizer", default="", help="the policy's tokenizer; runs record theirs")
+    checkpoint = parser.add_argument_group("published checkpoints").add_argument
+    checkpoint(
+        "--statistics", default="", help="normalization statistics, if not in the checkpoint"
+    )
+    checkpoint("--dataset", default="", help="which statistics, if there are several")
+    checkpoint("--joints", type=int, default=0, help="the robot's number of joints")
+    checkpoint("--size", default="", help="size of an openpi checkpoint, such as base_pi05")
+    checkpoint("--dtype", default="", choices=("", "float32", "bfloat16"), help="of the weights")
+    pair = {"action": "append", "default": [], "metavar": "NAME=VALUE"}
+    checkpoint("--camera", **pair, help="the backbone's camera = the robot's camera, repeatedly")
+    checkpoint("--adapter", **pair, help="name = adapter folder, repeatedly; see docs/serving.md")
+    return parser
+
+
+def _serve(options: argparse.Namespace, console: Console) -> None:
+    from lorasp_jax.serving import server
+
+    token = _read_token(options.token_file)
+    server.check_exposure(options.host, token)
+    if bool(options.certificate) != bool(options.key):
+        raise ValueError("--certificate and --key must be given together")
+    tls = server.tls_context(options.certificate, options.key) if options.key else None
+    policy, metadata = _load(options, console)
+    asyncio.run(_run(server.PolicyServer(policy, metadata, token=token), options, tls, console))
+
+
+async def _run(policy_server: Any, options: argparse.Namespace, tls: Any, console: Console) -> None:
+    """Serve until SIGINT or SIGTERM."""
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    async with policy_server.listen(options.host, options.port, tls=tls) as listening:
+        port = listening.sockets[0].getsockname()[1]
+        scheme = "wss" if tls else "ws"
+        _say(console, f"listening on {scheme}://{options.host}:{port}")
+        await stop.wait()
+        _say(console, "closing connections")
+    policy_server.close()
+
+
+def _load(options: argparse.Namespace, console: Console) -> tuple[Any, dict[str, Any]]:
+    """Load and compile the policies, saying what takes long."""
+    from envs.compilation import cache
+    from lorasp_jax.serving import loading
+    from lorasp_jax.serving.policies import CompiledPolicies, batch_sizes
+
+    sizes, start = batch_sizes(options.max_batch), time.monotonic()
+    named = dict(map(_named, options.policy))
+    if len(named) < len(options.policy):
+        raise ValueError("the policies must have different names: pass NAME=POLICY")
+    cache.enable()
+    _say(console, f"loading {', '.join(named.values())}")
+    if all(map(loading.is_run, named.values())):
+        loaded = loading.load_runs(named, base=options.base, words=options.tokenizer)
+    elif len(named) == 1:
+        loaded = loading.load_checkpoint(_checkpoint(options, *named.values()))
+    else:
+        raise ValueError("several policies must all be folders of finished runs")
+    policy = CompiledPolicies(
+        loaded.policies,
+        loaded.words,
+        prompt=options.prompt,
+        max_batch=options.max_batch,
+        num_steps=options.num_steps,
+        seed=options.seed,
+    )
+    loaded.policies.clear()  # the prepared weights are copies
+    names = policy.adapters
+
+    def report(name: str, size: int) -> None:
+        step = names.index(name) * len(sizes) + sizes.index(size) + 1
+        _say(console, f"compiling {name}, batch {size} ({step} of {len(names) * len(sizes)})")
+
+    policy.warm_up(report)
+    _say(console, f"ready after {time.monotonic() - start:.0f} s")
+    return policy, loaded.metadata
+
+
+def _checkpoint(options: argparse.Namespace, where: str) -> Any:
+    from lorasp_jax.serving.loading import Checkpoint
+
+    return Checkpoint(
+        where,
+        tokenizer=options.tokenizer,
+        statistics=options.statistics,
+        dataset=options.dataset,
+        joints=options.joints,
+        size=options.size,
+        dtype=options.dtype,
+        cameras=dict(map(_pair, options.camera)),
+        adapters=dict(map(_pair, options.adapter)),
+    )
+
+
+def _named(text: str) -> tuple[str, str]:
+    """Split NAME=POLICY; without a name, the last part of the path is the name."""
+    name, equals, where = text.partition("=")
+    return (name, where) if equals else (Path(text).name, text)
+
+
+def _pair(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not (name and equals and value):
+        raise ValueError(f"expected NAME=VALUE, got {text!r}")
+    return name, value
+
+
+def _read_token(path: Path | None) -> str:
+    """Read the token, without a final newline.
+
+    Raises:
+        ValueError: the file is empty or not text.
+    """
+    if path is None:
+        return ""
+    token = path.read_text().strip()
+    if not token or not token.isascii() or not token.isprintable():
+        raise ValueError(f"{path} must contain a token of printable ASCII characters")
+    return token
+
+
+def _say(console: Console, text: str) -> None:
+    console.print(text, soft_wrap=True, highlight=False, markup=False)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

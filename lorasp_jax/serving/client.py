@@ -1,0 +1,149 @@
+"""Ask a policy server for actions, from a robot or a script.
+
+    with PolicyClient("ws://127.0.0.1:8000") as policy:
+        policy.reset()
+        reply = policy.infer({"image": {"side": ..., "wrist": ...}, "state": ..., "prompt": "..."})
+        reply["actions"]  # [C, J+1]
+
+Needs only NumPy, msgpack and websockets. Works with openpi's servers too.
+"""
+
+import contextlib
+import ssl
+import time
+from collections.abc import Mapping
+from typing import Any, Self
+
+from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
+from websockets.sync.client import ClientConnection, connect
+
+from lorasp_jax.serving import wire
+
+RETRY_EVERY = 0.2
+"""Time between attempts to connect [s]."""
+
+
+class PolicyError(RuntimeError):
+    """The server refused a request or failed; the message is the server's sentence."""
+
+
+class ServerGone(ConnectionError):
+    """There is no server, it closed the connection, or it did not reply in time."""
+
+
+class PolicyClient:
+    """A connection to a policy server. Not thread-safe.
+
+    Attributes:
+        metadata: the server's description of its policy.
+    """
+
+    def __init__(
+        self,
+        address: str = "ws://127.0.0.1:8000",
+        *,
+        token: str = "",
+        certificate: str = "",
+        timeout: float = 10.0,
+        wait: float = 0.0,
+    ) -> None:
+        """Connect to a server.
+
+        Args:
+            address: ws://host:port or wss://host:port.
+            token: the server's token, if it requires one.
+            certificate: path of a PEM file to trust in addition to the system's certificates.
+            timeout: how long to wait for the connection and for each reply [s].
+            wait: how long to try again if there is no server yet [s].
+
+        Raises:
+            ServerGone: there is no server at this address, it requires another token, or its
+                certificate is not trusted.
+        """
+        self.address, self._timeout, self._reset = address, timeout, False
+        self._exit = contextlib.ExitStack()
+        context = ssl.create_default_context(cafile=certificate or None)
+        self._options: dict[str, Any] = {
+            "additional_headers": {"Authorization": f"Api-Key {token}"} if token else {},
+            "ssl": context if address.startswith("wss:") else None,
+            "compression": None,
+            "max_size": wire.MAX_FRAME,
+            "open_timeout": timeout,
+            "close_timeout": 1,
+            "proxy": None,
+        }
+        self._socket = self._connect(time.monotonic() + wait)
+        self.metadata: dict[str, Any] = self._receive(timeout)
+
+    def infer(self, observation: Mapping[str, Any], *, timeout: float | None = None) -> dict:
+        """Return the server's reply: `actions` `[C, J+1]` f32, and timings [ms].
+
+        Args:
+            observation: one of the server's request forms; may have the key `adapter`.
+            timeout: how long to wait for the reply [s]; None is the client's default.
+
+        Raises:
+            PolicyError: the server refused the observation. It then closes the connection.
+            ServerGone: the connection is lost, or no reply came in time. The connection is closed,
+                since a late reply could be mistaken for the next one.
+            TypeError: the observation contains something else than numbers, text and arrays.
+        """
+        extra = {"reset": True} if self._reset else {}
+        frame = wire.pack({**observation, **extra})
+        try:
+            self._socket.send(frame)
+        except ConnectionClosed as error:
+            raise self._gone(error) from error
+        reply = self._receive(self._timeout if timeout is None else timeout)
+        self._reset = False
+        return reply
+
+    def reset(self) -> None:
+        """Tell the server with the next request that a new episode starts."""
+        self._reset = True
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._exit.close()
+
+    def __enter__(self) -> Self:
+        """Return the client."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the connection."""
+        self.close()
+
+    def _connect(self, deadline: float) -> ClientConnection:
+        """Connect, trying again until the deadline while the address refuses connections."""
+        while True:
+            try:
+                return self._exit.enter_context(connect(self.address, **self._options))
+            except ConnectionRefusedError as error:
+                if time.monotonic() > deadline:
+                    raise ServerGone(f"no policy server at {self.address}: {error}") from error
+                time.sleep(RETRY_EVERY)
+            except InvalidStatus as error:
+                code, body = error.response.status_code, error.response.body or b""
+                text = body.decode(errors="replace").strip()
+                message = f"{self.address} refused the connection ({code}): {text}"
+                raise ServerGone(message) from error
+            except (OSError, WebSocketException) as error:
+                raise ServerGone(f"no policy server at {self.address}: {error}") from error
+
+    def _receive(self, timeout: float) -> dict[str, Any]:
+        try:
+            frame = self._socket.recv(timeout)
+        except TimeoutError as error:
+            self.close()
+            raise ServerGone(f"{self.address} did not reply within {timeout:g} s") from error
+        except ConnectionClosed as error:
+            raise self._gone(error) from error
+        if isinstance(frame, str):
+            self.close()
+            raise PolicyError(frame)
+        return wire.unpack(frame)
+
+    def _gone(self, error: ConnectionClosed) -> ServerGone:
+        reason = error.rcvd.reason if error.rcvd else ""
+        return ServerGone(f"{self.address} closed the connection{reason and ': '}{reason}")

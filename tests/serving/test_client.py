@@ -1,0 +1,79 @@
+"""Test the client against servers that are late, slow or gone."""
+
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from lorasp_jax.serving.client import PolicyClient, ServerGone
+from tests import ROOT
+from tests.serving.stand_in import StandIn, connect, observation, serving
+
+
+@pytest.fixture
+def free_port():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        return taken.getsockname()[1]
+
+
+def test_no_server(free_port):
+    with pytest.raises(ServerGone, match=f"^no policy server at ws://127.0.0.1:{free_port}: "):
+        PolicyClient(f"ws://127.0.0.1:{free_port}")
+
+
+@pytest.mark.parametrize("address", ["nonsense", "http://127.0.0.1:1", "ws://127.0.0.1:x"])
+def test_addresses_that_are_none(address):
+    with pytest.raises((ServerGone, ValueError)):
+        PolicyClient(address)
+
+
+def test_waiting_for_a_server(free_port):
+    clients = []
+    address = f"ws://127.0.0.1:{free_port}"
+    thread = threading.Thread(target=lambda: clients.append(PolicyClient(address, wait=30)))
+    thread.start()
+    time.sleep(0.5)
+    with serving(StandIn(), port=free_port):
+        thread.join(30)
+        with clients[0] as client:
+            assert client.metadata["action_dim"] == 7
+
+
+def test_a_late_reply_is_never_taken_for_the_next_one():
+    policy = StandIn()
+    with serving(policy) as server, connect(server) as client:
+        policy.gate.clear()
+        with pytest.raises(ServerGone, match=r"did not reply within 0\.2 s"):
+            client.infer(observation(), timeout=0.2)
+        policy.gate.set()
+        with pytest.raises(ServerGone, match="closed the connection"):
+            client.infer(observation())
+
+
+def test_a_server_that_stops():
+    with serving(StandIn()) as server:
+        client = connect(server)
+        client.infer(observation())
+    with pytest.raises(ServerGone, match="closed the connection"):
+        client.infer(observation())
+    client.close()
+
+
+def test_values_that_cannot_be_sent_do_not_end_the_connection():
+    with serving(StandIn()) as server, connect(server) as client:
+        with pytest.raises(TypeError, match="a message cannot contain a complex"):
+            client.infer(observation(extra=1j))
+        np.testing.assert_array_equal(client.infer(observation())["actions"][0], np.arange(7))
+
+
+def test_the_client_imports_neither_jax_nor_the_simulation():
+    code = "import sys, lorasp_jax.serving.client; print(*sys.modules)"
+    command = [sys.executable, "-c", code]
+    process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    heavy = {"jax", "flax", "mujoco", "envs", "PIL", "rich"}
+    assert heavy & set(process.stdout.split()) == set()
