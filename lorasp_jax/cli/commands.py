@@ -1,4 +1,4 @@
-"""The console command: `lorasp-jax train | study | envs | data | report | serve | completion`."""
+"""The console command, `lorasp-jax COMMAND`; see `COMMANDS`."""
 
 import argparse
 import importlib
@@ -13,6 +13,10 @@ import lorasp_jax
 COMMANDS = {
     "train": ("lorasp_jax.cli.train", "adapt a policy to a robot"),
     "study": ("lorasp_jax.study.__main__", "run many experiments and test claims about them"),
+    "latency": (
+        "lorasp_jax.evaluation.latency.__main__",
+        "evaluate policies whose actions arrive late",
+    ),
     "envs": ("envs.__main__", "collect, render or play episodes of the scripted experts"),
     "data": ("lorasp_jax.data.__main__", "inspect or convert datasets"),
     "report": (

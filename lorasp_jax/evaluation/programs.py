@@ -16,7 +16,7 @@ import envs
 from envs.compilation import fast_cpu
 from envs.env import Env
 from envs.scene.ranges import Randomization
-from envs.state import State
+from envs.state import Poses, State
 from lorasp_jax.config import Config
 from lorasp_jax.evaluation.rollout import Rollout, act, as_rollout, num_calls, predict
 from lorasp_jax.models.sampling import Sampler
@@ -41,23 +41,56 @@ def split_rollout(
 
     def rollout(policy: Policy, key: jax.Array) -> Rollout:
         calls = num_calls(env, policy, execute_steps)
-        rows = policy.processor.prompts.rows(env.instructions)
-        policy, place = _without_names(prepared(policy)), _placement(policy)
-        # Programs are compiled again for arrays placed otherwise, so all follow the keys.
-        reset_key, sample_key = jax.device_put(tuple(jax.random.split(key)), place)
-        state = _reset(env, reset_key, ranges)
-        prompts = jax.device_put(rows[np.asarray(state.info["instruction"])], place)
+        worlds = Worlds(env, policy, key, ranges)
         records = []
         for call in range(calls):
-            inputs = (sample_key, np.int32(call), _observe(env, state), prompts, state.done)
-            actions, ranks = _predict()(policy, *inputs, denoise_steps=denoise_steps)
-            actions = jax.device_put(actions, place)
-            state, poses = _act(env, state, actions, execute_steps=execute_steps)
-            records.append((poses, *ranks))
-        state, records = jax.device_get((state, records))
+            actions, ranks = worlds.predict(call, denoise_steps=denoise_steps)
+            records.append((worlds.act(actions, execute_steps), *ranks))
+        state, records = jax.device_get((worlds.state, records))
         return as_rollout(state, *jax.tree.map(lambda *values: np.stack(values), *records))
 
     return rollout
+
+
+class Worlds:
+    """The parallel worlds of one rollout, and the compiled programs that act in them.
+
+    Attributes:
+        state: the current state of the worlds.
+    """
+
+    def __init__(
+        self, env: Env, policy: Policy, key: jax.Array, ranges: Randomization | None = None
+    ) -> None:
+        """Reset the worlds; `key` determines them and the policy's noise.
+
+        Raises:
+            ValueError: the policy has no prompt for one of the instructions.
+        """
+        rows = policy.processor.prompts.rows(env.instructions)
+        self._env, self._policy = env, _without_names(prepared(policy))
+        # Programs are compiled again for arrays placed otherwise, so all follow the keys.
+        self._place = _placement(policy)
+        reset_key, self._sample_key = jax.device_put(tuple(jax.random.split(key)), self._place)
+        self.state: State = _reset(env, reset_key, ranges)
+        prompts = rows[np.asarray(self.state.info["instruction"])]
+        self._prompts = jax.device_put(prompts, self._place)
+
+    def predict(self, call: int, *, denoise_steps: int, **previous: Any) -> tuple[jax.Array, tuple]:
+        """Observe the worlds and sample a chunk in each; see `rollout.predict`."""
+        observation, done = _observe(self._env, self.state), self.state.done
+        inputs = (self._sample_key, np.int32(call), observation, self._prompts, done)
+        actions, ranks = _predict()(self._policy, *inputs, denoise_steps=denoise_steps, **previous)
+        return jax.device_put(actions, self._place), ranks
+
+    def act(self, actions: jax.Array, execute_steps: int) -> Poses:
+        """Execute the first actions of chunks `[W, C, J+1]`; see `rollout.act`."""
+        self.state, poses = _act(self._env, self.state, actions, execute_steps=execute_steps)
+        return poses
+
+    def hold(self, action: jax.Array, steps: int) -> None:
+        """Execute the same action `[W, J+1]` for a number of control steps."""
+        self.state = _hold(self._env, self.state, action, np.int32(steps))
 
 
 def prepared(policy: Policy) -> Policy:
@@ -100,6 +133,11 @@ def _observe(env: Env, state: State) -> RawObservation:
 
 
 _act = fast_cpu.jit(act, static_argnums=0, static_argnames="execute_steps")
+
+
+@functools.partial(fast_cpu.jit, static_argnums=0)
+def _hold(env: Env, state: State, action: jax.Array, steps: jax.Array) -> State:
+    return jax.lax.fori_loop(0, steps, lambda _, state: env.step(state, action), state)
 
 
 @functools.cache

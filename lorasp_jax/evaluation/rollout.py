@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -98,6 +99,7 @@ def predict(
     done: jax.Array,
     *,
     denoise_steps: int,
+    **previous: Any,
 ) -> tuple[jax.Array, tuple[metrics.LayerRanks, dict[str, jax.Array], jax.Array]]:
     """Sample a chunk in every world, with a new key for each call.
 
@@ -109,13 +111,14 @@ def predict(
         prompts: `[W]` int32, rows of the policy's prompt table.
         done: `[W]` bool.
         denoise_steps: Euler steps.
+        previous: `previous`, `prefix_length` and `guidance` of `Policy.sample`, if any.
 
     Returns:
         `[W, C, J+1]` actions, and (active ranks, their histogram, number of unfinished worlds).
     """
     call_key = jax.random.fold_in(key, call)
     actions, aux = policy.sample(
-        call_key, observation, prompts, num_steps=denoise_steps, return_aux=True
+        call_key, observation, prompts, num_steps=denoise_steps, return_aux=True, **previous
     )
     ranks = metrics.layer_ranks(aux, ~done)
     histogram = metrics.rank_histogram(aux, ~done, _max_rank(policy))

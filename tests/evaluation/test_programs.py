@@ -44,7 +44,7 @@ def compilations():
 
     def listen(event, duration, fun_name="", **_):
         name = fun_name.removeprefix("jit(").removesuffix(")")
-        if event == COMPILATION and name in {*POLICY, *WORLD}:
+        if event == COMPILATION and name in {*POLICY, *WORLD, "_hold"}:
             counts[name] = counts.get(name, 0) + 1
 
     monitoring.register_event_duration_secs_listener(listen)

@@ -201,6 +201,28 @@ def test_delta_actions_are_decoded_as_absolute(set_by):
         published(relative=(True,) * 14)
 
 
+def test_a_previous_chunk_is_made_relative_to_the_current_state():
+    """Real-time chunking: what the robot is executing stays the same in absolute joint targets."""
+    given = {}
+
+    class Recorder:
+        def sample_actions(self, key, obs, **options):
+            given.update(options)
+            return options["prefix"], {}
+
+    proc = processor(6)
+    relative = dataclasses.replace(proc.inputs, delta=(*[True] * 6, False))
+    policy = Policy(Recorder(), dataclasses.replace(proc, inputs=relative))
+    previous = jax.random.normal(jax.random.key(0), (2, 3, 7))
+    raw = {"image": {}, "state": jnp.arange(14.0).reshape(2, 7)}
+    chunk = policy.sample(None, raw, jnp.zeros(2, int), previous=previous, prefix_length=2)
+    np.testing.assert_allclose(chunk, previous, atol=1e-5)
+    absolute = proc.normalize_actions(previous)
+    assert given["prefix"].shape == absolute.shape == (2, 3, 8)
+    assert np.abs(given["prefix"] - absolute)[..., :6].max() > 1
+    assert (given["prefix_length"], given["guidance"]) == (2, None)
+
+
 def test_prompts_contain_the_normalized_state():
     """The state is that of the robot's slots, with the added noise."""
     config, texts = Pi0Config.nano_pi05(), ["press the button", "push it"]

@@ -35,6 +35,8 @@ HEADER_BYTES = 2**16
 """Bytes reserved for a shard's header: names, shapes and offsets of a few hundred tensors."""
 RUNTIME_FIELDS = ("dtype", "param_dtype", "remat", "unroll")
 """Config fields that affect how a model runs, but not its architecture."""
+LENGTHS = ("max_tokens", "chunk")
+"""Numbers of tokens, on which no parameter depends; they are saved as the model's defaults."""
 
 Folder = str | os.PathLike[str]
 Model = TypeVar("Model", bound=nnx.Module)
@@ -108,8 +110,8 @@ def load_native(folder: Folder, config: Any = None) -> Any:
 
     Args:
         folder: folder with config.json and safetensors.
-        config: sets the `RUNTIME_FIELDS`; its other fields must match the stored model. None uses
-            the stored config, in fp32.
+        config: sets the `RUNTIME_FIELDS` and the `LENGTHS`; its other fields must match the stored
+            model. None uses the stored config, in fp32.
 
     Raises:
         ValueError: files are missing, damaged or in another format, or do not match `config`.
@@ -118,7 +120,7 @@ def load_native(folder: Folder, config: Any = None) -> Any:
     description = _description(folder)
     stored = _config(folder, description)
     config = config or stored
-    if type(config) is not type(stored) or _saved_fields(config) != _saved_fields(stored):
+    if type(config) is not type(stored) or _sizes(config) != _sizes(stored):
         raise ValueError(f"{folder} does not match the config: {_difference(stored, config)}")
     arrays = TensorFiles(weight_files(folder))
     if _digest(description, arrays) != description["sha256"]:  # before allocating the model
@@ -236,8 +238,13 @@ def _saved_fields(config: Any) -> dict[str, Any]:
     return {name: value for name, value in fields.items() if name not in RUNTIME_FIELDS}
 
 
+def _sizes(config: Any) -> dict[str, Any]:
+    """The saved fields that must match for weights to fit and to mean the same."""
+    return {name: value for name, value in _saved_fields(config).items() if name not in LENGTHS}
+
+
 def _difference(stored: Any, config: Any) -> str:
-    a, b = _saved_fields(stored), _saved_fields(config)
+    a, b = _sizes(stored), _sizes(config)
     different = (k for k in sorted(a | b) if a.get(k) != b.get(k))
     pairs = [f"{k} is {a.get(k)} in the folder, {b.get(k)} in the config" for k in different]
     return "; ".join(pairs) or f"the stored model is a {type(stored).__name__}"

@@ -92,6 +92,15 @@ def test_wrong_sizes_raise(folder):
         models.load(folder, other)
 
 
+def test_weights_load_with_other_lengths(folder):
+    """As runs with `--model.max-tokens` or `--model.chunk` need; the file keeps its own."""
+    other = dataclasses.replace(CONFIG, max_tokens=9, chunk=7)
+    loaded, stored = models.load(folder, other), models.load(folder)
+    assert loaded.config == other
+    assert (stored.config.max_tokens, stored.config.chunk) == (CONFIG.max_tokens, CONFIG.chunk)
+    assert models.weights_hash(loaded) == models.weights_hash(stored)
+
+
 def edit_config(folder, **change):
     path = folder / "config.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))

@@ -1,0 +1,1 @@
+"""Success and smoothness of a policy whose chunks arrive late."""
