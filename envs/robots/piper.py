@@ -23,8 +23,8 @@ _DH = np.array(
         [0.0, np.pi / 2, 0.091, 0.0],
     ]
 )
-# dh_is_offset=1, the SDK's default, shifts the zeros of joints 2 and 3 by 2 degrees.
-_SDK_OFFSET = np.deg2rad([0.0, 2.0, -2.0, 0.0, 0.0, 0.0])
+SDK_OFFSET = np.deg2rad([0.0, 2.0, -2.0, 0.0, 0.0, 0.0])
+"""Angles of this model minus those with the SDK's default zeros (dh_is_offset=1) [rad]."""
 
 
 def _chain(theta_shift: np.ndarray) -> np.ndarray:
@@ -38,7 +38,7 @@ def _chain(theta_shift: np.ndarray) -> np.ndarray:
     return np.stack(steps)
 
 
-_CHAIN, _SDK_CHAIN = _chain(np.zeros(6)), _chain(_SDK_OFFSET)
+_CHAIN, _SDK_CHAIN = _chain(np.zeros(6)), _chain(SDK_OFFSET)
 
 
 def forward_kinematics(q: jax.Array, *, sdk_offset: bool = False) -> tuple[jax.Array, jax.Array]:
@@ -63,12 +63,12 @@ def forward_kinematics(q: jax.Array, *, sdk_offset: bool = False) -> tuple[jax.A
 
 def from_sdk_zeros(q: jax.Array) -> jax.Array:
     """Convert joint angles [..., 6] in rad from the SDK's default zeros to this model's zeros."""
-    return q + jax.numpy.asarray(_SDK_OFFSET, q.dtype)
+    return q + jax.numpy.asarray(SDK_OFFSET, q.dtype)
 
 
 def to_sdk_zeros(q: jax.Array) -> jax.Array:
     """Convert joint angles [..., 6] in rad from this model's zeros to the SDK's default zeros."""
-    return q - jax.numpy.asarray(_SDK_OFFSET, q.dtype)
+    return q - jax.numpy.asarray(SDK_OFFSET, q.dtype)
 
 
 # Shapes and colors are our choices; masses [kg] are Menagerie's. Link 6 and the hand weigh .45.

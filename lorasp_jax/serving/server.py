@@ -12,7 +12,6 @@ import http
 import ipaddress
 import itertools
 import logging
-import socket
 import ssl
 import time
 from collections.abc import AsyncIterator, Mapping
@@ -33,7 +32,6 @@ from lorasp_jax.serving.sessions import Session
 
 MAX_CLIENTS = 64
 """Maximum number of connections."""
-MAX_PORT = 65_535
 _log = logging.getLogger(__name__)
 
 
@@ -59,22 +57,20 @@ class PolicyServer:
 
     @contextlib.asynccontextmanager
     async def listen(
-        self, port: socket.socket, *, tls: ssl.SSLContext | None = None
+        self, host: str = "127.0.0.1", port: int = 8000, *, tls: ssl.SSLContext | None = None
     ) -> AsyncIterator[Server]:
         """Accept connections while the context is open.
 
-        Args:
-            port: from `bind`.
-            tls: from `tls_context`, to encrypt the connections.
-
         Raises:
             ValueError: other machines could connect, but there is no token.
+            OSError: the port is taken.
         """
-        check_exposure(port, self._token)
+        check_exposure(host, self._token)
         options: dict[str, Any] = {"compression": None, "max_size": wire.MAX_FRAME, "max_queue": 1}
         async with serve(
             self._handle,
-            sock=port,
+            host,
+            port,
             ssl=tls,
             origins=[None],  # browsers send their page's origin: no page may use a local server
             process_request=self._process_request,
@@ -191,35 +187,16 @@ def describe(policy: BatchPolicy) -> dict[str, Any]:
     }
 
 
-def bind(host: str, port: int) -> socket.socket:
-    """Reserve a port without accepting connections yet; port 0 chooses a free one.
-
-    Raises:
-        ValueError: the port is taken or invalid, or the host is not an address of this machine.
-    """
-    if not 0 <= port <= MAX_PORT:
-        raise ValueError(f"the port must be 0 to {MAX_PORT}, got {port}")
+def check_exposure(host: str, token: str) -> None:
+    """Raise ValueError if other machines could connect to `host` without a token."""
     try:
-        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        reserved = socket.socket(family, socket.SOCK_STREAM)
-        try:
-            reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            reserved.bind(address)
-        except OSError:
-            reserved.close()
-            raise
-    except OSError as error:
-        raise ValueError(f"cannot listen on {host}, port {port}: {error.strerror}") from error
-    return reserved
-
-
-def check_exposure(port: socket.socket, token: str) -> None:
-    """Raise ValueError if other machines could connect to a port without a token."""
-    host = port.getsockname()[0]
-    if not ipaddress.ip_address(host).is_loopback and not token:
+        local = ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        local = host == "localhost"
+    if not local and not token:
         raise ValueError(
-            f"anyone who reaches {host} could use the policy: pass a token file, or listen on "
-            "127.0.0.1"
+            f"anyone who reaches {host or 'this machine'} could use the policy: pass a token file, "
+            "or listen on 127.0.0.1"
         )
 
 

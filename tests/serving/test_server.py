@@ -1,6 +1,5 @@
 """Test the protocol between the server and clients."""
 
-import asyncio
 import ssl
 import threading
 import time
@@ -16,7 +15,7 @@ from websockets.sync.client import connect as raw_connect
 from lorasp_jax.serving import server as server_module
 from lorasp_jax.serving import wire
 from lorasp_jax.serving.client import PolicyError, ServerGone
-from lorasp_jax.serving.server import PolicyServer, bind, check_exposure, tls_context
+from lorasp_jax.serving.server import check_exposure, tls_context
 from tests.serving.stand_in import SPEC, StandIn, connect, observation, serving
 
 
@@ -145,32 +144,16 @@ def test_a_token_is_required():
         error.value.close()
 
 
-def test_other_addresses_need_a_token():
-    with bind("0.0.0.0", 0) as port:
-        with pytest.raises(ValueError, match=r"anyone who reaches 0\.0\.0\.0 could use the policy"):
-            check_exposure(port, "")
-        check_exposure(port, "secret")
-        server = PolicyServer(StandIn())
-        with pytest.raises(ValueError, match="anyone who reaches"):
-            asyncio.run(server.listen(port).__aenter__())
-        server.close()
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.2", "", "example.org"])
+def test_other_addresses_need_a_token(host):
+    with pytest.raises(ValueError, match=r"anyone who reaches .* could use the policy"):
+        check_exposure(host, "")
+    check_exposure(host, "secret")
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "127.8.8.8", "localhost"])
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.8.8.8", "::1", "localhost"])
 def test_this_machine_needs_none(host):
-    with bind(host, 0) as port:
-        check_exposure(port, "")
-
-
-def test_ports_that_cannot_be_used(server):
-    with pytest.raises(
-        ValueError, match=r"cannot listen on 127\.0\.0\.1, port \d+: Address already"
-    ):
-        bind("127.0.0.1", server.port)
-    with pytest.raises(ValueError, match=r"cannot listen on 192\.0\.2\.1, port 0: Cannot assign"):
-        bind("192.0.2.1", 0)
-    with pytest.raises(ValueError, match="the port must be 0 to 65535, got 99999"):
-        bind("127.0.0.1", 99999)
+    check_exposure(host, "")
 
 
 def test_pages_in_browsers_are_refused(server):

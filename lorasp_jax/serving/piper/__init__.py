@@ -1,0 +1,1 @@
+"""The AgileX PiPER as the client of a policy server: its driver, and the checks before it."""

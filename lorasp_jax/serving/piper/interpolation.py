@@ -1,0 +1,34 @@
+"""From a chunk of actions at the policy's rate to targets at the arm's rate."""
+
+import math
+
+import numpy as np
+
+
+class Path:
+    """Straight lines through a chunk of actions, as the simulator interpolates them.
+
+    During control step i, the target moves from action i - 1 to action i and arrives at the end.
+    See `envs.actions.interpolate`.
+
+    Attributes:
+        steps: number of control steps until the path ends.
+    """
+
+    def __init__(self, start: np.ndarray, actions: np.ndarray, control_dt: float) -> None:
+        """Create a path.
+
+        Args:
+            start: [7] target before the first action.
+            actions: [C, 7], one per control step.
+            control_dt: duration of a control step [s].
+        """
+        self._knots, self._dt = np.concatenate([start[None], actions]), control_dt
+        self.steps = len(actions)
+
+    def target(self, seconds: float) -> np.ndarray:
+        """Return the target [7] at a time since the start [s]; past the end, the last action."""
+        position = min(max(seconds / self._dt, 0.0), float(self.steps))
+        step = min(math.floor(position), self.steps - 1)
+        fraction = position - step
+        return self._knots[step] + fraction * (self._knots[step + 1] - self._knots[step])
