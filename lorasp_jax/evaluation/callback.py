@@ -20,7 +20,7 @@ from envs.scene.randomization import Draw
 from envs.state import Poses
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config
-from lorasp_jax.evaluation import video
+from lorasp_jax.evaluation import metrics, video
 from lorasp_jax.evaluation.programs import compiled_rollout, prepared
 from lorasp_jax.evaluation.results import Result, evaluate
 from lorasp_jax.policies.policy import Policy
@@ -126,6 +126,8 @@ class Evaluation(Callback):
                 f"{task} {when}: {100 * result.success:.1f} % success "
                 f"(95 % CI {low:.0f}-{high:.0f} %) in {result.episodes} episodes"
             )
+        if bias := metrics.position_bias(result.outcomes for result in results.values()):
+            run.console.print(f"warning: {bias}", style="yellow", highlight=False)
         return results
 
     def _evaluate_task(

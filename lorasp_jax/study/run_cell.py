@@ -17,6 +17,7 @@ from envs.compilation import cache
 from envs.datasets.episodes import Episodes
 from envs.datasets.locks import locked
 from lorasp_jax.config import Config
+from lorasp_jax.evaluation import metrics
 from lorasp_jax.evaluation.callback import Evaluation
 from lorasp_jax.study import held_out
 from lorasp_jax.study.cost import training_cost
@@ -39,7 +40,7 @@ def run_cell(job: Job) -> dict[str, Any]:
 
     Raises:
         ValueError: see `setup.prepare` and `loop.train`; for a derived cell, the source's policy is
-            missing or cannot be transformed.
+            missing or cannot be transformed; the device computed some episodes wrongly.
     """
     cache.enable()
     try:
@@ -88,11 +89,17 @@ def _derive(job: Job) -> dict[str, Any]:
 
 
 def _results(run: Run) -> dict[str, Any]:
-    """Return what cell.json takes from results.json."""
+    """Return what cell.json takes from results.json.
+
+    Raises:
+        ValueError: the device computed some episodes wrongly.
+    """
     results = read_json(run.folder / "results.json", records.RESULTS)
     tasks: Mapping[str, Any] = results["tasks"]
     outcomes = {task: value["after"]["outcomes"] for task, value in tasks.items()}
     before = {t: value["before"]["outcomes"] for t, value in tasks.items() if "before" in value}
+    if bias := metrics.position_bias([o == "1" for o in text] for text in outcomes.values()):
+        raise ValueError(bias)
     names = (
         "active_rank",
         "layer_active_rank",

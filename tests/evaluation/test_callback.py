@@ -65,6 +65,14 @@ def test_evaluation_runs_at_the_next_log_step(run):
     assert phases <= run.seconds["total"]  # evaluation is not counted as training
 
 
+def test_rows_that_the_device_computes_wrongly_are_reported(run):
+    outcomes = tuple(index % 2 == 0 for index in range(64))
+    result = Result(0.5, 64, (0.4, 0.6), outcomes, 30.0, {}, {}, poses=(), draw=None)
+    evaluation = Evaluation(lambda _, task: (task, None), lambda *_, **__: result, None)
+    evaluation.on_log(run, 120, {})
+    assert "warning: success depends on bit 0 of an episode's index" in run.console.file.getvalue()
+
+
 def test_evaluation_can_be_disabled(run):
     evaluation = Evaluation(evaluate=lambda *_, **__: pytest.fail("evaluated"))
     settings = dataclasses.replace(run.config.evaluation, every=0)

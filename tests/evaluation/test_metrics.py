@@ -4,7 +4,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lorasp_jax.evaluation.metrics import layer_ranks, rank_histogram, wilson_interval
+from lorasp_jax.evaluation.metrics import (
+    layer_ranks,
+    position_bias,
+    rank_histogram,
+    wilson_interval,
+)
 from lorasp_jax.peft import Aux
 
 RUNNING = jnp.array([False, True, False])
@@ -28,6 +33,24 @@ def test_bounds_and_symmetry():
 def test_invalid_counts(successes: int, trials: int):
     with pytest.raises(ValueError, match=r"successes must be in 0\.\.trials"):
         wilson_interval(successes, trials)
+
+
+def outcomes(rng, *, wrong_rows=False):
+    """Two tasks of 256 episodes; with wrong rows, success is rarer in odd ones."""
+    rates = np.where(wrong_rows & (np.arange(256) % 2 == 1), 0.2, 0.9)
+    return [rng.random(256) < rates, rng.random(256) < rates / 3]
+
+
+def test_success_that_depends_on_the_position_is_found():
+    rng = np.random.default_rng(0)
+    assert not any(position_bias(outcomes(rng)) for _ in range(200))
+    for _ in range(20):
+        assert "bit 0" in position_bias(outcomes(rng, wrong_rows=True))
+
+
+@pytest.mark.parametrize("success", [[], [True], [False] * 9, [True, False] * 16])
+def test_few_or_equal_outcomes_show_no_position_bias(success):
+    assert not position_bias([success])
 
 
 def reports(rank):

@@ -4,6 +4,7 @@ import re
 
 import pytest
 
+from lorasp_jax.evaluation.metrics import position_bias
 from lorasp_jax.study import page, results
 from lorasp_jax.study.__main__ import main
 from tests import ROOT
@@ -58,6 +59,12 @@ def test_the_committed_page_is_made_from_the_committed_results(tmp_path):
         )
         if made == there:  # other versions of Matplotlib draw other bytes
             assert files[path.relative_to(docs)] == path.read_bytes(), path
+
+
+def test_committed_success_does_not_depend_on_the_position_in_a_batch():
+    for name, cell in results.load(RESULTS).items():
+        outcomes = [[o == "1" for o in text] for text in cell["outcomes"].values()]
+        assert not position_bias(outcomes), name
 
 
 def figure_version(content):

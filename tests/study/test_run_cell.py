@@ -18,6 +18,7 @@ from lorasp_jax.study.held_out import EPISODES, SEED
 from lorasp_jax.study.runner import Job
 from lorasp_jax.study.study import Cell
 from lorasp_jax.training.run import Run
+from lorasp_jax.training.run_folder import write_json
 from tests import ROOT
 from tests.runs import random_episodes
 from tests.study.fakes import CONFIG
@@ -73,6 +74,19 @@ def test_only_measured_cells_have_costs_and_measures(tmp_path, monkeypatch, meas
     assert found["speed"] == ({"x": 1.0} if measured else {})
     assert found["measures"] == ({"y": 2} if measured else {})
     assert ("measure" in run.seconds) == measured
+
+
+def test_rows_that_the_device_computes_wrongly_fail_the_cell(tmp_path):
+    run = Run(CONFIG, tmp_path, Console(quiet=True), "")
+    after = {"success": 0.5, "episodes": 64, "ci95": [0.4, 0.6], "outcomes": "10" * 32}
+    tree = {
+        **{"scale": "smoke", "seconds": {}, "tasks": {"press": {"after": after}}},
+        **{"active_rank": {}, "layer_active_rank": {}, "active_rank_histogram": {}},
+        **{"trainable_parameters": 1, "total_parameters": 2},
+    }
+    write_json(tmp_path / "results.json", tree)
+    with pytest.raises(ValueError, match="success depends on bit 0 of an episode's index"):
+        run_cell._results(run)
 
 
 @pytest.mark.parametrize(
