@@ -8,7 +8,7 @@ import json
 import pytest
 from rich.console import Console
 
-from benchmarks import compile_time, data, long_run, measuring, scaling
+from benchmarks import compile_time, data, long_run, measuring, scaling, serving
 from lorasp_jax import peft
 from lorasp_jax.data.cache import Cache
 from lorasp_jax.models.pi0 import Pi0Config
@@ -123,3 +123,13 @@ def test_compile_time(tmp_path, capsys):
     assert {"bare", *peft.names()} <= {row["model"] for row in rows}
     assert rows[0]["ratio"] == 1
     assert "lora_sp" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_serving():
+    command = serving.waiting_command(image_size=16, cameras=1, seconds=0.01)
+    (one, times), (eight, times_of_eight) = serving.measure(command, calls=20)
+    assert (times.shape, times_of_eight.shape) == ((20, 3), (160, 3))
+    assert (times[:, 0] > times[:, 1]).all()
+    assert (times[:, 1] >= 10).all()
+    assert eight > 2 * one

@@ -3,6 +3,7 @@
 import argparse
 import asyncio
 import signal
+import socket
 import sys
 import time
 from collections.abc import Sequence
@@ -65,26 +66,36 @@ def parser(program: str) -> argparse.ArgumentParser:
 
 
 def _serve(options: argparse.Namespace, console: Console) -> None:
-    from lorasp_jax.serving import server
-
-    token = _read_token(options.token_file)
-    server.check_exposure(options.host, token)
+    server, token = _server_module(), _read_token(options.token_file)
     if bool(options.certificate) != bool(options.key):
         raise ValueError("--certificate and --key must be given together")
     tls = server.tls_context(options.certificate, options.key) if options.key else None
-    policy, metadata = _load(options, console)
-    asyncio.run(_run(server.PolicyServer(policy, metadata, token=token), options, tls, console))
+    with server.bind(options.host, options.port) as port:  # before anything that takes long
+        server.check_exposure(port, token)
+        policy, metadata = _load(options, console)
+        policy_server = server.PolicyServer(policy, metadata, token=token)
+        asyncio.run(_run(policy_server, port, tls, console))
 
 
-async def _run(policy_server: Any, options: argparse.Namespace, tls: Any, console: Console) -> None:
+def _server_module() -> Any:
+    try:
+        from lorasp_jax.serving import server
+    except ModuleNotFoundError as error:
+        if str(error.name).partition(".")[0] not in ("msgpack", "websockets"):
+            raise
+        raise ValueError(f'{error}: pip install "lorasp_jax[serving]"') from error
+    return server
+
+
+async def _run(policy_server: Any, port: socket.socket, tls: Any, console: Console) -> None:
     """Serve until SIGINT or SIGTERM."""
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    async with policy_server.listen(options.host, options.port, tls=tls) as listening:
-        port = listening.sockets[0].getsockname()[1]
-        scheme = "wss" if tls else "ws"
-        _say(console, f"listening on {scheme}://{options.host}:{port}")
+    async with policy_server.listen(port, tls=tls):
+        host, number = port.getsockname()[:2]
+        host = f"[{host}]" if ":" in host else host
+        _say(console, f"listening on {'wss' if tls else 'ws'}://{host}:{number}")
         await stop.wait()
         _say(console, "closing connections")
     policy_server.close()

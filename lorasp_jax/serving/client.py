@@ -8,17 +8,19 @@
 Needs only NumPy, msgpack and websockets. Works with openpi's servers too.
 """
 
-import contextlib
+import asyncio
 import ssl
+import threading
 import time
-from collections.abc import Mapping
-from typing import Any, Self
+from collections.abc import Coroutine, Mapping
+from typing import Any, Self, TypeVar
 
+from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
-from websockets.sync.client import ClientConnection, connect
 
 from lorasp_jax.serving import wire
 
+T = TypeVar("T")
 RETRY_EVERY = 0.2
 """Time between attempts to connect [s]."""
 
@@ -34,7 +36,11 @@ class ServerGone(ConnectionError):
 class PolicyClient:
     """A connection to a policy server. Not thread-safe.
 
+    The connection lives in a thread of its own, which answers the server's pings between requests.
+    Only that thread touches it, since Python's encrypted sockets do not tolerate two.
+
     Attributes:
+        address: the server's.
         metadata: the server's description of its policy.
     """
 
@@ -61,7 +67,6 @@ class PolicyClient:
                 certificate is not trusted.
         """
         self.address, self._timeout, self._reset = address, timeout, False
-        self._exit = contextlib.ExitStack()
         context = ssl.create_default_context(cafile=certificate or None)
         self._options: dict[str, Any] = {
             "additional_headers": {"Authorization": f"Api-Key {token}"} if token else {},
@@ -72,10 +77,20 @@ class PolicyClient:
             "close_timeout": 1,
             "proxy": None,
         }
-        self._socket = self._connect(time.monotonic() + wait)
-        self.metadata: dict[str, Any] = self._receive(timeout)
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
+        self._thread.start()
+        self._socket: ClientConnection | None = None
+        try:
+            self._socket = self._run(self._connect(time.monotonic() + wait))
+            self.metadata: dict[str, Any] = self._exchange(None, timeout)
+        except BaseException:
+            self.close()
+            raise
 
-    def infer(self, observation: Mapping[str, Any], *, timeout: float | None = None) -> dict:
+    def infer(
+        self, observation: Mapping[str, Any], *, timeout: float | None = None
+    ) -> dict[str, Any]:
         """Return the server's reply: `actions` `[C, J+1]` f32, and timings [ms].
 
         Args:
@@ -88,13 +103,12 @@ class PolicyClient:
                 since a late reply could be mistaken for the next one.
             TypeError: the observation contains something else than numbers, text and arrays.
         """
-        extra = {"reset": True} if self._reset else {}
-        frame = wire.pack({**observation, **extra})
+        frame = wire.pack({**observation, "reset": True} if self._reset else observation)
         try:
-            self._socket.send(frame)
-        except ConnectionClosed as error:
-            raise self._gone(error) from error
-        reply = self._receive(self._timeout if timeout is None else timeout)
+            reply = self._exchange(frame, self._timeout if timeout is None else timeout)
+        except BaseException:  # also after Ctrl-C, as the reply may still come
+            self.close()
+            raise
         self._reset = False
         return reply
 
@@ -103,8 +117,14 @@ class PolicyClient:
         self._reset = True
 
     def close(self) -> None:
-        """Close the connection."""
-        self._exit.close()
+        """Close the connection and stop its thread."""
+        if not self._thread.is_alive():
+            return
+        if self._socket is not None:
+            self._run(self._socket.close())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
 
     def __enter__(self) -> Self:
         """Return the client."""
@@ -114,15 +134,19 @@ class PolicyClient:
         """Close the connection."""
         self.close()
 
-    def _connect(self, deadline: float) -> ClientConnection:
+    def _run(self, coroutine: Coroutine[Any, Any, T]) -> T:
+        """Run a coroutine in the connection's thread."""
+        return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result()
+
+    async def _connect(self, deadline: float) -> ClientConnection:
         """Connect, trying again until the deadline while the address refuses connections."""
         while True:
             try:
-                return self._exit.enter_context(connect(self.address, **self._options))
+                return await connect(self.address, **self._options)
             except ConnectionRefusedError as error:
                 if time.monotonic() > deadline:
                     raise ServerGone(f"no policy server at {self.address}: {error}") from error
-                time.sleep(RETRY_EVERY)
+                await asyncio.sleep(RETRY_EVERY)
             except InvalidStatus as error:
                 code, body = error.response.status_code, error.response.body or b""
                 text = body.decode(errors="replace").strip()
@@ -131,19 +155,25 @@ class PolicyClient:
             except (OSError, WebSocketException) as error:
                 raise ServerGone(f"no policy server at {self.address}: {error}") from error
 
-    def _receive(self, timeout: float) -> dict[str, Any]:
+    def _exchange(self, frame: bytes | None, timeout: float) -> dict[str, Any]:
+        """Send a frame, unless it is None, and return the next reply."""
+        if not self._thread.is_alive():
+            raise ServerGone(f"the connection to {self.address} is closed")
         try:
-            frame = self._socket.recv(timeout)
+            reply = self._run(self._send_and_receive(frame, timeout))
         except TimeoutError as error:
-            self.close()
             raise ServerGone(f"{self.address} did not reply within {timeout:g} s") from error
         except ConnectionClosed as error:
-            raise self._gone(error) from error
-        if isinstance(frame, str):
-            self.close()
-            raise PolicyError(frame)
-        return wire.unpack(frame)
+            reason = error.rcvd.reason if error.rcvd else ""
+            text = f"{self.address} closed the connection{reason and ': '}{reason}"
+            raise ServerGone(text) from error
+        if isinstance(reply, str):
+            raise PolicyError(reply)
+        return wire.unpack(reply)
 
-    def _gone(self, error: ConnectionClosed) -> ServerGone:
-        reason = error.rcvd.reason if error.rcvd else ""
-        return ServerGone(f"{self.address} closed the connection{reason and ': '}{reason}")
+    async def _send_and_receive(self, frame: bytes | None, timeout: float) -> bytes | str:
+        assert self._socket is not None
+        async with asyncio.timeout(timeout):
+            if frame is not None:
+                await self._socket.send(frame)
+            return await self._socket.recv()

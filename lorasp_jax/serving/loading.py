@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lorasp_jax.adapters.io import hugging_face, native
+from lorasp_jax.adapters.io import native
 from lorasp_jax.models import backbone
 from lorasp_jax.models.checkpoints import loading
 from lorasp_jax.policies import statistics_files, tokenizer
@@ -21,7 +21,6 @@ from lorasp_jax.training.base import SIZES
 
 UNADAPTED = "base"
 """Name of a checkpoint without adapters, for requests that choose among several."""
-PEFT_CONFIG = "adapter_config.json"
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ class Checkpoint:
         size: a size of π0, such as "base_pi05", for checkpoints that do not record it.
         dtype: of parameters and products; "" leaves the default.
         cameras: backbone camera -> the robot's name for it; empty: the backbone's names.
-        adapters: name -> folder, of this project or of Hugging Face PEFT.
+        adapters: name -> folder; see `load_adapters`.
     """
 
     where: str
@@ -125,7 +124,7 @@ def load_checkpoint(checkpoint: Checkpoint) -> Loaded:
     )
     model = found.load(config)
     models = {UNADAPTED: model}
-    models |= {name: _adapt(model, folder) for name, folder in checkpoint.adapters.items()}
+    models |= {n: native.load_adapters(f, model) for n, f in checkpoint.adapters.items()}
     policies = {name: Policy(adapted, processor) for name, adapted in models.items()}
     return Loaded(policies, dict.fromkeys(policies, words), {})
 
@@ -136,9 +135,3 @@ def _config(size: str) -> Any:
         known = ", ".join(name for name in SIZES if hasattr(pi0, name))
         raise ValueError(f"unknown size {size!r}: choose one of {known}")
     return getattr(pi0, size)()
-
-
-def _adapt(model: Any, folder: str) -> Any:
-    is_peft = folder.startswith(hub.HUB) or (Path(folder) / PEFT_CONFIG).is_file()
-    load = hugging_face.load_peft if is_peft else native.load_adapters
-    return load(folder, model)

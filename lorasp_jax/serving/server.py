@@ -12,6 +12,7 @@ import http
 import ipaddress
 import itertools
 import logging
+import socket
 import ssl
 import time
 from collections.abc import AsyncIterator, Mapping
@@ -32,6 +33,7 @@ from lorasp_jax.serving.sessions import Session
 
 MAX_CLIENTS = 64
 """Maximum number of connections."""
+MAX_PORT = 65_535
 _log = logging.getLogger(__name__)
 
 
@@ -57,20 +59,22 @@ class PolicyServer:
 
     @contextlib.asynccontextmanager
     async def listen(
-        self, host: str = "127.0.0.1", port: int = 8000, *, tls: ssl.SSLContext | None = None
+        self, port: socket.socket, *, tls: ssl.SSLContext | None = None
     ) -> AsyncIterator[Server]:
         """Accept connections while the context is open.
 
+        Args:
+            port: from `bind`.
+            tls: from `tls_context`, to encrypt the connections.
+
         Raises:
             ValueError: other machines could connect, but there is no token.
-            OSError: the port is taken.
         """
-        check_exposure(host, self._token)
+        check_exposure(port, self._token)
         options: dict[str, Any] = {"compression": None, "max_size": wire.MAX_FRAME, "max_queue": 1}
         async with serve(
             self._handle,
-            host,
-            port,
+            sock=port,
             ssl=tls,
             origins=[None],  # browsers send their page's origin: no page may use a local server
             process_request=self._process_request,
@@ -187,16 +191,35 @@ def describe(policy: BatchPolicy) -> dict[str, Any]:
     }
 
 
-def check_exposure(host: str, token: str) -> None:
-    """Raise ValueError if other machines could connect to `host` without a token."""
+def bind(host: str, port: int) -> socket.socket:
+    """Reserve a port without accepting connections yet; port 0 chooses a free one.
+
+    Raises:
+        ValueError: the port is taken or invalid, or the host is not an address of this machine.
+    """
+    if not 0 <= port <= MAX_PORT:
+        raise ValueError(f"the port must be 0 to {MAX_PORT}, got {port}")
     try:
-        local = ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        local = host == "localhost"
-    if not local and not token:
+        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        reserved = socket.socket(family, socket.SOCK_STREAM)
+        try:
+            reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            reserved.bind(address)
+        except OSError:
+            reserved.close()
+            raise
+    except OSError as error:
+        raise ValueError(f"cannot listen on {host}, port {port}: {error.strerror}") from error
+    return reserved
+
+
+def check_exposure(port: socket.socket, token: str) -> None:
+    """Raise ValueError if other machines could connect to a port without a token."""
+    host = port.getsockname()[0]
+    if not ipaddress.ip_address(host).is_loopback and not token:
         raise ValueError(
-            f"anyone who reaches {host or 'this machine'} could use the policy: pass a token file, "
-            "or listen on 127.0.0.1"
+            f"anyone who reaches {host} could use the policy: pass a token file, or listen on "
+            "127.0.0.1"
         )
 
 
@@ -211,6 +234,9 @@ def tls_context(certificate: Path, key: Path) -> ssl.SSLContext:
         ValueError: a file is missing, or they do not belong together.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    # Session tickets arrive while clients send their first request. Clients that read and write in
+    # two threads, such as openpi's, can then hang (github.com/python/cpython/issues/143756).
+    context.num_tickets = 0
     try:
         context.load_cert_chain(certificate, key)
     except (OSError, ssl.SSLError) as error:

@@ -9,7 +9,7 @@ import numpy as np
 
 from lorasp_jax.serving.client import PolicyClient
 from lorasp_jax.serving.requests import PolicySpec
-from lorasp_jax.serving.server import PolicyServer
+from lorasp_jax.serving.server import PolicyServer, bind
 
 SPEC = PolicySpec(("side", "wrist"), image_size=16, state_dim=7, chunk=10)
 
@@ -44,19 +44,20 @@ class StandIn:
 @contextlib.contextmanager
 def serving(policy, **options):
     """Serve in a thread; yields the server, with the attribute `address`."""
-    listen = {name: options.pop(name) for name in ("host", "port", "tls") if name in options}
+    port = bind("127.0.0.1", options.pop("port", 0))
+    listen = {"tls": options.pop("tls")} if "tls" in options else {}
     server, loop = PolicyServer(policy, **options), asyncio.new_event_loop()
     started, stop = threading.Event(), asyncio.Event()
 
     async def run():
-        async with server.listen(**{"port": 0, **listen}) as listening:
-            server.port = listening.sockets[0].getsockname()[1]
+        async with server.listen(port, **listen):
             started.set()
             await stop.wait()
 
     thread = threading.Thread(target=lambda: loop.run_until_complete(run()), daemon=True)
     thread.start()
     assert started.wait(10)
+    server.port = port.getsockname()[1]
     scheme = "wss" if "tls" in listen else "ws"
     server.address = f"{scheme}://127.0.0.1:{server.port}"
     try:

@@ -1,5 +1,6 @@
 """Test the client against servers that are late, slow or gone."""
 
+import signal
 import socket
 import subprocess
 import sys
@@ -51,7 +52,7 @@ def test_a_late_reply_is_never_taken_for_the_next_one():
         with pytest.raises(ServerGone, match=r"did not reply within 0\.2 s"):
             client.infer(observation(), timeout=0.2)
         policy.gate.set()
-        with pytest.raises(ServerGone, match="closed the connection"):
+        with pytest.raises(ServerGone, match=r"the connection to .* is closed"):
             client.infer(observation())
 
 
@@ -64,11 +65,27 @@ def test_a_server_that_stops():
     client.close()
 
 
+def test_an_interrupted_call_closes_the_connection(monkeypatch):
+    """As its reply could be taken for the next one."""
+    policy = StandIn()
+    with serving(policy) as server, connect(server) as client:
+        policy.gate.clear()
+        main = threading.main_thread().ident
+        timer = threading.Timer(0.2, signal.pthread_kill, [main, signal.SIGINT])
+        timer.start()
+        with pytest.raises(KeyboardInterrupt):
+            client.infer(observation())
+        policy.gate.set()
+        with pytest.raises(ServerGone, match="is closed"):
+            client.infer(observation())
+
+
 def test_values_that_cannot_be_sent_do_not_end_the_connection():
     with serving(StandIn()) as server, connect(server) as client:
+        client.infer(observation())
         with pytest.raises(TypeError, match="a message cannot contain a complex"):
             client.infer(observation(extra=1j))
-        np.testing.assert_array_equal(client.infer(observation())["actions"][0], np.arange(7))
+        np.testing.assert_array_equal(client.infer(observation())["actions"][0], np.arange(7) + 1)
 
 
 def test_the_client_imports_neither_jax_nor_the_simulation():

@@ -1,5 +1,7 @@
 """Test the protocol between the server and clients."""
 
+import asyncio
+import dataclasses
 import ssl
 import threading
 import time
@@ -15,7 +17,7 @@ from websockets.sync.client import connect as raw_connect
 from lorasp_jax.serving import server as server_module
 from lorasp_jax.serving import wire
 from lorasp_jax.serving.client import PolicyError, ServerGone
-from lorasp_jax.serving.server import check_exposure, tls_context
+from lorasp_jax.serving.server import PolicyServer, bind, check_exposure, tls_context
 from tests.serving.stand_in import SPEC, StandIn, connect, observation, serving
 
 
@@ -56,6 +58,15 @@ def test_a_reset_starts_an_episode_of_this_connection_only(server):
         client.reset()
         numbers += [c.infer(observation())["actions"][0, 0] for c in (client, client, other)]
     assert numbers == [0, 1, 0, 0, 1, 1]
+
+
+def test_forms_of_openpi_get_as_many_dimensions_as_their_clients_expect():
+    spec = dataclasses.replace(SPEC, state_dim=8)
+    picture = np.zeros((16, 16, 3), np.uint8)
+    pictures = {"observation/image": picture, "observation/wrist_image": picture}
+    with serving(StandIn(spec)) as server, connect(server) as client:
+        reply = client.infer({"observation/state": np.zeros(8), **pictures})
+        assert reply["actions"].shape == (10, 7)
 
 
 def test_adapters_are_chosen_by_a_key(server):
@@ -144,16 +155,32 @@ def test_a_token_is_required():
         error.value.close()
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.2", "", "example.org"])
-def test_other_addresses_need_a_token(host):
-    with pytest.raises(ValueError, match=r"anyone who reaches .* could use the policy"):
-        check_exposure(host, "")
-    check_exposure(host, "secret")
+def test_other_addresses_need_a_token():
+    with bind("0.0.0.0", 0) as port:
+        with pytest.raises(ValueError, match=r"anyone who reaches 0\.0\.0\.0 could use the policy"):
+            check_exposure(port, "")
+        check_exposure(port, "secret")
+        server = PolicyServer(StandIn())
+        with pytest.raises(ValueError, match="anyone who reaches"):
+            asyncio.run(server.listen(port).__aenter__())
+        server.close()
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "127.8.8.8", "::1", "localhost"])
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.8.8.8", "localhost"])
 def test_this_machine_needs_none(host):
-    check_exposure(host, "")
+    with bind(host, 0) as port:
+        check_exposure(port, "")
+
+
+def test_ports_that_cannot_be_used(server):
+    with pytest.raises(
+        ValueError, match=r"cannot listen on 127\.0\.0\.1, port \d+: Address already"
+    ):
+        bind("127.0.0.1", server.port)
+    with pytest.raises(ValueError, match=r"cannot listen on 192\.0\.2\.1, port 0: Cannot assign"):
+        bind("192.0.2.1", 0)
+    with pytest.raises(ValueError, match="the port must be 0 to 65535, got 99999"):
+        bind("127.0.0.1", 99999)
 
 
 def test_pages_in_browsers_are_refused(server):
@@ -199,3 +226,4 @@ def test_encrypted_servers_use_modern_protocols(tmp_path):
     certificate.private_key_and_cert_chain_pem.write_to_path(str(tmp_path / "server.pem"))
     context = tls_context(tmp_path / "server.pem", tmp_path / "server.pem")
     assert context.minimum_version >= ssl.TLSVersion.TLSv1_2
+    assert context.num_tickets == 0

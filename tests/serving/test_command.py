@@ -1,0 +1,158 @@
+"""Test the command line and what it loads."""
+
+import dataclasses
+import json
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from flax import nnx
+
+import lorasp_jax
+from lorasp_jax import models
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.io import native
+from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.peft import LoRA
+from lorasp_jax.serving import __main__ as command
+from lorasp_jax.serving import loading
+from lorasp_jax.serving.client import PolicyClient
+from lorasp_jax.serving.loading import Checkpoint
+from lorasp_jax.training import export
+from tests import ROOT
+from tests.models.random_models import random_backbone, with_noise
+from tests.runs import CONFIG, make_run
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("base")
+    models.save(folder, random_backbone(Pi0Config.dummy()))
+    moments = {"mean": [0.5] * 7, "std": [2.0] * 7}
+    stats = {f"{kind}_{k}": v for kind in ("state", "action") for k, v in moments.items()}
+    (folder / "statistics.json").write_text(json.dumps(stats))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, base):
+    model_config = dataclasses.replace(CONFIG.model, checkpoint=str(base))
+    config = dataclasses.replace(CONFIG, model=model_config)
+    run = make_run(tmp_path_factory.mktemp("runs") / "trained", config, models.load(base))
+    run.base_hash = models.weights_hash(base)
+    export.write(run)
+    return run.folder
+
+
+def refuse(capsys, *arguments):
+    assert command.main(arguments) == 2
+    printed = capsys.readouterr()
+    assert "Traceback" not in printed.err
+    return printed.err
+
+
+def test_a_run_is_loaded(run):
+    loaded = loading.load_runs({"a": str(run), "b": str(run)})
+    assert list(loaded.policies) == list(loaded.words) == ["a", "b"]
+    assert loaded.metadata == {"robot": "piper", "control_dt": 0.1}
+    assert loaded.policies["a"].processor.prompts.instructions[0] == "press the button"
+
+
+def test_runs_of_different_robots_are_not_served_together(run, tmp_path, monkeypatch):
+    described = export.describe(run)
+    other = iter([described, {**described, "robot": "panda"}])
+    monkeypatch.setattr(export, "describe", lambda _: next(other))
+    with pytest.raises(ValueError, match="must agree on robot and control_dt"):
+        loading.load_runs({"a": str(run), "b": str(run)})
+
+
+def test_a_checkpoint_is_loaded_with_and_without_adapters(base, tmp_path):
+    adapted = lorasp_jax.adapt(models.load(base), [("q_proj", LoRA(rank=2))], rngs=nnx.Rngs(0))
+    graphdef, adapters, frozen = lorasp_jax.split(adapted)
+    adapted = nnx.merge(graphdef, with_noise(adapters, 0.1), frozen)
+    native.save_adapters(tmp_path / "ours", adapted)
+    checkpoint = Checkpoint(str(base), adapters={"mine": str(tmp_path / "ours")})
+    loaded = loading.load_checkpoint(checkpoint)
+    assert list(loaded.policies) == ["base", "mine"]
+    adapted_paths = [len(adaptation.methods(policy.model)) for policy in loaded.policies.values()]
+    assert adapted_paths == [0, 3]  # vision, language, action
+    processor = loaded.policies["base"].processor
+    assert processor.robot_slots == (0, 1, 2, 3, 4, 5, 7)
+    np.testing.assert_array_equal(np.asarray(processor.statistics.state["std"])[:6], 2)
+
+
+def test_checkpoints_that_do_not_say_enough(base):
+    with pytest.raises(ValueError, match="do not show the robot's number of joints: pass --joints"):
+        loading.load_checkpoint(Checkpoint("assets/pi0_nano"))
+    with pytest.raises(ValueError, match="unknown size 'huge': choose one of nano, small, base"):
+        loading.load_checkpoint(Checkpoint(str(base), size="huge"))
+    with pytest.raises(ValueError, match="cannot find statistics in"):
+        loading.load_checkpoint(Checkpoint(str(base), statistics=str(ROOT / "tests" / "models")))
+    with pytest.raises(ValueError, match="keys of cameras must be one or more of"):
+        loading.load_checkpoint(Checkpoint(str(base), cameras={"top": "front"}))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["nowhere"], "nowhere does not exist"),
+        (["a=nowhere", "b=nothing"], "several policies must all be folders of finished runs"),
+        (["x/a", "y/a"], "the policies must have different names: pass NAME=POLICY"),
+        (["a", "--host", "0.0.0.0"], "anyone who reaches 0.0.0.0 could use the policy"),
+        (["a", "--certificate", "x"], "--certificate and --key must be given together"),
+        (["a", "--certificate", "x", "--key", "y"], "cannot use x with y"),
+        (["a", "--token-file", "nothing"], "nothing: No such file"),
+        (["a", "--max-batch", "0"], "the largest batch must be at least 1"),
+        (["assets/pi0_nano", "--camera", "side"], "expected NAME=VALUE, got 'side'"),
+    ],
+)
+def test_mistakes_get_one_sentence(arguments, sentence, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert sentence in refuse(capsys, *arguments, "--port", "0").replace("\n", " ")
+
+
+def test_an_empty_token_is_refused(tmp_path, capsys):
+    (tmp_path / "token").write_text("\n")
+    error = refuse(capsys, "a", "--token-file", str(tmp_path / "token"))
+    assert "must contain a token of printable ASCII characters" in error
+
+
+def test_missing_libraries_are_named(monkeypatch, capsys):
+    monkeypatch.delitem(sys.modules, "lorasp_jax.serving.server")
+    monkeypatch.delattr(sys.modules["lorasp_jax.serving"], "server")
+    monkeypatch.setitem(sys.modules, "websockets.asyncio.server", None)
+    monkeypatch.setitem(sys.modules, "msgpack", None)
+    monkeypatch.delitem(sys.modules, "lorasp_jax.serving.wire", raising=False)
+    assert 'pip install "lorasp_jax[serving]"' in refuse(capsys, "a")
+
+
+def test_serving_a_run_until_an_interrupt(run):
+    arguments = [str(run), "--port", "0", "--max-batch", "1", "--num-steps", "1"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "lorasp_jax.serving", *arguments],
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    with process:
+        lines = []
+        while not lines or not lines[-1].startswith("listening on "):
+            line = process.stdout.readline()
+            assert line, lines
+            lines.append(line)
+        assert [line.split()[0] for line in lines] == ["loading", "compiling", "ready", "listening"]
+        with PolicyClient(lines[-1].split()[-1]) as client:
+            assert client.metadata["adapters"] == ["trained"]
+            assert client.metadata["robot"] == "piper"
+            picture = np.zeros((48, 64, 3), np.uint8)
+            reply = client.infer(
+                {
+                    "image": {"side": picture, "wrist": picture},
+                    "state": np.zeros(7),
+                    "prompt": "push the button",
+                }
+            )
+            assert reply["actions"].shape == (4, 7)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(20) == 0
+        assert process.stdout.read() == "closing connections\n"
