@@ -1,19 +1,15 @@
 """The arm's driver and the fake arm, through the unmodified piper_sdk on a virtual CAN bus."""
 
-import itertools
-
 import numpy as np
 import pytest
 
 from lorasp_jax.serving.fake_piper import frames
-from lorasp_jax.serving.fake_piper.firmware import FakePiper
-from lorasp_jax.serving.fake_piper.lockstep import Lockstep
 from lorasp_jax.serving.fake_piper.world import World
 from lorasp_jax.serving.piper.arm import PiperArm
 from lorasp_jax.serving.piper.safety import MAX_EFFORT, Governor, Limits, Unsafe, fault
+from tests.serving.benches import Bench, channel
 
 LIMITS = Limits.of()
-CHANNELS = (f"arm{i}" for i in itertools.count())  # the SDK keeps one interface per name
 
 
 @pytest.fixture(scope="module")
@@ -23,16 +19,9 @@ def world():
 
 @pytest.fixture
 def bench(world):
-    """A connected, not yet enabled arm, its fake other end and their clock."""
-    world.reset(3)
-    channel = next(CHANNELS)
-    fake = FakePiper(channel, world)
-    clock = Lockstep(fake)
-    arm = PiperArm(channel, bus="virtual", clock=clock)
-    clock.arm = arm
-    yield arm, fake, clock
-    arm.close()
-    fake.close()
+    bench = Bench(world)
+    yield bench.arm, bench.fake, bench.clock
+    bench.close()
 
 
 def ready(bench):
@@ -89,19 +78,12 @@ def test_the_speed_percentage_limits_the_arm_too(bench):
 def test_commands_take_the_latency(world):
     moved = []
     for latency in (0.0, 0.15):
-        world.reset(3)
-        channel = next(CHANNELS)
-        fake = FakePiper(channel, world, latency=latency)
-        clock = Lockstep(fake)
-        arm = PiperArm(channel, bus="virtual", clock=clock)
-        clock.arm = arm
-        ready((arm, fake, clock))
-        wait(clock, 0.3)
-        start = fake.world.pose
-        drive(arm, clock, start + np.array([0.3, 0, 0, 0, 0, 0, 0]), 40)
-        moved.append(fake.world.pose[0] - start[0])
-        arm.close()
-        fake.close()
+        bench = Bench(world, latency=latency).ready(LIMITS)
+        bench.wait(0.3)
+        start = world.pose
+        drive(bench.arm, bench.clock, start + np.array([0.3, 0, 0, 0, 0, 0, 0]), 40)
+        moved.append(world.pose[0] - start[0])
+        bench.close()
     assert moved[0] > 0.02
     assert moved[1] < moved[0] / 4
 
@@ -120,10 +102,13 @@ def test_frames_that_stop_are_noticed_within_60_ms(bench):
 
 def test_clock_steps_do_not_age_feedback(bench):
     arm, fake, clock = ready(bench)
-    fake.time -= 1000.0  # stamps jump back, as after a step of the system's clock
-    clock.wait_until(fake.time + 0.02)
-    arm._clock = type("Same", (), {"now": lambda _: clock.now() + 1000.0})()
-    assert fault(arm.read(), LIMITS) is None
+    for step in (-1000.0, 1000.0, 0.0):
+        fake.faults.clock_step = step
+        wait(clock, 0.02)
+        assert fault(arm.read(), LIMITS) is None
+    fake.faults.silent, fake.faults.clock_step = True, -1000.0
+    wait(clock, 0.06)
+    assert "no feedback" in fault(arm.read(), LIMITS)
 
 
 @pytest.mark.parametrize(
@@ -193,7 +178,7 @@ def test_a_missing_interface_is_one_sentence(capsys):
 
 def test_the_grippers_effort_is_capped():
     with pytest.raises(ValueError, match=f"at most {MAX_EFFORT}, got 5000"):
-        PiperArm(next(CHANNELS), bus="virtual", effort=5000)
+        PiperArm(channel(), bus="virtual", effort=5000)
 
 
 def test_nan_never_reaches_the_bus(bench):

@@ -4,6 +4,7 @@ It imitates what matters to a client: drivers that must be switched on, control 
 percentage, the last target that stays in force, delays, noise, and faults on demand.
 """
 
+import threading
 from collections import deque
 from dataclasses import dataclass
 from typing import Any
@@ -34,6 +35,7 @@ class Faults:
         status: arm_status that is reported, such as 7 for a collision; the arm then stands still.
         ctrl_mode: control mode that is reported in place of the true one.
         corrupted: the firmware's joint limits are those of a known defect: all -0.1 degrees.
+        clock_step: added to the frames' time stamps [s], as when the system's clock is set.
         dead_driver: number from 0 of a joint whose driver does not switch on.
     """
 
@@ -43,6 +45,7 @@ class Faults:
     ctrl_mode: int | None = None
     corrupted: bool = False
     dead_driver: int | None = None
+    clock_step: float = 0.0
 
 
 class FakePiper:
@@ -83,14 +86,22 @@ class FakePiper:
         self._waiting: deque[tuple[float, Any]] = deque()
         self._tick, self._ctrl_mode, self._stopped = 0, _STANDBY, 0
         self._percent, self._enabled = 100, np.zeros(6, bool)
-        self.restart()
-
-    def restart(self) -> None:
-        """Take the world's present pose as the target, as after a reset of the scene."""
         self._target, self._setpoint = self.world.pose, self.world.pose
+        self._turn = threading.Lock()  # the arm may live in a thread of its own
+
+    def reset(self, seed: int) -> None:
+        """Start a random layout, with the arm at rest in its start pose."""
+        with self._turn:
+            self.world.reset(seed)
+            self._waiting.clear()
+            self._target, self._setpoint = self.world.pose, self.world.pose
 
     def tick(self) -> None:
         """Advance by `PERIOD`: receive, simulate, send."""
+        with self._turn:
+            self._take_turn()
+
+    def _take_turn(self) -> None:
         self.time = round(self.time + PERIOD, 6)
         while (message := self._bus.recv(0)) is not None:
             self._waiting.append((self.time + self._latency, message))
@@ -101,6 +112,11 @@ class FakePiper:
         self._tick += 1
         if not self.faults.silent:
             self._report()
+
+    @property
+    def stamp(self) -> float:
+        """Time stamp of the latest frames [s]."""
+        return self.time + self.faults.clock_step
 
     def close(self) -> None:
         """Leave the bus."""
@@ -121,7 +137,9 @@ class FakePiper:
         elif kind == frames.MODE:
             self._check(data[3] != _MIT, "MIT mode")
             self._check(1 <= data[2] <= 100, f"speed {data[2]} %")
-            self._ctrl_mode, self._percent = data[0], data[2]
+            if self._ctrl_mode != _TEACHING:  # a person has the arm until teaching ends
+                self._ctrl_mode = data[0]
+            self._percent = data[2]
         elif kind == frames.ENABLE:
             self._enabled[:] = data[1] == 0x02
         elif kind == frames.STOP_OR_TEACH:
@@ -181,5 +199,5 @@ class FakePiper:
 
     def _send(self, kind: int, data: bytes) -> None:
         message = can.Message(arbitration_id=kind, data=data, is_extended_id=False)
-        message.timestamp = self.time
+        message.timestamp = self.stamp
         self._bus.send(message)

@@ -5,6 +5,7 @@ judge success. Physics differ from training: the engine, its time step, gains, f
 """
 
 import functools
+import threading
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,9 +61,14 @@ class World:
         self._physics = physics or Physics()
         self._render = jax.jit(self.env.render)
         self._check = jax.jit(functools.partial(_check, self.env))
+        self._lock = threading.Lock()  # the arm may live in a thread of its own
 
     def reset(self, seed: int) -> None:
         """Start a random layout."""
+        with self._lock:
+            self._reset(seed)
+
+    def _reset(self, seed: int) -> None:
         self.state: State = self.env.reset(jax.random.key(seed))
         self.model = placing.world_model(self.env.model, self.state.info["layout"], 0)
         self.model.opt.timestep = self._physics.timestep
@@ -88,7 +94,8 @@ class World:
 
     def advance(self, seconds: float) -> None:
         """Simulate a multiple of the time step."""
-        mujoco.mj_step(self.model, self.data, round(seconds / self._physics.timestep))
+        with self._lock:
+            mujoco.mj_step(self.model, self.data, round(seconds / self._physics.timestep))
 
     def judge(self) -> bool:
         """Test for success, as the environment does after every control step."""
@@ -104,10 +111,11 @@ class World:
 
     def _arrays(self) -> dict[str, Any]:
         """Return what rendering and tasks read, with poses up to date."""
-        mujoco.mj_kinematics(self.model, self.data)
-        mujoco.mj_camlight(self.model, self.data)
         names = (*_FIELDS, "site_xmat", "qpos", "qvel")
-        arrays = {name: getattr(self.data, name).astype(np.float32) for name in names}
+        with self._lock:
+            mujoco.mj_kinematics(self.model, self.data)
+            mujoco.mj_camlight(self.model, self.data)
+            arrays = {name: getattr(self.data, name).astype(np.float32) for name in names}
         return arrays | {name: arrays[name].reshape(-1, 3, 3) for name in _MATRICES}
 
 

@@ -61,9 +61,8 @@ class PiperArm:
             clock: measures the age of frames.
 
         Raises:
-            ValueError: the effort is out of range.
+            ValueError: the effort is out of range, or piper_sdk is not installed.
             ConnectionError: there is no such interface, it is down or has another bitrate.
-            ImportError: piper_sdk is not installed.
         """
         if not 0 < effort <= MAX_EFFORT:
             raise ValueError(f"the effort must be above 0 and at most {MAX_EFFORT}, got {effort}")
@@ -200,7 +199,7 @@ def _open(can: str, bus: str) -> Any:
     try:
         from piper_sdk import C_PiperInterface_V2, LogLevel
     except ImportError as error:
-        raise ImportError("the PiPER needs piper_sdk: pip install 'lorasp_jax[piper]'") from error
+        raise ValueError("the PiPER needs piper_sdk: pip install 'lorasp_jax[piper]'") from error
     checked = bus == "socketcan"
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # the SDK's use of python-can

@@ -26,6 +26,19 @@ class Path:
         self._knots, self._dt = np.concatenate([start[None], actions]), control_dt
         self.steps = len(actions)
 
+    def starting_at(self, start: np.ndarray) -> "Path":
+        """Return this path from another start [7]."""
+        return Path(start, self._knots[1:], self._dt)
+
+    @property
+    def end(self) -> np.ndarray:
+        """The last action, [7]."""
+        return self._knots[-1]
+
+    def action(self, step: int) -> np.ndarray:
+        """Return the action of a control step from 0, [7]."""
+        return self._knots[step + 1]
+
     def target(self, seconds: float) -> np.ndarray:
         """Return the target [7] at a time since the start [s]; past the end, the last action."""
         position = min(max(seconds / self._dt, 0.0), float(self.steps))

@@ -1,0 +1,134 @@
+"""Options that a real and a fake arm share, and what is made of them."""
+
+import argparse
+import contextlib
+import importlib
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from envs import names
+from lorasp_jax.serving.client import PolicyClient, PolicyError
+from lorasp_jax.serving.pictures import to_square
+from lorasp_jax.serving.piper.asking import Observation
+from lorasp_jax.serving.piper.log import Log
+from lorasp_jax.serving.piper.safety import Limits
+from lorasp_jax.serving.piper.session import Session, Settings
+
+_WAIT = 60.0  # s to wait for a server that is still compiling
+
+
+def add_shared(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the server, the task, the execution and the limits."""
+    add = parser.add_argument_group("policy").add_argument
+    add("--server", default="ws://127.0.0.1:8000", help="address (default: %(default)s)")
+    add("--token-file", type=Path, metavar="FILE", help="file with the server's token")
+    add("--certificate", default="", metavar="FILE", help="PEM file to trust, for wss://")
+    add("--prompt", default="", help="the request in words; default: one of the task's")
+    add = parser.add_argument_group("execution").add_argument
+    add("--execute", type=int, default=5, help="actions of each chunk (default: %(default)s)")
+    add("--ahead", type=int, default=0, help="actions before their end to ask for the next chunk; "
+        "0: the arm waits for the answer (default: %(default)s)")  # fmt: skip
+    add("--control-dt", type=float, default=0.1, help="duration of an action [s] (default: 0.1)")
+    add("--log", type=Path, metavar="FOLDER", help="default: logs/piper-TIME")
+    add = parser.add_argument_group("limits").add_argument
+    add("--speed", type=float, default=1.0, help="of the joints [rad/s] (default: %(default)s)")
+    add(
+        "--effort", type=int, default=1000, help="of the gripper [0.001 N m] (default: %(default)s)"
+    )
+    add("--zeros", choices=("sdk", "urdf"), default="sdk", help="the firmware's zeros of joints 2 "
+        "and 3: sdk for newer firmware (default: %(default)s)")  # fmt: skip
+    add("--box", type=float, nargs=6, metavar=("X0", "X1", "Y0", "Y1", "Z0", "Z1"),
+        help="space for the finger tips in the base frame [m]")  # fmt: skip
+
+
+def limits(options: argparse.Namespace) -> Limits:
+    """Return the limits; raise ValueError if one is out of range."""
+    box = {}
+    if options.box:
+        box = {"box_low": tuple(options.box[::2]), "box_high": tuple(options.box[1::2])}
+    return Limits.of(speed=options.speed, zeros=options.zeros, **box)
+
+
+def settings(options: argparse.Namespace, prompt: str, **more: Any) -> Settings:
+    """Return the settings of a session; raise ValueError if one is out of range."""
+    return Settings(
+        options.prompt or prompt,
+        control_dt=options.control_dt,
+        execute=options.execute,
+        ahead=options.ahead,
+        **more,
+    )
+
+
+def task(name: str) -> Any:
+    """Return the `Task` of this name; raise ValueError if there is none."""
+    names.check("task", name)
+    return importlib.import_module(f"envs.tasks.{name}").TASK
+
+
+@contextlib.contextmanager
+def opened_log(options: argparse.Namespace) -> Iterator[Log]:
+    """Open the log, and close it at the end."""
+    log = Log(options.log or Path("logs") / time.strftime("piper-%Y%m%d-%H%M%S"))
+    try:
+        yield log
+    finally:
+        log.close()
+
+
+def stop_on_signals(session: Session) -> None:
+    """Let Ctrl-C and SIGTERM stop a session: the arm brakes and holds."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: session.stop())
+
+
+class Server:
+    """A policy server as the function that a session asks."""
+
+    def __init__(self, client: PolicyClient) -> None:
+        """Wrap a connection."""
+        self._client = client
+        self._size = client.metadata.get("image_size")
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """The server's description of its policy."""
+        return self._client.metadata
+
+    def reset(self) -> None:
+        """Begin an episode with the next question."""
+        self._client.reset()
+
+    def __call__(self, observation: Observation) -> np.ndarray:
+        """Return the server's actions [C, 7]; its pictures are resized here, so less is sent.
+
+        Raises:
+            ServerGone, PolicyError: as `PolicyClient.infer`.
+        """
+        pictures = observation["image"]
+        if isinstance(self._size, int) and self._size > 0:
+            pictures = {name: to_square(name, x, self._size) for name, x in pictures.items()}
+        reply = self._client.infer({**observation, "image": pictures})
+        if "actions" not in reply:
+            raise PolicyError(f"the server's reply has no actions, only {', '.join(reply)}")
+        return reply["actions"]
+
+
+@contextlib.contextmanager
+def policy(options: argparse.Namespace) -> Iterator[Server]:
+    """Connect to the server.
+
+    Raises:
+        ServerGone: there is no server.
+        OSError: the token cannot be read.
+    """
+    token = options.token_file.read_text().strip() if options.token_file else ""
+    secret = {"token": token, "certificate": options.certificate}
+    print(f"connecting to {options.server}", flush=True)
+    with PolicyClient(options.server, wait=_WAIT, **secret) as client:
+        yield Server(client)

@@ -1,0 +1,101 @@
+"""The two commands: the fake arm's, and the real arm's as far as it goes without one."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from envs.rendering.video import write_video
+from envs.tasks import press
+from lorasp_jax.serving.fake_piper.__main__ import main as fake
+from lorasp_jax.serving.piper import options
+from lorasp_jax.serving.piper.__main__ import main as real
+from tests.serving.stand_in import StandIn, serving
+
+
+class Still(StandIn):
+    """Answers with the state, so that the arm does not move."""
+
+    def prepare(self, request, index):
+        self.last_request = request
+        return request.state
+
+
+@pytest.fixture
+def server(monkeypatch):
+    monkeypatch.setattr(options, "_WAIT", 0.0)
+    policy = Still()
+    with serving(policy) as server:
+        server.policy = policy
+        yield server
+
+
+@pytest.fixture
+def film(tmp_path):
+    write_video(tmp_path / "film.mp4", np.zeros((5, 32, 32, 3), np.uint8), 30)
+    return str(tmp_path / "film.mp4")
+
+
+def test_the_expert_on_the_fake_arm(tmp_path, capsys):
+    film = tmp_path / "film.mp4"
+    words = ["--expert", "--task", "press", "--episodes", "1", "--seed", "2"]
+    code = fake(
+        [*words, "--image-size", "32", "--log", str(tmp_path / "log"), "--video", str(film)]
+    )
+    assert code == 0
+    printed = capsys.readouterr().out
+    assert "episode 0: success" in printed
+    assert "1 of 1 succeeded" in printed
+    assert film.stat().st_size > 1000
+    lines = (tmp_path / "log" / "log.jsonl").read_text().splitlines()
+    assert json.loads(lines[0])["episode"] == 0
+
+
+@pytest.mark.parametrize("more", [[], ["--realtime"]])
+def test_a_served_policy_on_the_fake_arm(server, tmp_path, capsys, monkeypatch, more):
+    short = dataclasses.replace(press.TASK, time_limit=1.0)
+    monkeypatch.setattr(press, "TASK", short)
+    words = ["--server", server.address, "--log", str(tmp_path / "log"), *more]
+    assert fake([*words, "--latency", "0.1", "--thinking", "0.1"]) == 0
+    assert "episode 0: failure\n" in capsys.readouterr().out
+    assert server.policy.last_request.images["wrist"].shape == (16, 16, 3)
+    assert server.policy.last_request.prompt
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--task", "juggle"], "unknown task 'juggle'"),
+        (["--latency", "0.2"], "--latency must be 0 to 0.15 s"),
+        (["--episodes", "0"], "--episodes must be at least 1"),
+        (["--speed", "9"], "at most 3 rad/s, got 9.0"),
+        (["--ahead", "5"], "ahead must be 0 to 4"),
+    ],
+)
+def test_the_fake_arm_refuses_wrong_options(words, message, tmp_path, capsys):
+    assert fake(["--expert", "--log", str(tmp_path), *words]) == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+
+
+def test_no_server(monkeypatch, capsys):
+    monkeypatch.setattr(options, "_WAIT", 0.0)
+    assert fake(["--server", "ws://127.0.0.1:9"]) == 2
+    assert "no policy server at ws://127.0.0.1:9" in capsys.readouterr().err
+
+
+def test_the_real_arm_needs_a_task_cameras_and_a_bus(server, film, capsys):
+    words = ["--server", server.address]
+    assert real(words) == 2
+    assert "pass --task or --prompt" in capsys.readouterr().err
+    words += ["--task", "press"]
+    assert real(words) == 2
+    assert "looks through side, wrist: pass --camera side=" in capsys.readouterr().err
+    words += ["--camera", f"side={film}", "--camera", "wrist=/dev/video_nowhere"]
+    assert real(words) == 2
+    assert "cannot open camera wrist" in capsys.readouterr().err
+    words[-1] = f"wrist={film}"
+    assert real([*words, "--can", "can_nowhere"]) == 2
+    assert "cannot open can_nowhere" in capsys.readouterr().err
+    assert real([*words, "--camera", "side"]) == 2
+    assert "--camera must be NAME=SOURCE" in capsys.readouterr().err
