@@ -8,9 +8,16 @@ import pytest
 
 from envs.rendering.video import write_video
 from envs.tasks import press
+from lorasp_jax.data.opening import open_source
 from lorasp_jax.serving.fake_piper.__main__ import main as fake
+from lorasp_jax.serving.fake_piper.firmware import FakePiper
+from lorasp_jax.serving.fake_piper.timing import RealTime
+from lorasp_jax.serving.fake_piper.world import World
 from lorasp_jax.serving.piper import options
+from lorasp_jax.serving.piper.__main__ import HELD
 from lorasp_jax.serving.piper.__main__ import main as real
+from lorasp_jax.serving.piper.arm import PiperArm
+from tests.serving.benches import channel
 from tests.serving.stand_in import StandIn, serving
 
 
@@ -40,14 +47,15 @@ def film(tmp_path):
 def test_the_expert_on_the_fake_arm(tmp_path, capsys):
     film = tmp_path / "film.mp4"
     words = ["--expert", "--task", "press", "--episodes", "1", "--seed", "2"]
-    code = fake(
-        [*words, "--image-size", "32", "--log", str(tmp_path / "log"), "--video", str(film)]
-    )
-    assert code == 0
+    words += ["--image-size", "32", "--log", str(tmp_path / "log"), "--video", str(film)]
+    assert fake([*words, "--record", str(tmp_path / "data")]) == 0
     printed = capsys.readouterr().out
     assert "episode 0: success" in printed
     assert "1 of 1 succeeded" in printed
     assert film.stat().st_size > 1000
+    source = open_source(tmp_path / "data")
+    assert source.episode(0).image["side"].shape[2:] == (32, 32, 3)
+    assert 25 < source.num_steps < 50
     lines = (tmp_path / "log" / "log.jsonl").read_text().splitlines()
     assert json.loads(lines[0])["episode"] == 0
 
@@ -90,7 +98,7 @@ def test_the_real_arm_needs_a_task_cameras_and_a_bus(server, film, capsys):
     assert "pass --task or --prompt" in capsys.readouterr().err
     words += ["--task", "press"]
     assert real(words) == 2
-    assert "looks through side, wrist: pass --camera side=" in capsys.readouterr().err
+    assert "cameras are needed for side, wrist: pass --camera side=" in capsys.readouterr().err
     words += ["--camera", f"side={film}", "--camera", "wrist=/dev/video_nowhere"]
     assert real(words) == 2
     assert "cannot open camera wrist" in capsys.readouterr().err
@@ -99,3 +107,66 @@ def test_the_real_arm_needs_a_task_cameras_and_a_bus(server, film, capsys):
     assert "cannot open can_nowhere" in capsys.readouterr().err
     assert real([*words, "--camera", "side"]) == 2
     assert "--camera must be NAME=SOURCE" in capsys.readouterr().err
+
+
+class LinkedArm(PiperArm):
+    """A real arm's driver on the bus of a fake arm that lives in a thread."""
+
+    def __init__(self, can, *, bus, **options):
+        name = channel()
+        world = World("press", image_size=16)
+        world.reset(0)
+        self.fake = FakePiper(name, world)
+        super().__init__(name, bus="virtual", **options)
+        self.time = RealTime(self.fake)
+        self.time.start(self)
+
+    def close(self):
+        self.time.stop()
+        super().close()
+        self.fake.close()
+
+
+@pytest.fixture
+def linked(monkeypatch, film):
+    monkeypatch.setattr("lorasp_jax.serving.piper.__main__.PiperArm", LinkedArm)
+    monkeypatch.setattr("lorasp_jax.serving.piper.cameras.MAX_AGE", 60.0)
+    return ["--camera", f"side={film}", "--camera", f"wrist={film}", "--task", "press"]
+
+
+def test_the_real_command_with_an_arm_on_the_bus(server, linked, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("builtins.input", lambda question: "y")
+    words = ["--server", server.address, *linked, "--seconds", "1"]
+    words += ["--log", str(tmp_path / "log"), "--record", str(tmp_path / "data")]
+    assert real([*words, "--image-size", "16"]) == 0, capsys.readouterr()
+    assert "1 episodes recorded" in capsys.readouterr().out
+    assert open_source(tmp_path / "data").num_steps >= 5
+
+
+def test_a_dry_run_of_the_real_command(server, linked, tmp_path, capsys):
+    words = ["--server", server.address, *linked, "--seconds", "0.5", "--dry-run"]
+    assert real([*words, "--log", str(tmp_path)]) == 0
+    assert "would command" in capsys.readouterr().out
+
+
+def test_teaching_with_the_real_command(linked, tmp_path, monkeypatch, capsys):
+    questions = []
+    monkeypatch.setattr("builtins.input", lambda question: questions.append(question) or "n")
+    monkeypatch.setattr("lorasp_jax.serving.piper.teaching._STILL", -1.0)
+    words = [*linked, "--seconds", "0.6", "--record", str(tmp_path / "data"), "--image-size", "16"]
+    assert real([*words, "--teach", "hand"]) == 0
+    assert questions[0].startswith("keep this episode of ")
+    assert real([*words, "--teach", "leader"]) == HELD
+    assert "no leader sends targets" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--teach", "hand"], "--teach needs --record FOLDER"),
+        (["--record", "data", "--dry-run"], "nothing to record"),
+    ],
+)
+def test_options_that_do_not_go_together(words, message, capsys):
+    assert real(["--task", "press", *words]) == 2
+    assert message in " ".join(capsys.readouterr().err.split())

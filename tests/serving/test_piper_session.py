@@ -1,5 +1,6 @@
 """The control loop on the fake arm, through the unmodified piper_sdk: execution and faults."""
 
+import contextlib
 import json
 
 import numpy as np
@@ -258,11 +259,12 @@ def test_a_first_target_out_of_reach(bench, monkeypatch):
 def test_a_server_that_dies_in_mid_chunk(bench):
     policy = StandIn()
     policy.prepare = lambda request, index: request.state
-    with serving(policy) as server:
-        client = PolicyClient(server.address)
+    with contextlib.ExitStack() as stack:
+        client = PolicyClient(stack.enter_context(serving(policy)).address)
         run = Run(bench, Server(client))
-        run.at = {0.72: client._socket.close}
+        run.at = {0.72: stack.close}
         problem = run(30.0)
+    client.close()
     assert "closed the connection" in problem
     assert run.said[1:] == ["moving slowly to the rest pose"]
     assert_holds(run, "closed the connection")

@@ -13,17 +13,18 @@ from rich.console import Console
 
 from envs.cli.errors import parse_arguments, run_command
 from envs.compilation import cache
+from envs.datasets.locks import locked
 from envs.rendering.video import side_by_side, write_video
 from lorasp_jax.evaluation.metrics import wilson_interval
 from lorasp_jax.serving.fake_piper.demonstrator import Demonstrator
 from lorasp_jax.serving.fake_piper.firmware import PERIOD, FakePiper
 from lorasp_jax.serving.fake_piper.timing import Lockstep, RealTime
-from lorasp_jax.serving.fake_piper.world import World
+from lorasp_jax.serving.fake_piper.world import Physics, World
 from lorasp_jax.serving.piper import options as shared
 from lorasp_jax.serving.piper.arm import PiperArm
 from lorasp_jax.serving.piper.asking import InThread, InTurn
 from lorasp_jax.serving.piper.cameras import Simulated
-from lorasp_jax.serving.piper.log import Log
+from lorasp_jax.serving.piper.recording import Recording
 from lorasp_jax.serving.piper.session import Session
 
 _LARGEST_LATENCY = 0.15  # s, of commands; our choice
@@ -61,6 +62,8 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--realtime", action="store_true", help="let time run while the policy thinks")
     add("--image-size", type=int, default=64, help="of pictures [px], for policies that do not "
         "say it (default: %(default)s)")  # fmt: skip
+    add("--record", type=Path, metavar="FOLDER", help="add the successful episodes to an RLDS "
+        "dataset, which train.py takes as --data.source")  # fmt: skip
     add("--video", type=Path, metavar="FILE", help="MP4 of what the cameras see")
     shared.add_shared(parser)
     return parser
@@ -80,27 +83,31 @@ def _run(options: argparse.Namespace, console: Console) -> None:
         size = (server and server.metadata.get("image_size")) or options.image_size
         world = World(options.task, image_size=size)
         world.reset(options.seed)
-        with _bench(options, world) as bench:
+        with _bench(options, world) as bench, _recorder(options, world, size) as recorder:
             bench.arm.connect()
-            films = _episodes(options, bench, server, log, console)
+            films = _episodes(options, bench, server, (log, recorder), console)
     if options.video:
         options.video.parent.mkdir(parents=True, exist_ok=True)
         write_video(options.video, np.stack(films), _VIDEO_RATE)
 
 
 def _episodes(
-    options: argparse.Namespace, bench: "Bench", server: Any, log: Log, console: Console
+    options: argparse.Namespace, bench: "Bench", server: Any, records: tuple, console: Console
 ) -> list[np.ndarray]:
     """Run and count episodes; return the pictures of a video."""
-    films, wins = [], 0
+    films, wins, (log, recorder) = [], 0, records
     for episode in range(options.episodes):
         bench.reset(options.seed + episode)
         log.line(bench.clock.now(), episode=episode)
-        session = _session(options, bench, server, options.seed + episode, log, console)
+        session = _session(options, bench, server, options.seed + episode, records, console)
         film = films if options.video else None
         world = bench.fake.world
         problem = session.run(world.env.task.time_limit, _judge(world, film))
         wins += world.success
+        if recorder and world.success:
+            recorder.keep()
+        elif recorder:
+            recorder.discard()
         outcome = "success" if world.success else f"failure: {problem}" if problem else "failure"
         console.print(f"episode {episode}: {outcome}", markup=False, highlight=False)
         if session.stopped:
@@ -115,7 +122,7 @@ def _session(
     bench: "Bench",
     server: Any,
     seed: int,
-    log: Log,
+    records: tuple,
     console: Console,
 ) -> Session:
     """Enable the arm, and prepare an episode."""
@@ -126,12 +133,33 @@ def _session(
     ask = server or Demonstrator(world, clock, seed)
     asker = InThread(ask) if options.realtime else InTurn(ask, clock, options.thinking)
     settings = shared.settings(options, world.instruction)
+    log, recorder = records
+    if recorder:
+        recorder.say(settings.prompt)
+    more = {"log": log, "recorder": recorder, "say": console.print}
     cameras = Simulated(world.images)
-    session = Session(
-        bench.arm, cameras, asker, limits, settings, clock, log=log, say=console.print
-    )
+    session = Session(bench.arm, cameras, asker, limits, settings, clock, **more)
     shared.stop_on_signals(session)
     return session
+
+
+@contextmanager
+def _recorder(options: argparse.Namespace, world: World, size: int) -> Iterator[Recording | None]:
+    """Open the dataset, if there is to be one, and keep other processes from writing it."""
+    if not options.record:
+        yield None
+        return
+    with locked(options.record):
+        instructions = world.env.task.instructions
+        yield Recording(
+            options.record,
+            task=world.env.task.name,
+            instructions=instructions,
+            prompt=options.prompt or instructions[0],
+            control_dt=options.control_dt,
+            image_size=size,
+            physics_dt=Physics().timestep,
+        )
 
 
 class Bench(NamedTuple):

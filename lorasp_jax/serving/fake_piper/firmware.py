@@ -22,7 +22,7 @@ _SLOW = 10  # the drivers' own states come every tenth time
 _FASTEST, _GRIPPER_SPEED = 3.0, 0.1  # rad/s as the firmware's default; m/s, our choice
 _STANDBY, _CAN, _TEACHING = 0, 1, 2
 _MIT = 0xAD
-_EMERGENCY = 1
+_EMERGENCY, _GUIDED = 1, 11  # arm_status
 
 
 @dataclass
@@ -189,7 +189,7 @@ class FakePiper:
                 self._send(kind, frames.driver(on))
         mode = self._ctrl_mode if self.faults.ctrl_mode is None else self.faults.ctrl_mode
         teaching = int(self._ctrl_mode == _TEACHING)
-        status = self.faults.status or self._stopped
+        status = self.faults.status or self._stopped or (_GUIDED if teaching else 0)
         self._send(frames.STATUS, frames.status(mode, status, teaching))
 
     def _tell_limits(self, joint: int) -> None:

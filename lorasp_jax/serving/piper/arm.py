@@ -16,6 +16,7 @@ from envs.robots.piper import SDK_OFFSET
 from lorasp_jax.serving.piper.clock import Clock, RealClock
 from lorasp_jax.serving.piper.safety import (
     CAN_CONTROL,
+    MAX_AGE,
     MAX_EFFORT,
     Limits,
     Reading,
@@ -110,10 +111,8 @@ class PiperArm:
 
     def read(self) -> Reading:
         """Return the latest feedback."""
-        joints = self.sdk.GetArmJointMsgs().joint_state
-        counts = [getattr(joints, f"joint_{i + 1}") for i in range(6)]
         opening = self.sdk.GetArmGripperMsgs().gripper_state.grippers_angle / _PER_METER
-        angles = np.deg2rad(np.array(counts) / _PER_DEGREE)
+        angles = _angles(self.sdk.GetArmJointMsgs().joint_state)
         if angles.any():  # zeros mean that nothing has been received
             angles = angles + self._offset
         status = self.sdk.GetArmStatus().arm_status
@@ -124,6 +123,14 @@ class PiperArm:
             arm_status=int(status.arm_status),
             enabled=all(self.sdk.GetArmEnableStatus()),
         )
+
+    def leader(self) -> np.ndarray | None:
+        """Return the target [7] that another arm on the bus sends to this one; None: none does."""
+        message = self.sdk.GetArmJointCtrl()
+        if self._since("leader", message.time_stamp) > MAX_AGE:
+            return None
+        opening = self.sdk.GetArmGripperCtrl().gripper_ctrl.grippers_angle / _PER_METER
+        return np.append(_angles(message.joint_ctrl) + self._offset, opening)
 
     def command(self, pose: np.ndarray) -> None:
         """Send one target [7]; it stays in force until the next, as the arm has no watchdog.
@@ -168,19 +175,19 @@ class PiperArm:
         Frames are stamped by the system's clock, which may jump, so we note when stamps change.
         The SDK's own `isOk` notices a silent bus only after 250 ms.
         """
+        messages = {
+            "joints": self.sdk.GetArmJointMsgs(),
+            "gripper": self.sdk.GetArmGripperMsgs(),
+            "status": self.sdk.GetArmStatus(),
+        }
+        return max(self._since(name, message.time_stamp) for name, message in messages.items())
+
+    def _since(self, name: str, stamp: float) -> float:
+        """Return the time since a kind of frame last had a new stamp [s]; 0 if that is now."""
         now = self._clock.now()
-        messages = (
-            ("joints", self.sdk.GetArmJointMsgs()),
-            ("gripper", self.sdk.GetArmGripperMsgs()),
-            ("status", self.sdk.GetArmStatus()),
-        )
-        ages = []
-        for name, message in messages:
-            stamp = message.time_stamp
-            if name not in self._seen or self._seen[name][0] != stamp:
-                self._seen[name] = stamp, now if stamp else -np.inf
-            ages.append(now - self._seen[name][1])
-        return max(ages)
+        if name not in self._seen or self._seen[name][0] != stamp:
+            self._seen[name] = stamp, now if stamp else -np.inf
+        return now - self._seen[name][1]
 
     def _check_firmware(self) -> None:
         """Refuse joint limits that no arm has; old firmware reports none."""
@@ -193,6 +200,12 @@ class PiperArm:
                     f"the firmware's limits of joint {number} are corrupted (a range of {span:g} "
                     f"degrees, {speed / 1000:g} rad/s): set them with piper_sdk first"
                 )
+
+
+def _angles(joints: Any) -> np.ndarray:
+    """Convert the SDK's joint counts to angles [6] in rad."""
+    counts = [getattr(joints, f"joint_{i + 1}") for i in range(6)]
+    return np.deg2rad(np.array(counts) / _PER_DEGREE)
 
 
 def _open(can: str, bus: str) -> Any:

@@ -18,6 +18,7 @@ from lorasp_jax.serving.piper.asking import Observation
 from lorasp_jax.serving.piper.log import Log
 from lorasp_jax.serving.piper.safety import Limits
 from lorasp_jax.serving.piper.session import Session, Settings
+from lorasp_jax.serving.piper.teaching import Lesson
 
 _WAIT = 60.0  # s to wait for a server that is still compiling
 
@@ -81,8 +82,8 @@ def opened_log(options: argparse.Namespace) -> Iterator[Log]:
         log.close()
 
 
-def stop_on_signals(session: Session) -> None:
-    """Let Ctrl-C and SIGTERM stop a session: the arm brakes and holds."""
+def stop_on_signals(session: Session | Lesson) -> None:
+    """Let Ctrl-C and SIGTERM stop a session, in which the arm brakes and holds, or a lesson."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: session.stop())
 

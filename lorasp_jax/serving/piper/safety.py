@@ -38,6 +38,7 @@ _ARM_STATUS = {
     8: "too fast while guided by hand",
     9: "a joint has failed",
     10: "failure",
+    11: "guided by hand",
     14: "controller too hot",
     15: "brake resistor too hot",
 }
@@ -136,7 +137,7 @@ def check_chunk(actions: Any) -> np.ndarray:
     return chunk.astype(float)
 
 
-def fault(reading: Reading, limits: Limits, *, ctrl_mode: int = CAN_CONTROL) -> str | None:
+def fault(reading: Reading, limits: Limits) -> str | None:
     """Say in a sentence why an arm must not be commanded now; None: it may be."""
     joints = reading.pose[:6]
     if reading.age > MAX_AGE:
@@ -148,12 +149,12 @@ def fault(reading: Reading, limits: Limits, *, ctrl_mode: int = CAN_CONTROL) -> 
         joint = int(beyond.argmax())
         degrees = np.rad2deg(joints[joint])
         return f"joint {joint + 1} reports {degrees:.0f} degrees, far beyond its limits"
+    if reading.ctrl_mode != CAN_CONTROL:
+        name = _CTRL_MODES.get(reading.ctrl_mode, "unknown")
+        return f"the arm is in control mode {reading.ctrl_mode} ({name}), not {CAN_CONTROL}"
     if reading.arm_status:
         name = _ARM_STATUS.get(reading.arm_status, "unknown")
         return f"the arm reports status {reading.arm_status} ({name})"
-    if reading.ctrl_mode != ctrl_mode:
-        name = _CTRL_MODES.get(reading.ctrl_mode, "CAN control" if ctrl_mode != 1 else "unknown")
-        return f"the arm is in control mode {reading.ctrl_mode} ({name}), not {ctrl_mode}"
     return None if reading.enabled else "a joint's driver is off"
 
 

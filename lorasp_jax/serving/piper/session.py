@@ -47,7 +47,14 @@ class Arm(Protocol):
 
 
 class Recorder(Protocol):
-    """Receives what was observed and commanded at every control step."""
+    """Receives what was observed and commanded at every control step.
+
+    Attributes:
+        steps: number of control steps received.
+    """
+
+    @property
+    def steps(self) -> int: ...  # noqa: D102
 
     def step(self, images: dict[str, np.ndarray], state: np.ndarray, action: np.ndarray) -> None:
         """Take a control step: pictures, measured pose [7], action [7]."""
