@@ -1,15 +1,16 @@
 """Run the cells of a study: one worker, of which many may share a study's folder.
 
-A worker claims a whole group of cells with a lock, which the operating system releases even if the
-worker is killed. What is finished stands in the cells' folders, so that workers need not talk to
-each other, and a killed one loses at most the steps since its last checkpoint.
+A worker claims a cell with a lock, which the operating system releases even if the worker is
+killed. What is finished stands in the cells' folders, so that workers need not talk to each other,
+and a killed one loses at most the steps since its last checkpoint.
 """
 
+import collections
 import contextlib
 import functools
 import time
 import traceback
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ import filelock
 from envs.datasets.locks import acquire
 from lorasp_jax.config import Config
 from lorasp_jax.study import status
-from lorasp_jax.study.status import Board, State
+from lorasp_jax.study.status import Board, State, Status
 from lorasp_jax.study.study import Cell, Derived, Results, Study
 from lorasp_jax.training.run_folder import write_json
 
@@ -67,42 +68,63 @@ def work(
 
     While another worker runs one, this one waits: the cell may enable others, or be left behind.
     """
-    board = Board(study, folder)
+    board, last = Board(study, folder), ""
     while True:
         statuses = board.read()
-        groups = {
-            group: [cell for cell in cells if cell.name in names]
-            for group, cells in study.groups.items()
-            if any(c.name in names and statuses[c.name].state is State.RUNNABLE for c in cells)
-        }
-        if not groups:
+        runnable = [
+            cell.name
+            for cell in study.cells
+            if cell.name in names and statuses[cell.name].state is State.RUNNABLE
+        ]
+        if not runnable:
             return
-        # The first group that is free; then look again, because it may have enabled earlier ones.
-        run_group = functools.partial(_run_group, study, board, folder, run_cell, report)
-        if not any(run_group(*item) for item in groups.items()):
+        run = functools.partial(_run_claimed, study, board, folder, run_cell, report)
+        # The best cell that is free; then look again, because it may have enabled better ones.
+        ran = next((name for name in _by_urgency(study, statuses, runnable, last) if run(name)), "")
+        if not ran:
             time.sleep(poll)
+        last = ran or last
 
 
-def _run_group(
-    study: Study,
-    board: Board,
-    folder: Path,
-    run_cell: RunCell,
-    report: Report,
-    group: str,
-    cells: list[Cell | Derived],
+def _by_urgency(
+    study: Study, statuses: Mapping[str, Status], names: Sequence[str], last: str
+) -> list[str]:
+    """Sort cells in the order in which a worker that has run the cell `last` should run them.
+
+    First come those that most cells wait for, then those of the last cell's group, whose programs
+    are compiled, then the first of each other group, since other workers may go on with the rest.
+    """
+    waiting = [c for c in study.cells if statuses[c.name].state is State.WAITING]
+    dependents = collections.Counter(need for cell in waiting for need in cell.needs)
+    group_of = {c.name: group for group, cells in study.groups.items() for c in cells}
+    before = collections.Counter[str]()  # runnable cells of a group before this one
+
+    def urgency(name: str) -> tuple[int, bool, int]:
+        group = group_of[name]
+        before[group] += 1
+        return -dependents[name], group != group_of.get(last), before[group]
+
+    return sorted(names, key=urgency)
+
+
+def _run_claimed(
+    study: Study, board: Board, folder: Path, run_cell: RunCell, report: Report, name: str
 ) -> bool:
-    """Run what can run in a group; return False if another worker has claimed the group."""
-    with _claimed(folder, group) as claimed:
-        for cell in cells if claimed else ():
-            for due in _due(study, folder, cell):
-                statuses = board.read()  # another worker may have run the cell meanwhile
-                if statuses[cell.name].state is State.RUNNABLE:
-                    config = statuses[due.name].config
-                    assert config is not None
-                    results = status.results_of(due.needs, statuses)
-                    run_one(Job(due, config, folder, results), run_cell, report)
-        return claimed
+    """Run a cell, after those of `_due`; return False if another worker has claimed one of them."""
+    for due in _due(study, folder, study[name]):
+        with _claimed(folder, due.name) as claimed:
+            if not claimed:
+                return False
+            statuses = board.read()
+            config = statuses[due.name].config
+            if due.name == name:
+                is_due = statuses[name].state is State.RUNNABLE
+            else:
+                is_due = not _is_here(folder, due.name)
+            if is_due and config:  # no other worker has run the cell meanwhile
+                results = status.results_of(due.needs, statuses)
+                run_one(Job(due, config, folder, results), run_cell, report)
+    return True
 
 
 def _due(study: Study, folder: Path, cell: Cell | Derived) -> list[Cell | Derived]:
@@ -110,9 +132,14 @@ def _due(study: Study, folder: Path, cell: Cell | Derived) -> list[Cell | Derive
 
     That is so if the study started from a file of results.
     """
-    if not isinstance(cell, Derived) or (folder / cell.source / status.CELL_FILE).exists():
+    if not isinstance(cell, Derived) or _is_here(folder, cell.source):
         return [cell]
     return [*_due(study, folder, study[cell.source]), cell]
+
+
+def _is_here(folder: Path, name: str) -> bool:
+    """Say whether a cell has run in this folder, so that its policy is here."""
+    return (folder / name / status.CELL_FILE).exists()
 
 
 def run_one(job: Job, run_cell: RunCell, report: Report) -> None:
@@ -132,9 +159,9 @@ def run_one(job: Job, run_cell: RunCell, report: Report) -> None:
 
 
 @contextlib.contextmanager
-def _claimed(folder: Path, group: str) -> Iterator[bool]:
-    """Claim a group in this block; yield False if another worker has it."""
-    file = folder / "groups" / f"{group}.lock"
+def _claimed(folder: Path, name: str) -> Iterator[bool]:
+    """Claim a cell in this block; yield False if another worker has it."""
+    file = folder / "locks" / f"{name}.lock"
     file.parent.mkdir(parents=True, exist_ok=True)
     try:
         lock = acquire(file)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # a run of a finished study should load no model code
 Results: TypeAlias = Mapping[str, Mapping[str, Any]]
 """The content of cell.json by cell name."""
 RESERVED = (
-    *("demonstrations", "held_out", "groups", "logs"),
+    *("demonstrations", "held_out", "locks", "logs"),
     *("results.json", "study.md", "figures"),
 )
 """What a study's folder contains besides the folders of cells."""
@@ -33,8 +33,8 @@ class Cell:
         config: the run's config, or a function that makes it from the results of the cells in
             `after`. The config's own name is ignored.
         after: names of the cells that must be finished first.
-        group: cells of one group are run by one process in a row, to share compiled programs; by
-            default, each cell is its own group.
+        group: cells of one group share compiled programs, so a process that has run one prefers the
+            others; by default, each cell is its own group.
         measured: whether to record the costs of training and the measures on held-out data, which
             take programs of their own to compile; otherwise only success and active ranks.
     """

@@ -151,16 +151,13 @@ class Workers:
     ) -> float | None:
         """Estimate the time until all cells that can run are finished [s]; None if unknown.
 
-        `ages` has the times for which cells have been running. No two cells of a group run at once.
+        `ages` has the times for which cells have been running.
         """
         jobs = max(len(self._running), 1)
         times = forecast.seconds(self._study, statuses, self._finished, jobs)
         left = {*forecast.left(self._study, self._names, statuses)} & times.keys()
-        groups = [
-            sum(max(times[c.name] - ages.get(c.name, 0.0), 0.0) for c in cells if c.name in left)
-            for cells in self._study.groups.values()
-        ]
-        return max(sum(groups) / jobs, *groups) if left else None
+        rest = [max(times[name] - ages.get(name, 0.0), 0.0) for name in left]
+        return max(sum(rest) / jobs, *rest) if left else None
 
     def _time_left(self) -> str:
         """Return the estimated time until all cells are finished."""

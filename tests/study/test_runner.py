@@ -1,3 +1,4 @@
+import dataclasses
 import multiprocessing
 import random
 import threading
@@ -6,6 +7,7 @@ import pytest
 
 from lorasp_jax.study import results, runner
 from lorasp_jax.study.status import Board, State, clear_failure
+from lorasp_jax.study.study import Derived
 from tests.study import fakes
 from tests.study.fakes import NAMES, ran, run, states, study
 
@@ -85,6 +87,59 @@ def test_several_workers_run_every_cell_once(folder):
         thread.join()
     assert sorted(ran(folder)) == sorted(NAMES)
     assert set(states(folder).values()) == {State.FINISHED}
+
+
+def test_workers_share_a_group_that_others_wait_for(folder):
+    both = threading.Barrier(2, timeout=20)
+
+    def meet(job):
+        if job.cell.name.startswith("sp/"):
+            both.wait()
+        return run(job)
+
+    threads = [
+        threading.Thread(target=work, args=(folder,), kwargs={"run_cell": meet}) for _ in range(2)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert {*ran(folder)[:2]} == {"sp/s0", "sp/s1"}
+    assert set(states(folder).values()) == {State.FINISHED}
+
+
+def test_a_worker_goes_on_with_the_group_that_it_has_compiled(folder):
+    work(folder, ["sp/s0", "sp/s1"])
+    statuses = Board(study(), folder).read()
+    names = ["lora/s0", "lora/s1", "lr"]
+
+    def order(last):
+        return runner._by_urgency(study(), statuses, names, last)
+
+    # cut/s0 waits for lora/s0; of the rest, a fresh worker prefers what no other may be compiling.
+    assert order("lora/s0") == ["lora/s0", "lora/s1", "lr"]
+    assert order("lr") == order("") == ["lora/s0", "lr", "lora/s1"]
+
+
+def test_workers_run_a_missing_source_once(folder, tmp_path):
+    work(folder)
+    finished = fakes.results(folder)
+    for name in ("cut/s0", "cut/s1"):
+        finished.pop(name, None)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    second = Derived("cut/again", "lora/s0", study()["cut/s0"].transform, ("sp/s0",))
+    started = dataclasses.replace(study(), cells=(*study().cells, second), finished=finished)
+    names = ["cut/s0", "cut/again"]
+    threads = [
+        threading.Thread(target=work, args=(empty, names, fakes.run_slowly, started))
+        for _ in range(3)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(ran(empty)) == ["cut/again", "cut/s0", "lora/s0"]
 
 
 def test_kills_do_not_change_the_results(folder, tmp_path):

@@ -73,9 +73,8 @@ def test_the_time_left(folder):
     statuses = Board(fakes.study(), folder).read()
     assert time_left(folder, statuses, {}, running=1) == 5
     assert time_left(folder, statuses, {"sp/s0": 0.5}, running=1) == 4.5
-    # Jobs that share a device are assumed to be as slow as one after the other; of the five cells
-    # left, three are of one group.
-    assert time_left(folder, statuses, {}, running=2) == 6
+    # Jobs that share a device are assumed to be as slow as one after the other.
+    assert time_left(folder, statuses, {}, running=2) == 5
     record_failure(folder / "sp/s1", "boom", "")
     assert time_left(folder, Board(fakes.study(), folder).read(), {}, running=1) == 1
 
