@@ -32,6 +32,7 @@ def sample(
     guidance: float | None,
     num_steps: int,
     slots: jax.Array | None = None,
+    overlap: jax.Array | int | None = None,
 ) -> tuple[jax.Array, Any]:
     """Like `flow_matching.sample`, but continue the previous chunk.
 
@@ -45,19 +46,21 @@ def sample(
             the result starts with the first d actions of `prefix`.
         num_steps: Euler steps.
         slots: see `flow_matching.loss`.
+        overlap: `[]` or `[B]` int32, number of actions in `prefix` that are not padding; None: all.
 
     Raises:
         ValueError: the prefix does not fit the noise.
     """
-    (batch, chunk, dim), overlap = noise.shape, prefix.shape[1]
-    if prefix.shape != (batch, overlap, dim) or not 1 <= overlap <= chunk:
+    (batch, chunk, dim), size = noise.shape, prefix.shape[1]
+    if prefix.shape != (batch, size, dim) or not 1 <= size <= chunk:
         raise ValueError(
             f"the prefix must have shape ({batch}, P, {dim}) with P from 1 to {chunk}, "
             f"got {prefix.shape}"
         )
-    previous = jnp.pad(prefix.astype(jnp.float32), ((0, 0), (0, chunk - overlap), (0, 0)))
+    previous = jnp.pad(prefix.astype(jnp.float32), ((0, 0), (0, chunk - size), (0, 0)))
     options = {"num_steps": num_steps, "slots": slots}
     if guidance is not None:
+        overlap = jnp.asarray(size if overlap is None else overlap)
         weights = soft_mask(jnp.asarray(length), overlap, chunk)[..., None]
         weights = weights if slots is None else jnp.where(slots, weights, 0)
         guided = guided_velocity(velocity, previous, weights, guidance)
@@ -118,17 +121,17 @@ def guidance_weight(flow_time: jax.Array, limit: float) -> jax.Array:
     return jnp.minimum(limit, (t**2 + tau**2) / (t * tau))  # infinite at t = 1
 
 
-def soft_mask(length: jax.Array, overlap: int, chunk: int) -> jax.Array:
+def soft_mask(length: jax.Array, overlap: jax.Array, chunk: int) -> jax.Array:
     """Compute W `[..., C]`, eq. 5: 1 for the d executed actions, then decaying to 0.
 
         W_i = c_i (e^(c_i) - 1) / (e - 1)    with c_i = (P - i) / (P - d + 1), for d <= i < P
 
     Args:
         length: d, `[...]` int.
-        overlap: P = H - s, number of actions that both chunks have.
+        overlap: P = H - s, `[...]` int, number of actions that both chunks have.
         chunk: C.
     """
-    i, d = jnp.arange(chunk), length[..., None]
+    i, d, overlap = jnp.arange(chunk), length[..., None], jnp.asarray(overlap)[..., None]
     c = (overlap - i) / jnp.maximum(overlap - d + 1, 1)
     decay = jnp.where(i < overlap, c * jnp.expm1(c) / jnp.expm1(1.0), 0)
     return jnp.where(i < d, 1, decay)

@@ -83,6 +83,7 @@ class Sampler:
         prefix: jax.Array | None = None,
         prefix_length: jax.Array | int = 0,
         guidance: float | None = None,
+        overlap: jax.Array | int | None = None,
     ) -> Any:
         """Sample action chunks.
 
@@ -99,6 +100,7 @@ class Sampler:
             prefix_length: d, `[]` or `[B]`, number of actions in the prefix that the robot executes
                 before it switches to the new chunk, from 0 to P.
             guidance: β of guided real-time chunking; None: the policy is trained for prefixes.
+            overlap: `[]` or `[B]`, number of actions in `prefix` that are not padding; None: all.
 
         Returns:
             `[B, C, A]` f32 normalized actions, or (actions, aux).
@@ -116,7 +118,7 @@ class Sampler:
         sample = flow_matching.sample
         if prefix is not None:
             condition = {"prefix": prefix, "length": prefix_length, "guidance": guidance}
-            sample = functools.partial(real_time_chunking.sample, **condition)
+            sample = functools.partial(real_time_chunking.sample, overlap=overlap, **condition)
         actions, action_aux = sample(
             lambda x_t, t: suffix_model.run_suffix(encoded, obs, x_t, t),
             noise,

@@ -49,6 +49,14 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--max-batch", type=int, default=8, help="largest batch (default: %(default)s)")
     add("--num-steps", type=int, default=10, help="flow steps (default: %(default)s)")
     add("--seed", type=int, default=0, help="seed of the flow's noise (default: %(default)s)")
+    add(
+        "--execution",
+        default="naive",
+        choices=("naive", "trained", "guided"),
+        help="whether chunks can continue the previous one, as learned in training or by guidance "
+        "(default: %(default)s); see docs/latency.md",
+    )
+    add("--guidance", type=float, default=10.0, help="limit of the guidance (default: %(default)s)")
     add("--base", default="", help="the run's base, if it has moved")
     add("--tokenizer", default="", help="the policy's tokenizer; runs record theirs")
     checkpoint = parser.add_argument_group("published checkpoints").add_argument
@@ -115,6 +123,8 @@ def _load(options: argparse.Namespace, console: Console) -> tuple[Any, dict[str,
     _say(console, f"loading {', '.join(named.values())}")
     if all(map(loading.is_run, named.values())):
         loaded = loading.load_runs(named, base=options.base, words=options.tokenizer)
+        if options.execution == "trained":
+            loading.check_trained(named.values())
     elif len(named) == 1:
         loaded = loading.load_checkpoint(_checkpoint(options, *named.values()))
     else:
@@ -126,6 +136,8 @@ def _load(options: argparse.Namespace, console: Console) -> tuple[Any, dict[str,
         max_batch=options.max_batch,
         num_steps=options.num_steps,
         seed=options.seed,
+        execution=options.execution,
+        guidance=options.guidance,
     )
     loaded.policies.clear()  # the prepared weights are copies
     names = policy.adapters

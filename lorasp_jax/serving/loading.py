@@ -2,7 +2,7 @@
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from lorasp_jax.policies.tokenizer import Tokenizer
 from lorasp_jax.storage import hub
 from lorasp_jax.training import export
 from lorasp_jax.training.base import SIZES
+from lorasp_jax.training.run_folder import CONFIG_FILE, read_json
 
 UNADAPTED = "base"
 """Name of a checkpoint without adapters, for requests that choose among several."""
@@ -87,6 +88,17 @@ def load_runs(runs: Mapping[str, str], *, base: str = "", words: str = "") -> Lo
             raise ValueError(f"the runs must agree on robot and control_dt, got {metadata}, {own}")
         metadata = own
     return Loaded(policies, tokenizers, metadata)
+
+
+def check_trained(runs: Iterable[str]) -> None:
+    """Raise ValueError unless runs were trained to continue chunks, as far as they say."""
+    for folder in runs:
+        config = read_json(Path(folder) / CONFIG_FILE, {"optim": {}})
+        if config and not config["optim"].get("rtc_max_delay"):
+            raise ValueError(
+                f"{folder} was not trained to continue chunks (--optim.rtc-max-delay): use "
+                "--execution guided"
+            )
 
 
 def load_checkpoint(checkpoint: Checkpoint) -> Loaded:

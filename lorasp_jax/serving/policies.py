@@ -14,6 +14,8 @@ from lorasp_jax.policies.prompt_table import Ids, PromptTable
 from lorasp_jax.policies.tokenizer import Tokenizer
 from lorasp_jax.serving.requests import PolicySpec, Request
 
+EXECUTIONS = ("naive", "trained", "guided")
+"""How a chunk relates to the previous one; see docs/latency.md."""
 CACHED_PROMPTS = 1024
 """Number of instructions whose tokens are kept."""
 
@@ -27,6 +29,9 @@ class Rows(NamedTuple):
         state: f32 `[J+1]`.
         ids, mask: `[T]`, the instruction's tokens.
         index: int32, number of the request in its episode.
+        previous: f32 `[C, J+1]`, what remains of the previous chunk, then zeros.
+        overlap: int32, number of actions that remain; 0: the new chunk does not continue any.
+        delay: int32, number of these that the robot will execute.
     """
 
     images: dict[str, Any]
@@ -35,6 +40,9 @@ class Rows(NamedTuple):
     ids: Any
     mask: Any
     index: Any
+    previous: Any
+    overlap: Any
+    delay: Any
 
 
 class CompiledPolicies:
@@ -53,6 +61,8 @@ class CompiledPolicies:
         max_batch: int = 8,
         num_steps: int = 10,
         seed: int = 0,
+        execution: str = "naive",
+        guidance: float = 10.0,
     ) -> None:
         """Prepare the policies' weights; `warm_up` compiles.
 
@@ -64,18 +74,21 @@ class CompiledPolicies:
             max_batch: largest batch.
             num_steps: Euler steps of the flow-matching sampler.
             seed: of the flow's noise.
+            execution: one of `EXECUTIONS`.
+            guidance: β of guided execution, see `real_time_chunking.sample`.
 
         Raises:
             ValueError: the policies need different observations.
         """
         self._specs = {name: spec_of(policy) for name, policy in policies.items()}
-        self.spec = _common_spec(self._specs)
+        self.spec = dataclasses.replace(_common_spec(self._specs), execution=execution)
+        self._guidance = np.float32(guidance) if execution == "guided" else None
         self._prompt, self._key, self._num_steps = prompt, jax.random.key(seed), num_steps
         self._tables = {name: policy.processor.prompts for name, policy in policies.items()}
         self._policies = {name: _without_prompts(policy) for name, policy in policies.items()}
         self._words = dict(words)
         self._tokens = functools.lru_cache(CACHED_PROMPTS)(self._tokenize)
-        self._sample = jax.jit(_sample, static_argnames="num_steps")
+        self._sample = jax.jit(_sample, static_argnames=("num_steps", "continues"))
         self.sizes = batch_sizes(max_batch)
 
     @property
@@ -118,13 +131,15 @@ class CompiledPolicies:
             ids=ids,
             mask=mask,
             index=np.array(index, np.int32),
+            **_remaining(request, spec),
         )
 
     def run(self, adapter: str, rows: Sequence[Rows]) -> np.ndarray:
         """Return actions f32 `[B, C, J+1]`."""
         batch = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
         policy = self._policies[adapter]
-        return np.asarray(self._sample(policy, self._key, batch, num_steps=self._num_steps))
+        options = {"num_steps": self._num_steps, "continues": self.spec.execution != "naive"}
+        return np.asarray(self._sample(policy, self._key, batch, self._guidance, **options))
 
     def _tokenize(self, adapter: str, prompt: str) -> tuple[np.ndarray, np.ndarray]:
         table = self._tables[adapter].with_instructions(self._words[adapter], [prompt])
@@ -188,7 +203,29 @@ def _without_prompts(policy: Policy) -> Policy:
     return dataclasses.replace(policy, processor=processor).with_sampler()
 
 
-def _sample(policy: Policy, key: jax.Array, rows: Rows, *, num_steps: int) -> jax.Array:
+def _remaining(request: Request, spec: PolicySpec) -> dict[str, np.ndarray]:
+    """Return the fields of `Rows` that continue the previous chunk."""
+    rest = np.zeros((spec.chunk, spec.state_dim), np.float32)
+    overlap = 0
+    if request.executed is not None and request.previous is not None:
+        overlap = spec.chunk - request.executed
+        rest[:overlap] = request.previous[request.executed :]
+    return {
+        "previous": rest,
+        "overlap": np.array(overlap, np.int32),
+        "delay": np.array(request.delay, np.int32),
+    }
+
+
+def _sample(
+    policy: Policy,
+    key: jax.Array,
+    rows: Rows,
+    guidance: jax.Array | None,
+    *,
+    num_steps: int,
+    continues: bool,
+) -> jax.Array:
     """Sample `[B, C, J+1]`; a row's result does not depend on the other rows."""
     prompts: PromptTable = dataclasses.replace(
         policy.processor.prompts, start=Ids(jnp.asarray(rows.ids), jnp.asarray(rows.mask))
@@ -207,11 +244,20 @@ def _sample(policy: Policy, key: jax.Array, rows: Rows, *, num_steps: int) -> ja
     noise = jax.vmap(
         lambda i: jax.random.normal(jax.random.fold_in(key, i), (config.chunk, config.action_dim))
     )(rows.index)
+    condition = {}
+    if continues:
+        condition = {
+            "prefix": processor.normalize_actions(rows.previous, rows.state),
+            "prefix_length": rows.delay,
+            "overlap": rows.overlap,
+            "guidance": guidance,
+        }
     chunk = policy.model.sample_actions(
         key,
         dataclasses.replace(observation, images=images, image_masks=masks),
         num_steps=num_steps,
         noise=noise,
         slots=processor.flow_slots,
+        **condition,
     )
     return processor.decode(chunk, rows.state)

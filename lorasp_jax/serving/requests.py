@@ -1,8 +1,15 @@
 """Observations as clients send them: this project's own form and those of openpi's examples.
 
 A form says where a request has the robot's state and pictures. `FORMS` lists all of them; a request
-has the first form whose keys it contains. Two more keys work with every form, and openpi's servers
-ignore them: `adapter`, the name of the adapter to use, and `reset`, true when an episode starts.
+has the first form whose keys it contains. More keys work with every form; openpi's servers ignore
+them:
+
+    adapter     name of the adapter to use
+    reset       true when an episode starts
+    executed    s, number of actions of the previous chunk that the robot has executed
+    delay       d, number of further ones that it will execute before it switches to the new chunk
+
+`executed` makes the new chunk continue the previous one, as in `models.real_time_chunking`.
 """
 
 from collections.abc import Mapping
@@ -31,6 +38,7 @@ class PolicySpec:
         centred: how pictures that are not square are padded; see `pictures.to_square`.
         antialias: how pictures are resized.
         instructions: those that the policy was trained with.
+        execution: "naive", or how chunks continue the previous one: "trained" or "guided".
     """
 
     cameras: tuple[str, ...]
@@ -41,6 +49,7 @@ class PolicySpec:
     centred: bool = True
     antialias: bool = True
     instructions: tuple[str, ...] = ()
+    execution: str = "naive"
 
 
 @dataclass(frozen=True)
@@ -109,6 +118,10 @@ class Request:
         adapter: name of an adapter, or None.
         reset: whether an episode starts.
         actions: number of action dimensions to return.
+        executed: s, actions of the previous chunk that the robot has executed; None: the new chunk
+            does not continue it.
+        delay: d, further actions of the previous chunk that the robot will execute.
+        previous: f32 `[C, J+1]`, the previous chunk. The session knows it.
     """
 
     images: Mapping[str, np.ndarray] = field(repr=False)
@@ -117,6 +130,9 @@ class Request:
     adapter: str | None
     reset: bool
     actions: int
+    executed: int | None = None
+    delay: int = 0
+    previous: np.ndarray | None = field(default=None, repr=False)
 
 
 def parse(message: Any, spec: PolicySpec) -> Request:
@@ -134,6 +150,7 @@ def parse(message: Any, spec: PolicySpec) -> Request:
         raise ValueError(
             f"{' and '.join(form.state)} must have {spec.state_dim} values, got {state.size}"
         )
+    executed, delay = _progress(message, spec)
     reset = message.get("reset", False)
     if not isinstance(reset, bool | np.bool_):
         raise ValueError(f"reset must be true or false, got {type(reset).__name__}")
@@ -144,7 +161,30 @@ def parse(message: Any, spec: PolicySpec) -> Request:
         adapter=_text("adapter", message.get("adapter")),
         reset=bool(reset),
         actions=min(form.actions or spec.state_dim, spec.state_dim),
+        executed=executed,
+        delay=delay,
     )
+
+
+def _progress(message: Mapping[str, Any], spec: PolicySpec) -> tuple[int | None, int]:
+    """Return how many actions of the previous chunk were executed, and how many more will be."""
+    executed, delay = message.get("executed"), message.get("delay", 0)
+    if executed is None and delay == 0:
+        return None, 0
+    for name, value, most in (("executed", executed, spec.chunk), ("delay", delay, spec.chunk)):
+        if type(value) is not int or not 0 <= value <= most:
+            raise ValueError(f"{name} must be an integer from 0 to {most}, got {str(value)[:40]}")
+    if executed + delay > spec.chunk:
+        raise ValueError(
+            f"executed and delay must be at most {spec.chunk} together, the length of a chunk, got "
+            f"{executed} and {delay}"
+        )
+    if spec.execution == "naive":
+        raise ValueError(
+            "this server's chunks do not continue the previous one: start it with --execution "
+            "trained or guided, or leave out executed and delay"
+        )
+    return executed, delay
 
 
 def _form(message: Mapping[str, Any]) -> Form:

@@ -143,6 +143,7 @@ class PolicyServer:
             raise wire.FrameError("a request must be a binary frame")
         adapter, row, actions = await asyncio.to_thread(self._read, session, frame)
         answer = await self._batcher.infer(session.client, adapter, row)
+        session.previous = answer.actions
         infer_ms = (time.perf_counter() - start) * 1e3
         timing = {"infer_ms": infer_ms}
         if session.previous_ms is not None:
@@ -165,7 +166,7 @@ class PolicyServer:
         if adapter not in self._policy.adapters:
             known = ", ".join(self._policy.adapters)
             raise ValueError(f"adapter must be one of {known}, got {adapter!r}")
-        row = self._policy.prepare(request, session.advance(request.reset))
+        row = self._policy.prepare(*session.advance(request))
         return adapter, row, request.actions
 
     async def _refuse(self, connection: ServerConnection, sentence: str) -> None:
@@ -188,6 +189,7 @@ def describe(policy: BatchPolicy) -> dict[str, Any]:
         "action_horizon": spec.chunk,
         "adapters": list(policy.adapters),
         "instructions": list(spec.instructions),
+        "execution": spec.execution,
     }
 
 

@@ -21,6 +21,7 @@ from lorasp_jax.serving import loading
 from lorasp_jax.serving.client import PolicyClient
 from lorasp_jax.serving.loading import Checkpoint
 from lorasp_jax.training import export
+from lorasp_jax.training.run_folder import write_json
 from tests import ROOT
 from tests.models.random_models import random_backbone, with_noise
 from tests.runs import CONFIG, make_run
@@ -58,6 +59,14 @@ def test_a_run_is_loaded(run):
     assert list(loaded.policies) == list(loaded.words) == ["a", "b"]
     assert loaded.metadata == {"robot": "piper", "control_dt": 0.1}
     assert loaded.policies["a"].processor.prompts.instructions[0] == "press the button"
+
+
+def test_only_trained_runs_can_continue_chunks_as_trained(tmp_path):
+    write_json(tmp_path / "config.json", {"optim": {"rtc_max_delay": 2}})
+    loading.check_trained([str(tmp_path)])
+    write_json(tmp_path / "config.json", {"optim": {}})
+    with pytest.raises(ValueError, match=r"was not trained to continue chunks"):
+        loading.check_trained([str(tmp_path)])
 
 
 def test_runs_of_different_robots_are_not_served_together(run, tmp_path, monkeypatch):

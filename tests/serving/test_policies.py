@@ -31,9 +31,9 @@ def make_policy(config=None, *, seed=0, instructions=INSTRUCTIONS, cameras=None)
     return Policy(random_backbone(config, seed=seed), processor)
 
 
-def compiled(policies, **options):
+def compiled(policies, steps=2, **options):
     words = dict.fromkeys(policies, WORDS)
-    return CompiledPolicies(policies, words, max_batch=2, num_steps=2, **options)
+    return CompiledPolicies(policies, words, max_batch=2, num_steps=steps, **options)
 
 
 def request(spec, seed=0, prompt=INSTRUCTIONS[1], absent=()):
@@ -91,14 +91,59 @@ def test_everything_in_a_request_matters(served):
     assert all(np.abs(first - other).max() > 1e-4 for other in changed)
 
 
-def test_programs_are_shared_and_compiled_in_advance(served):
-    progress = []
-    served.warm_up(lambda *step: progress.append(step))
+@pytest.fixture(scope="module", params=["trained", "guided"])
+def continuing(request):
+    return compiled({"base": make_policy()}, execution=request.param)
+
+
+def test_a_chunk_continues_what_remains_of_the_previous_one(continuing):
+    """The rows of a batch may differ in how much remains and is executed."""
+    policy, spec = make_policy(), continuing.spec
+    previous = np.random.default_rng(5).normal(size=(2, spec.chunk, 7)).astype(np.float32)
+    sent = [
+        dataclasses.replace(request(spec, i), executed=s, delay=d, previous=previous[i])
+        for i, (s, d) in enumerate([(1, 2), (2, 1)])
+    ]
+    found = actions(continuing, *sent)
+    for i, (s, d) in enumerate([(1, 2), (2, 1)]):
+        raw = {
+            "image": {k: v[None] for k, v in sent[i].images.items()},
+            "state": sent[i].state[None],
+        }
+        noise = jax.random.normal(
+            jax.random.fold_in(jax.random.key(0), 0),
+            (1, spec.chunk, policy.model.config.action_dim),
+        )
+        chunk = policy.model.sample_actions(
+            None,
+            policy.processor.encode(raw, np.array([1])),
+            num_steps=2,
+            noise=noise,
+            slots=policy.processor.flow_slots,
+            prefix=policy.processor.normalize_actions(previous[i : i + 1, s:]),
+            prefix_length=d,
+            guidance=10.0 if spec.execution == "guided" else None,
+        )
+        np.testing.assert_allclose(found[i], policy.processor.decode(chunk)[0], atol=1e-4)
+        if spec.execution == "trained":
+            np.testing.assert_allclose(found[i, :d], previous[i, s : s + d], atol=1e-5)
+
+
+def test_a_chunk_without_a_previous_one_is_independent(continuing, served):
+    sent = request(served.spec)
+    np.testing.assert_allclose(actions(continuing, sent), actions(served, sent), atol=1e-5)
+    done = dataclasses.replace(sent, executed=served.spec.chunk, previous=np.ones((4, 7)))
+    np.testing.assert_allclose(actions(continuing, done), actions(served, sent), atol=1e-5)
+
+
+def test_programs_are_shared_and_compiled_in_advance():
+    fresh, progress = compiled({"base": make_policy(), "other": make_policy(seed=1)}, steps=1), []
+    earlier = fresh._sample._cache_size()  # JAX counts those of `served` too
+    fresh.warm_up(lambda *step: progress.append(step))
     assert progress == [("base", 1), ("base", 2), ("other", 1), ("other", 2)]
-    compilations = served._sample._cache_size()
-    assert compilations == 2
-    actions(served, request(served.spec, prompt="open the pot"), adapter="other")
-    assert served._sample._cache_size() == compilations
+    assert fresh._sample._cache_size() == earlier + 2
+    actions(fresh, request(fresh.spec, prompt="open the pot"), adapter="other", index=7)
+    assert fresh._sample._cache_size() == earlier + 2
 
 
 def test_prompts(served):

@@ -1,6 +1,7 @@
 """Test the request forms: openpi's examples are understood, and mistakes get a sentence."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -126,6 +127,41 @@ BLANK = np.zeros((16, 16, 3), np.float32)
 def test_mistakes(changes, sentence):
     with pytest.raises(ValueError, match=sentence):
         parse(changed(observation(), **changes), SPEC)
+
+
+def test_continuing_a_chunk():
+    trained = dataclasses.replace(SPEC, execution="trained")
+    for changes, expected in (
+        ({}, (None, 0)),
+        ({"delay": 0}, (None, 0)),
+        ({"executed": 4}, (4, 0)),
+        ({"executed": 4, "delay": 6}, (4, 6)),
+        ({"executed": 10}, (10, 0)),
+    ):
+        request = parse(observation(**changes), trained)
+        assert (request.executed, request.delay) == expected
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"executed": 11}, "executed must be an integer from 0 to 10, got 11"),
+        ({"executed": -1}, "executed must be an integer from 0 to 10, got -1"),
+        ({"executed": 2.0}, "executed must be an integer from 0 to 10, got 2.0"),
+        ({"executed": True}, "executed must be an integer from 0 to 10, got True"),
+        ({"executed": 0, "delay": "1"}, "delay must be an integer from 0 to 10, got 1"),
+        ({"delay": 1}, "executed must be an integer from 0 to 10, got None"),
+        ({"executed": 6, "delay": 5}, "must be at most 10 together, the length of a chunk"),
+    ],
+)
+def test_mistakes_in_continuing_a_chunk(changes, sentence):
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        parse(observation(**changes), dataclasses.replace(SPEC, execution="guided"))
+
+
+def test_a_server_whose_chunks_are_independent_says_so():
+    with pytest.raises(ValueError, match="start it with --execution trained or guided"):
+        parse(observation(executed=0), SPEC)
 
 
 @pytest.mark.parametrize("message", [None, 3, [], {b"state": 1}, {3: 4}])

@@ -60,6 +60,20 @@ def test_a_reset_starts_an_episode_of_this_connection_only(server):
     assert numbers == [0, 1, 0, 0, 1, 1]
 
 
+def test_a_session_keeps_the_previous_chunk():
+    policy = StandIn(dataclasses.replace(SPEC, execution="trained"))
+    with serving(policy) as server, connect(server) as client:
+        first = client.infer(observation())["actions"]
+        client.infer(observation(executed=2, delay=1))
+        np.testing.assert_array_equal(policy.last_request.previous, first)
+        client.reset()
+        client.infer(observation())
+        assert policy.last_request.previous is None
+        client.reset()
+        with pytest.raises(PolicyError, match="first request of an episode must not have the key"):
+            client.infer(observation(executed=2))
+
+
 def test_forms_of_openpi_get_as_many_dimensions_as_their_clients_expect():
     spec = dataclasses.replace(SPEC, state_dim=8)
     picture = np.zeros((16, 16, 3), np.uint8)
