@@ -38,7 +38,8 @@ def parser(program: str) -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--config", type=Path, required=True, help="study file with get_study(scale)")
     add("--scale", choices=SCALES, default="accelerator", help="size preset (default: accelerator)")
-    add("--only", metavar="PATTERN", default="*", help="cells to run, such as 'pi0/multi/*'")
+    text = "cells to run, such as 'pi0/multi/*'"
+    add("--only", metavar="PATTERN", nargs="+", default=["*"], help=text)
     add("--jobs", type=_positive, default=1, metavar="N", help="processes that share the device")
     add("--shard", type=_shard, default=(1, 1), metavar="I/N", help="run the I-th of N parts")
     add("--dry-run", action="store_true", help="list the cells, then exit")

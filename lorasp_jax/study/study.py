@@ -2,7 +2,7 @@
 
 import fnmatch
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -143,18 +143,23 @@ def load(path: Path, scale: str) -> Study:
     return study
 
 
-def select(study: Study, only: str, shard: tuple[int, int]) -> list[str]:
-    """Return the names of a shard's cells that match a shell pattern.
+def select(study: Study, only: Sequence[str], shard: tuple[int, int]) -> list[str]:
+    """Return the names of a shard's cells that match one of some shell patterns.
 
     Groups are dealt out in turn, so that every cell is in one shard.
 
     Raises:
-        ValueError: no cell of the study matches.
+        ValueError: no cell of the study matches one of the patterns.
     """
-    matching = {cell.name for cell in study.cells if fnmatch.fnmatchcase(cell.name, only)}
-    if not matching:
-        first = study.cells[0].name if study.cells else "none"
-        raise ValueError(f"no cell of {study.name} matches {only!r}; the first cell is {first}")
+    matching = set[str]()
+    for pattern in only:
+        found = {cell.name for cell in study.cells if fnmatch.fnmatchcase(cell.name, pattern)}
+        if not found:
+            first = study.cells[0].name if study.cells else "none"
+            raise ValueError(
+                f"no cell of {study.name} matches {pattern!r}; the first cell is {first}"
+            )
+        matching |= found
     index, count = shard
     groups = list(study.groups.values())[index - 1 :: count]
     return [cell.name for group in groups for cell in group if cell.name in matching]
