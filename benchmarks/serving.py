@@ -129,6 +129,21 @@ def measure(command: Sequence[str], calls: int) -> list[tuple[float, np.ndarray]
             server.terminate()
 
 
+def latency_rows(name: str, times: np.ndarray) -> list[dict[str, Any]]:
+    """Return the table's rows for one policy; `times` is as in `measure`."""
+    total, server, policy = times.T
+    parts = {
+        "call": total,
+        "policy": policy,
+        "overhead": total - policy,
+        "in server": server - policy,
+    }
+    return [
+        {"policy": name, "ms": part, **dict(zip(COLUMNS, summary(values), strict=True))}
+        for part, values in parts.items()
+    ]
+
+
 def main() -> None:
     """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
@@ -148,23 +163,14 @@ def main() -> None:
     latencies, throughputs = [], []
     for name, command in servers.items():
         (one, times), (eight, times_of_eight) = measure(command, options.calls)
-        total, server, policy = times.T
-        parts = {
-            "call": total,
-            "policy": policy,
-            "overhead": total - policy,
-            "in server": server - policy,
-        }
-        for part, values in parts.items():
-            columns = dict(zip(COLUMNS, summary(values), strict=True))
-            latencies.append({"policy": name, "ms": part, **columns})
+        latencies += latency_rows(name, times)
         throughputs.append(
             {
                 "policy": name,
                 "1 client": one,
                 "8 clients": eight,
                 "ratio": eight / one,
-                "policy ms, 1": float(np.median(policy)),
+                "policy ms, 1": float(np.median(times[:, 2])),
                 "8": float(np.median(times_of_eight[:, 2])),
             }
         )

@@ -14,6 +14,9 @@ from rich.console import Console
 
 from envs.cli.errors import parse_arguments, run_command
 
+CHECKPOINT_OPTIONS = ("statistics", "dataset", "joints", "size", "dtype", "camera", "adapter")
+"""Options that say what the files of a published checkpoint do not."""
+
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.serving") -> int:
     """Serve until SIGINT or SIGTERM; return the exit code, one of `envs.cli.errors`."""
@@ -59,7 +62,12 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--guidance", type=float, default=10.0, help="limit of the guidance (default: %(default)s)")
     add("--base", default="", help="the run's base, if it has moved")
     add("--tokenizer", default="", help="the policy's tokenizer; runs record theirs")
-    checkpoint = parser.add_argument_group("published checkpoints").add_argument
+    _add_checkpoint_options(parser.add_argument_group("published checkpoints"))
+    return parser
+
+
+def _add_checkpoint_options(group: Any) -> None:
+    checkpoint = group.add_argument
     checkpoint(
         "--statistics", default="", help="normalization statistics, if not in the checkpoint"
     )
@@ -70,7 +78,6 @@ def parser(program: str) -> argparse.ArgumentParser:
     pair = {"action": "append", "default": [], "metavar": "NAME=VALUE"}
     checkpoint("--camera", **pair, help="the backbone's camera = the robot's camera, repeatedly")
     checkpoint("--adapter", **pair, help="name = adapter folder, repeatedly; see docs/serving.md")
-    return parser
 
 
 def _serve(options: argparse.Namespace, console: Console) -> None:
@@ -112,23 +119,12 @@ async def _run(policy_server: Any, port: socket.socket, tls: Any, console: Conso
 def _load(options: argparse.Namespace, console: Console) -> tuple[Any, dict[str, Any]]:
     """Load and compile the policies, saying what takes long."""
     from envs.compilation import cache
-    from lorasp_jax.serving import loading
     from lorasp_jax.serving.policies import CompiledPolicies, batch_sizes
 
     sizes, start = batch_sizes(options.max_batch), time.monotonic()
-    named = dict(map(_named, options.policy))
-    if len(named) < len(options.policy):
-        raise ValueError("the policies must have different names: pass NAME=POLICY")
     cache.enable()
-    _say(console, f"loading {', '.join(named.values())}")
-    if all(map(loading.is_run, named.values())):
-        loaded = loading.load_runs(named, base=options.base, words=options.tokenizer)
-        if options.execution == "trained":
-            loading.check_trained(named.values())
-    elif len(named) == 1:
-        loaded = loading.load_checkpoint(_checkpoint(options, *named.values()))
-    else:
-        raise ValueError("several policies must all be folders of finished runs")
+    _say(console, f"loading {', '.join(options.policy)}")
+    loaded = _loaded(options)
     policy = CompiledPolicies(
         loaded.policies,
         loaded.words,
@@ -151,6 +147,31 @@ def _load(options: argparse.Namespace, console: Console) -> tuple[Any, dict[str,
     return policy, loaded.metadata
 
 
+def _loaded(options: argparse.Namespace) -> Any:
+    """Load the runs or the checkpoint."""
+    from lorasp_jax.serving import loading
+
+    named = dict(map(_named, options.policy))
+    if len(named) < len(options.policy):
+        raise ValueError("the policies must have different names: pass NAME=POLICY")
+    if all(map(loading.is_run, named.values())):
+        _refuse(options, CHECKPOINT_OPTIONS, "is for published checkpoints: runs record theirs")
+        if options.execution == "trained":
+            loading.check_trained(named.values())
+        return loading.load_runs(named, base=options.base, words=options.tokenizer)
+    if len(named) > 1:
+        raise ValueError("several policies must all be folders of finished runs")
+    _refuse(options, ("base",), "is for runs")
+    return loading.load_checkpoint(_checkpoint(options, *named.values()))
+
+
+def _refuse(options: argparse.Namespace, names: Sequence[str], reason: str) -> None:
+    """Raise ValueError if one of these options was given, since it would have no effect."""
+    for name in names:
+        if getattr(options, name):
+            raise ValueError(f"--{name} {reason}")
+
+
 def _checkpoint(options: argparse.Namespace, where: str) -> Any:
     from lorasp_jax.serving.loading import Checkpoint
 
@@ -169,8 +190,9 @@ def _checkpoint(options: argparse.Namespace, where: str) -> Any:
 
 def _named(text: str) -> tuple[str, str]:
     """Split NAME=POLICY; without a name, the last part of the path is the name."""
-    name, equals, where = text.partition("=")
-    return (name, where) if equals else (Path(text).name, text)
+    if "=" not in text or Path(text).exists():  # a path may contain the character
+        return Path(text).name, text
+    return _pair(text)
 
 
 def _pair(text: str) -> tuple[str, str]:

@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lorasp_jax.policies.policy import Policy
-from lorasp_jax.policies.prompt_table import Ids, PromptTable
+from lorasp_jax.policies.policy import Observation, Policy
+from lorasp_jax.policies.processor import Processor
+from lorasp_jax.policies.prompt_table import Ids
 from lorasp_jax.policies.tokenizer import Tokenizer
 from lorasp_jax.serving.requests import PolicySpec, Request
 
@@ -217,6 +218,21 @@ def _remaining(request: Request, spec: PolicySpec) -> dict[str, np.ndarray]:
     }
 
 
+def _encode(processor: Processor, rows: Rows) -> Observation:
+    """Convert rows to model input, masking cameras without a picture."""
+    prompts = dataclasses.replace(processor.prompts, start=Ids(rows.ids, rows.mask))
+    observation = dataclasses.replace(processor, prompts=prompts).encode(
+        {"image": rows.images, "state": rows.state}, jnp.arange(len(rows.state))
+    )
+    images, masks = dict(observation.images), dict(observation.image_masks)
+    sources = dict(processor.cameras) or {name: name for name in rows.images}
+    for name, source in sources.items():
+        if source is not None:
+            masks[name] = rows.present[source]
+            images[name] = jnp.where(rows.present[source][:, None, None, None], images[name], -1)
+    return dataclasses.replace(observation, images=images, image_masks=masks)
+
+
 def _sample(
     policy: Policy,
     key: jax.Array,
@@ -227,20 +243,7 @@ def _sample(
     continues: bool,
 ) -> jax.Array:
     """Sample `[B, C, J+1]`; a row's result does not depend on the other rows."""
-    prompts: PromptTable = dataclasses.replace(
-        policy.processor.prompts, start=Ids(jnp.asarray(rows.ids), jnp.asarray(rows.mask))
-    )
-    processor = dataclasses.replace(policy.processor, prompts=prompts)
-    observation = processor.encode(
-        {"image": rows.images, "state": rows.state}, jnp.arange(len(rows.state))
-    )
-    sources = dict(processor.cameras) or {name: name for name in rows.images}
-    images, masks = dict(observation.images), dict(observation.image_masks)
-    for name, source in sources.items():
-        if source is not None:
-            masks[name] = rows.present[source]
-            images[name] = jnp.where(rows.present[source][:, None, None, None], images[name], -1)
-    config = policy.model.config
+    processor, config = policy.processor, policy.model.config
     noise = jax.vmap(
         lambda i: jax.random.normal(jax.random.fold_in(key, i), (config.chunk, config.action_dim))
     )(rows.index)
@@ -254,7 +257,7 @@ def _sample(
         }
     chunk = policy.model.sample_actions(
         key,
-        dataclasses.replace(observation, images=images, image_masks=masks),
+        _encode(processor, rows),
         num_steps=num_steps,
         noise=noise,
         slots=processor.flow_slots,

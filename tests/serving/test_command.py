@@ -114,12 +114,27 @@ def test_checkpoints_that_do_not_say_enough(base):
         (["a", "--certificate", "x", "--key", "y"], "cannot use x with y"),
         (["a", "--token-file", "nothing"], "nothing: No such file"),
         (["a", "--max-batch", "0"], "the largest batch must be at least 1"),
+        (["=x"], "expected NAME=VALUE, got '=x'"),
+        (["assets/pi0_nano", "--base", "x"], "--base is for runs"),
         (["assets/pi0_nano", "--camera", "side"], "expected NAME=VALUE, got 'side'"),
     ],
 )
 def test_mistakes_get_one_sentence(arguments, sentence, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     assert sentence in refuse(capsys, *arguments, "--port", "0").replace("\n", " ")
+
+
+def test_options_without_effect_are_refused(run, capsys):
+    for option in ("--statistics", "--joints", "--adapter"):
+        error = refuse(capsys, str(run), option, "1", "--port", "0").replace("\n", " ")
+        assert f"{option} is for published checkpoints: runs record theirs" in error
+
+
+def test_names_of_policies(tmp_path):
+    assert command._named("runs/press") == ("press", "runs/press")
+    assert command._named("a=runs/press") == ("a", "runs/press")
+    (tmp_path / "lr=0.1").mkdir()
+    assert command._named(str(tmp_path / "lr=0.1")) == ("lr=0.1", str(tmp_path / "lr=0.1"))
 
 
 def test_an_empty_token_is_refused(tmp_path, capsys):
