@@ -23,7 +23,7 @@ from lorasp_jax.evaluation.latency.execution import (
     delayed_rollout,
 )
 from lorasp_jax.evaluation.latency.smoothness import action_delta, jerk
-from lorasp_jax.evaluation.metrics import wilson_interval
+from lorasp_jax.evaluation.metrics import position_bias, wilson_interval
 from lorasp_jax.evaluation.programs import prepared
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training import records
@@ -139,11 +139,17 @@ def measure_point(
     episodes: int,
     delay: int,
 ) -> dict[str, Any]:
-    """Run episodes, a multiple of `env.num_envs`, at one delay; return a `POINT`."""
+    """Run episodes, a multiple of `env.num_envs`, at one delay; return a `POINT`.
+
+    Raises:
+        ValueError: success depends on an episode's position in its batch, see `position_bias`.
+    """
     keys = jax.random.split(key, episodes // env.num_envs)
     traces = [rollout(policy, batch_key, delay) for batch_key in keys]
     fields = (field.name for field in dataclasses.fields(Trace))
     trace = Trace(*(np.concatenate([getattr(t, name) for t in traces]) for name in fields))
+    if bias := position_bias([trace.success]):
+        raise ValueError(bias)
     successes = int(trace.success.sum())
     return {
         "delay": delay,

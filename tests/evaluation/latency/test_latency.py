@@ -1,6 +1,7 @@
 """The command: what it measures, its files, and its errors on one line."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -140,6 +141,18 @@ def test_runs_that_cannot_be_measured(folder, capsys):
     assert "cannot be simulated" in refused(capsys, folder)
     (folder / "results.json").unlink()
     assert "no finished run in" in refused(capsys, folder)
+
+
+def test_results_of_a_miscompiled_program_are_refused():
+    """Every other episode of a batch succeeds."""
+    env = SimpleNamespace(num_envs=128, control_dt=0.1)
+    odd = np.arange(128) % 2 == 1
+    arguments = (None, env, lambda *_: trace, jax.random.key(0), 256, 0)
+    trace = Trace(odd, np.full(128, 4), np.zeros((128, 4, 7)))
+    with pytest.raises(ValueError, match="success depends on bit 0 of an episode's index"):
+        curve.measure_point(*arguments)
+    trace = dataclasses.replace(trace, success=np.ones(128, bool))
+    assert curve.measure_point(*arguments)["success"] == 1
 
 
 def test_the_figure_averages_over_tasks():
