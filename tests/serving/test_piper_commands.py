@@ -9,6 +9,7 @@ import pytest
 from envs.rendering.video import write_video
 from envs.tasks import press
 from lorasp_jax.data.opening import open_source
+from lorasp_jax.serving.client import PolicyClient
 from lorasp_jax.serving.fake_piper.__main__ import main as fake
 from lorasp_jax.serving.fake_piper.firmware import FakePiper
 from lorasp_jax.serving.fake_piper.timing import RealTime
@@ -18,7 +19,7 @@ from lorasp_jax.serving.piper.__main__ import HELD
 from lorasp_jax.serving.piper.__main__ import main as real
 from lorasp_jax.serving.piper.arm import PiperArm
 from tests.serving.benches import channel
-from tests.serving.stand_in import StandIn, serving
+from tests.serving.stand_in import SPEC, StandIn, serving
 
 
 class Still(StandIn):
@@ -69,6 +70,19 @@ def test_a_served_policy_on_the_fake_arm(server, tmp_path, capsys, monkeypatch, 
     assert "episode 0: failure\n" in capsys.readouterr().out
     assert server.policy.last_request.images["wrist"].shape == (16, 16, 3)
     assert server.policy.last_request.prompt
+
+
+@pytest.mark.parametrize("execution", ["naive", "guided"])
+def test_only_servers_that_continue_chunks_are_told_how_far_the_arm_is(execution):
+    policy = Still(dataclasses.replace(SPEC, execution=execution))
+    with serving(policy) as server, PolicyClient(server.address) as client:
+        ask = options.Server(client)
+        state, large = np.zeros(7, np.float32), np.zeros((48, 64, 3), np.uint8)
+        question = {"image": {"side": large, "wrist": large}, "state": state, "prompt": "go"}
+        assert ask(question).shape == (10, 7)
+        assert ask(question | {"executed": 5, "delay": 3}).shape == (10, 7)
+    told = policy.last_request.executed, policy.last_request.delay
+    assert told == ((None, 0) if execution == "naive" else (5, 3))
 
 
 @pytest.mark.parametrize(

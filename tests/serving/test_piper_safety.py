@@ -128,6 +128,13 @@ def test_a_far_first_target_is_approached_slowly():
     assert not governor.approaching
 
 
+def test_a_first_target_beyond_the_limits_is_reached_at_the_limit():
+    governor = started(pose=shifted(5, 1.9))
+    follow(governor, [shifted(5, 3.0)] * 300)
+    assert not governor.approaching
+    assert governor.pose[5] == pytest.approx(LIMITS.upper[5])
+
+
 def test_a_near_first_target_is_not():
     governor = started()
     governor.step(shifted(0, np.deg2rad(4.9)))

@@ -140,10 +140,11 @@ def test_the_arm_waits_for_a_slow_answer(bench):
 
 def test_asking_ahead_skips_what_is_past(bench):
     start = bench.clock.now()
-    answers = []
+    answers, keys = [], []
 
     def ask(observation):
         """Actions that say for which time they are."""
+        keys.append((observation.get("executed"), observation.get("delay")))
         now = bench.clock.now() - start
         answers.append(now)
         times = now + 0.1 * np.arange(1, 11)
@@ -152,6 +153,7 @@ def test_asking_ahead_skips_what_is_past(bench):
     base = bench.arm.read().pose
     run = Run(bench, ask, latency=0.2, settings={"ahead": 3})
     run(2.0)
+    assert keys == [(None, None)] + [(5, 3)] * (len(keys) - 1)
     assert np.diff(answers)[1:] == pytest.approx(0.5, abs=0.011)
     times = np.arange(len(run.path)) * PERIOD
     late = times > 1.2  # the first chunk could not be asked for ahead
@@ -181,6 +183,20 @@ def test_frames_that_stop_for_good(bench):
     assert_holds(run, "no feedback from the arm")
 
 
+def test_going_on_starts_from_the_measured_pose(bench):
+    run, pushed = Run(bench, Turning(), hold=5.0), []
+
+    def push():
+        bench.fake.faults.silent = False
+        bench.world.data.qpos[0] += 0.3  # meanwhile somebody has moved the arm
+        pushed.append(bench.world.pose[0])
+
+    run.at = {0.5: lambda: vars(bench.fake.faults).update(silent=True), 0.7: push}
+    run(0.9)
+    jump = np.abs(np.diff(run.path[:, 0])).argmax() + 1
+    assert run.path[jump, 0] == pytest.approx(pushed[0], abs=0.05)
+
+
 @pytest.mark.parametrize(
     ("faults", "words"),
     [
@@ -190,9 +206,16 @@ def test_frames_that_stop_for_good(bench):
     ],
 )
 def test_an_arm_with_a_fault_holds_where_it_is(bench, faults, words):
-    run = Run(bench, Turning())
-    run.at = {0.5: lambda: vars(bench.fake.faults).update(faults)}
+    run, seen = Run(bench, Turning()), []
+
+    def fail():
+        vars(bench.fake.faults).update(faults)
+        seen.append(bench.world.pose)
+
+    run.at = {0.5: fail}
     assert words in run(5.0)
+    if "zeros" not in faults:  # it does not push on against what stopped it
+        assert run.path[-1, 0] == pytest.approx(seen[0][0], abs=0.012)
     assert_holds(run, words, jump=0.03)
     assert np.abs(run.path[-1] - sessions.REST)[:6].max() > 0.5
 
@@ -220,7 +243,8 @@ def test_a_person_who_guides_the_arm_gets_it(bench):
 def test_a_chunk_with_nan_is_refused_and_the_arm_goes_to_rest(bench):
     ask = Turning()
     run = Run(bench, ask)
-    run.at = {0.3: lambda: setattr(ask, "change", lambda actions: actions * np.nan)}
+    last = np.where(np.arange(10) < 9, 1.0, np.nan)[:, None]  # an action that is not executed
+    run.at = {0.3: lambda: setattr(ask, "change", lambda actions: actions * last)}
     assert "actions must be finite" in run(30.0)
     np.testing.assert_allclose(bench.world.pose[:6], sessions.REST[:6], atol=0.03)
     assert run.said == [run.said[0], "moving slowly to the rest pose"]

@@ -36,7 +36,8 @@ def parser(program: str) -> argparse.ArgumentParser:
     """Return the argument parser of this command."""
     parser = argparse.ArgumentParser(
         prog=program,
-        description="Run a policy on an AgileX PiPER, or record demonstrations.",
+        description="Run a policy on an AgileX PiPER, or record demonstrations. "
+        "Read docs/robot.md first.",
         epilog="Ctrl-C brakes and holds. An emergency stop lets the arm sink: keep it for people.",
     )
     add = parser.add_argument

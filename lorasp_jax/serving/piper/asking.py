@@ -9,7 +9,8 @@ import numpy as np
 from lorasp_jax.serving.piper.clock import Clock
 
 Observation = Mapping[str, Any]
-"""`image`: camera -> uint8 [H, W, 3]; `state`: f32 [7]; `prompt`: the request in words."""
+"""`image`: camera -> uint8 [H, W, 3]; `state`: f32 [7]; `prompt`: the request in words; `executed`
+and `delay` as in `lorasp_jax.serving.requests`, if the arm does not wait for the answer."""
 Ask = Callable[[Observation], Any]
 """Return actions [C, 7] for an observation; may raise what `PolicyClient.infer` raises."""
 

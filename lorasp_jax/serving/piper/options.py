@@ -20,6 +20,7 @@ from lorasp_jax.serving.piper.safety import Limits
 from lorasp_jax.serving.piper.session import Session, Settings
 from lorasp_jax.serving.piper.teaching import Lesson
 
+_CONTINUATION = ("executed", "delay")  # keys for servers whose chunks continue the previous one
 _WAIT = 60.0  # s to wait for a server that is still compiling
 
 
@@ -42,7 +43,7 @@ def add_shared(parser: argparse.ArgumentParser) -> None:
         "--effort", type=int, default=1000, help="of the gripper [0.001 N m] (default: %(default)s)"
     )
     add("--zeros", choices=("sdk", "urdf"), default="sdk", help="the firmware's zeros of joints 2 "
-        "and 3: sdk for newer firmware (default: %(default)s)")  # fmt: skip
+        "and 3, see docs/robot.md (default: %(default)s)")  # fmt: skip
     add("--box", type=float, nargs=6, metavar=("X0", "X1", "Y0", "Y1", "Z0", "Z1"),
         help="space for the finger tips in the base frame [m]")  # fmt: skip
 
@@ -95,6 +96,8 @@ class Server:
         """Wrap a connection."""
         self._client = client
         self._size = client.metadata.get("image_size")
+        continues = client.metadata.get("execution", "naive") != "naive"
+        self._unknown = () if continues else _CONTINUATION
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -114,7 +117,8 @@ class Server:
         pictures = observation["image"]
         if isinstance(self._size, int) and self._size > 0:
             pictures = {name: to_square(name, x, self._size) for name, x in pictures.items()}
-        reply = self._client.infer({**observation, "image": pictures})
+        known = {key: x for key, x in observation.items() if key not in self._unknown}
+        reply = self._client.infer({**known, "image": pictures})
         if "actions" not in reply:
             raise PolicyError(f"the server's reply has no actions, only {', '.join(reply)}")
         return reply["actions"]

@@ -197,6 +197,9 @@ class Session:
         images = self._cameras.read()
         state = reading.pose.astype(np.float32)
         observation = {"image": images, "state": state, "prompt": self._settings.prompt}
+        if self._settings.ahead and self._path:  # the new chunk may continue the previous one
+            executed = round((now - self._start) / self._settings.control_dt)
+            observation |= {"executed": executed, "delay": self._settings.ahead}
         if self._log:
             self._log.observation(now, observation)
         self._asker.ask(observation)
