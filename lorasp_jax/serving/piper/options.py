@@ -21,7 +21,7 @@ from lorasp_jax.serving.piper.session import Session, Settings
 from lorasp_jax.serving.piper.teaching import Lesson
 
 _CONTINUATION = ("executed", "delay")  # keys for servers whose chunks continue the previous one
-_WAIT = 60.0  # s to wait for a server that is still compiling
+_WAIT = 300.0  # s to wait for a server that is still compiling
 
 
 def add_shared(parser: argparse.ArgumentParser) -> None:
