@@ -148,7 +148,7 @@ def measure_point(
     traces = [rollout(policy, batch_key, delay) for batch_key in keys]
     fields = (field.name for field in dataclasses.fields(Trace))
     trace = Trace(*(np.concatenate([getattr(t, name) for t in traces]) for name in fields))
-    if bias := position_bias([trace.success]):
+    if bias := position_bias([trace.success.tolist()]):
         raise ValueError(bias)
     successes = int(trace.success.sum())
     return {
