@@ -65,7 +65,16 @@ def test_a_server_that_stops():
     client.close()
 
 
-def test_an_interrupted_call_closes_the_connection(monkeypatch):
+@pytest.fixture
+def interruptible():
+    """Make SIGINT raise KeyboardInterrupt; a shell's background processes ignore it."""
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, previous)
+
+
+@pytest.mark.usefixtures("interruptible")
+def test_an_interrupted_call_closes_the_connection():
     """As its reply could be taken for the next one."""
     policy = StandIn()
     with serving(policy) as server, connect(server) as client:
