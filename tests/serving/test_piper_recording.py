@@ -8,29 +8,15 @@ from envs.robots.piper import SDK_OFFSET
 from lorasp_jax.data.opening import open_source
 from lorasp_jax.serving.fake_piper import frames
 from lorasp_jax.serving.fake_piper.demonstrator import Demonstrator
-from lorasp_jax.serving.fake_piper.world import World
 from lorasp_jax.serving.piper.asking import InTurn
 from lorasp_jax.serving.piper.cameras import Simulated
 from lorasp_jax.serving.piper.recording import Recording
 from lorasp_jax.serving.piper.safety import Limits, Unsafe
 from lorasp_jax.serving.piper.session import Session, Settings
 from lorasp_jax.serving.piper.teaching import Lesson
-from tests.serving.benches import Bench
 
 LIMITS = Limits.of()
 WAYS = {"task": "press", "instructions": ("press it", "push it"), "control_dt": 0.1}
-
-
-@pytest.fixture(scope="module")
-def world():
-    return World("press", image_size=16)
-
-
-@pytest.fixture
-def bench(world):
-    bench = Bench(world).ready(LIMITS)
-    yield bench
-    bench.close()
 
 
 def recording(folder, prompt="push it", **more):

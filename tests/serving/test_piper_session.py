@@ -9,7 +9,6 @@ from PIL import Image
 
 from lorasp_jax.serving.client import PolicyClient, ServerGone
 from lorasp_jax.serving.fake_piper.demonstrator import Demonstrator
-from lorasp_jax.serving.fake_piper.world import World
 from lorasp_jax.serving.piper import session as sessions
 from lorasp_jax.serving.piper.asking import InThread, InTurn
 from lorasp_jax.serving.piper.cameras import NoPicture, Simulated
@@ -22,18 +21,6 @@ from tests.serving.stand_in import StandIn, serving
 
 LIMITS = Limits.of()
 ARM_STEP = np.array([0.03, 0, 0, 0, 0, 0, 0])  # rad per action
-
-
-@pytest.fixture(scope="module")
-def world():
-    return World("press", image_size=16)
-
-
-@pytest.fixture
-def bench(world):
-    bench = Bench(world).ready(LIMITS)
-    yield bench
-    bench.close()
 
 
 class Turning:
