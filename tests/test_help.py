@@ -28,6 +28,7 @@ COMMANDS = {
     "data": (["-m", "lorasp_jax.data", "--help"], "inspect"),
     "data inspect": (["-m", "lorasp_jax.data", "inspect", "--help"], "--state-numbers"),
     "report": (["-m", "lorasp_jax.report", "--help"], "rank-map"),
+    "export": (["-m", "lorasp_jax.serving.export", "--help"], "--max-batch"),
     "rank maps": (["-m", "lorasp_jax.report", "rank-map", "--help"], "--gif"),
 }
 PROGRAM = """

@@ -24,6 +24,7 @@ COMMANDS = {
         "rebuild the report of a run, or film its active ranks",
     ),
     "serve": ("lorasp_jax.serving.__main__", "serve a policy to robots over websockets"),
+    "export": ("lorasp_jax.serving.export", "export a policy, to run without this package"),
     "completion": ("lorasp_jax.cli.completion", "print a shell completion script"),
 }
 """Module and help text of each command. A module has `main(arguments, program)`, which returns the

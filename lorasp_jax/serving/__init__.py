@@ -2,5 +2,6 @@
 
     python -m lorasp_jax.serving runs/NAME
 
-`client` and `wire` need only NumPy, msgpack and websockets.
+`client` and `wire` need only NumPy, msgpack and websockets. `exported` runs policies that `export`
+wrote, and needs only JAX, NumPy and safetensors.
 """

@@ -37,8 +37,9 @@ def parser(program: str) -> argparse.ArgumentParser:
         "policy",
         nargs="+",
         metavar="[NAME=]POLICY",
-        help="folder of a finished run, or a published checkpoint (folder, hf://owner/name or "
-        "gs://bucket/folder). Several runs: requests choose by NAME, the first is the default",
+        help="folder of a finished run or an exported policy, or a published checkpoint (folder, "
+        "hf://owner/name or gs://bucket/folder). Several runs: requests choose by NAME, the first "
+        "is the default",
     )
     add("--host", default="127.0.0.1", help="address to listen on; others than the default need a "
         "token (default: %(default)s)")  # fmt: skip
@@ -49,8 +50,8 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--certificate", type=Path, metavar="FILE", help="PEM certificate chain, for wss://")
     add("--key", type=Path, metavar="FILE", help="PEM private key of the certificate")
     add("--prompt", default="", help="instruction of requests that have none")
-    add("--max-batch", type=int, default=8, help="largest batch (default: %(default)s)")
-    add("--num-steps", type=int, default=10, help="flow steps (default: %(default)s)")
+    add("--max-batch", type=int, help="largest batch (default: 8)")
+    add("--num-steps", type=int, help="flow steps (default: 10)")
     add("--seed", type=int, default=0, help="seed of the flow's noise (default: %(default)s)")
     add(
         "--execution",
@@ -59,7 +60,7 @@ def parser(program: str) -> argparse.ArgumentParser:
         help="whether chunks can continue the previous one, as learned in training or by guidance "
         "(default: %(default)s); see docs/latency.md",
     )
-    add("--guidance", type=float, default=10.0, help="limit of the guidance (default: %(default)s)")
+    add("--guidance", type=float, help="limit of the guidance (default: 10)")
     add("--base", default="", help="the run's base, if it has moved")
     add("--tokenizer", default="", help="the policy's tokenizer; runs record theirs")
     _add_checkpoint_options(parser.add_argument_group("published checkpoints"))
@@ -119,48 +120,65 @@ async def _run(policy_server: Any, port: socket.socket, tls: Any, console: Conso
 def _load(options: argparse.Namespace, console: Console) -> tuple[Any, dict[str, Any]]:
     """Load and compile the policies, saying what takes long."""
     from envs.compilation import cache
-    from lorasp_jax.serving.policies import CompiledPolicies, batch_sizes
+    from lorasp_jax.serving.exported import is_exported
 
-    sizes, start = batch_sizes(options.max_batch), time.monotonic()
+    named, start = dict(map(_named, options.policy)), time.monotonic()
+    if len(named) < len(options.policy):
+        raise ValueError("the policies must have different names: pass NAME=POLICY")
     cache.enable()
     _say(console, f"loading {', '.join(options.policy)}")
-    loaded = _loaded(options)
-    policy = CompiledPolicies(
-        loaded.policies,
-        loaded.words,
-        prompt=options.prompt,
-        max_batch=options.max_batch,
-        num_steps=options.num_steps,
-        seed=options.seed,
-        execution=options.execution,
-        guidance=options.guidance,
-    )
-    loaded.policies.clear()  # the prepared weights are copies
-    names = policy.adapters
+    load = _exported if all(map(is_exported, named.values())) else _compiled
+    policy, metadata = load(options, named)
+    pairs = [(name, size) for name in policy.adapters for size in policy.sizes]
 
     def report(name: str, size: int) -> None:
-        step = names.index(name) * len(sizes) + sizes.index(size) + 1
-        _say(console, f"compiling {name}, batch {size} ({step} of {len(names) * len(sizes)})")
+        step = pairs.index((name, size)) + 1
+        _say(console, f"compiling {name}, batch {size} ({step} of {len(pairs)})")
 
     policy.warm_up(report)
     _say(console, f"ready after {time.monotonic() - start:.0f} s")
+    return policy, metadata
+
+
+def _exported(options: argparse.Namespace, named: dict[str, str]) -> tuple[Any, dict[str, Any]]:
+    """Load exported policies."""
+    from lorasp_jax.serving.exported import load
+    from lorasp_jax.serving.exported_policies import ExportedPolicies
+
+    settings = ("num_steps", "max_batch", "guidance", "base", "tokenizer", *CHECKPOINT_OPTIONS)
+    _refuse(options, settings, "has no effect on exported policies")
+    policies = {name: load(folder) for name, folder in named.items()}
+    settings = {"prompt": options.prompt, "seed": options.seed, "execution": options.execution}
+    policy = ExportedPolicies(policies, **settings)
+    return policy, policy.metadata
+
+
+def _compiled(options: argparse.Namespace, named: dict[str, str]) -> tuple[Any, dict[str, Any]]:
+    """Load runs or a checkpoint."""
+    from lorasp_jax.serving.policies import CompiledPolicies, batch_sizes
+
+    if options.max_batch is not None:
+        batch_sizes(options.max_batch)  # an invalid one is refused before anything that takes long
+    loaded = _loaded(options, named)
+    names = ("num_steps", "max_batch", "guidance", "prompt", "seed", "execution")
+    given = {name: getattr(options, name) for name in names}
+    settings = {name: value for name, value in given.items() if value is not None}
+    policy = CompiledPolicies(loaded.policies, loaded.words, **settings)
+    loaded.policies.clear()  # the prepared weights are copies
     return policy, loaded.metadata
 
 
-def _loaded(options: argparse.Namespace) -> Any:
+def _loaded(options: argparse.Namespace, named: dict[str, str]) -> Any:
     """Load the runs or the checkpoint."""
     from lorasp_jax.serving import loading
 
-    named = dict(map(_named, options.policy))
-    if len(named) < len(options.policy):
-        raise ValueError("the policies must have different names: pass NAME=POLICY")
     if all(map(loading.is_run, named.values())):
         _refuse(options, CHECKPOINT_OPTIONS, "is for published checkpoints: runs record theirs")
         if options.execution == "trained":
             loading.check_trained(named.values())
         return loading.load_runs(named, base=options.base, words=options.tokenizer)
     if len(named) > 1:
-        raise ValueError("several policies must all be folders of finished runs")
+        raise ValueError("several policies must all be finished runs, or all be exported")
     _refuse(options, ("base",), "is for runs")
     return loading.load_checkpoint(_checkpoint(options, *named.values()))
 
@@ -169,7 +187,7 @@ def _refuse(options: argparse.Namespace, names: Sequence[str], reason: str) -> N
     """Raise ValueError if one of these options was given, since it would have no effect."""
     for name in names:
         if getattr(options, name):
-            raise ValueError(f"--{name} {reason}")
+            raise ValueError(f"--{name.replace('_', '-')} {reason}")
 
 
 def _checkpoint(options: argparse.Namespace, where: str) -> Any:

@@ -90,11 +90,16 @@ def load_runs(runs: Mapping[str, str], *, base: str = "", words: str = "") -> Lo
     return Loaded(policies, tokenizers, metadata)
 
 
+def was_trained(run: str | os.PathLike[str]) -> bool | None:
+    """Return whether a run was trained to continue chunks; None if it does not say."""
+    config = read_json(Path(run) / CONFIG_FILE, {"optim": {}})
+    return bool(config["optim"].get("rtc_max_delay")) if config else None
+
+
 def check_trained(runs: Iterable[str]) -> None:
     """Raise ValueError unless runs were trained to continue chunks, as far as they say."""
     for folder in runs:
-        config = read_json(Path(folder) / CONFIG_FILE, {"optim": {}})
-        if config and not config["optim"].get("rtc_max_delay"):
+        if was_trained(folder) is False:
             raise ValueError(
                 f"{folder} was not trained to continue chunks (--optim.rtc-max-delay): use "
                 "--execution guided"

@@ -13,7 +13,7 @@ from lorasp_jax.policies.policy import Observation, Policy
 from lorasp_jax.policies.processor import Processor
 from lorasp_jax.policies.prompt_table import Ids
 from lorasp_jax.policies.tokenizer import Tokenizer
-from lorasp_jax.serving.requests import PolicySpec, Request
+from lorasp_jax.serving.requests import PolicySpec, Request, choose_prompt, common_spec
 
 EXECUTIONS = ("naive", "trained", "guided")
 """How a chunk relates to the previous one; see docs/latency.md."""
@@ -29,7 +29,7 @@ class Rows(NamedTuple):
         present: camera -> bool.
         state: f32 `[J+1]`.
         ids, mask: `[T]`, the instruction's tokens.
-        index: int32, number of the request in its episode.
+        index: int32, number of the request in its episode; not for `sample`.
         previous: f32 `[C, J+1]`, what remains of the previous chunk, then zeros.
         overlap: int32, number of actions that remain; 0: the new chunk does not continue any.
         delay: int32, number of these that the robot will execute.
@@ -40,10 +40,10 @@ class Rows(NamedTuple):
     state: Any
     ids: Any
     mask: Any
-    index: Any
-    previous: Any
-    overlap: Any
-    delay: Any
+    index: Any = None
+    previous: Any = None
+    overlap: Any = None
+    delay: Any = None
 
 
 class CompiledPolicies:
@@ -82,11 +82,11 @@ class CompiledPolicies:
             ValueError: the policies need different observations.
         """
         self._specs = {name: spec_of(policy) for name, policy in policies.items()}
-        self.spec = dataclasses.replace(_common_spec(self._specs), execution=execution)
+        self.spec = dataclasses.replace(common_spec(self._specs), execution=execution)
         self._guidance = np.float32(guidance) if execution == "guided" else None
         self._prompt, self._key, self._num_steps = prompt, jax.random.key(seed), num_steps
         self._tables = {name: policy.processor.prompts for name, policy in policies.items()}
-        self._policies = {name: _without_prompts(policy) for name, policy in policies.items()}
+        self._policies = {name: without_prompts(policy) for name, policy in policies.items()}
         self._words = dict(words)
         self._tokens = functools.lru_cache(CACHED_PROMPTS)(self._tokenize)
         self._sample = jax.jit(_sample, static_argnames=("num_steps", "continues"))
@@ -119,10 +119,7 @@ class CompiledPolicies:
             ValueError: there is no instruction, or the tokenizer rejects it.
         """
         adapter, spec = request.adapter or self.adapters[0], self.spec
-        known = self._specs[adapter].instructions
-        prompt = request.prompt or self._prompt or (known[0] if len(known) == 1 else "")
-        if not prompt:
-            raise ValueError("the request must contain a prompt")
+        prompt = choose_prompt(request, self._prompt, self._specs[adapter])
         ids, mask = self._tokens(adapter, prompt)
         black = np.zeros((spec.image_size, spec.image_size, 3), np.uint8)
         return Rows(
@@ -159,25 +156,6 @@ def batch_sizes(max_batch: int) -> tuple[int, ...]:
     return (*(size for size in powers if size < max_batch), max_batch)
 
 
-def _common_spec(specs: Mapping[str, PolicySpec]) -> PolicySpec:
-    """Return the spec of all policies, with the instructions of each.
-
-    Raises:
-        ValueError: they need different observations.
-    """
-    (first, expected), *others = specs.items()
-    for name, spec in others:
-        for field in dataclasses.fields(spec):
-            a, b = getattr(expected, field.name), getattr(spec, field.name)
-            if a != b and field.name != "instructions":
-                raise ValueError(
-                    f"{first} and {name} cannot be served together: their {field.name} is "
-                    f"{a} and {b}"
-                )
-    instructions = dict.fromkeys(text for spec in specs.values() for text in spec.instructions)
-    return dataclasses.replace(expected, instructions=tuple(instructions))
-
-
 def spec_of(policy: Policy) -> PolicySpec:
     """Describe what a policy needs and returns."""
     processor, config = policy.processor, policy.model.config
@@ -194,7 +172,7 @@ def spec_of(policy: Policy) -> PolicySpec:
     )
 
 
-def _without_prompts(policy: Policy) -> Policy:
+def without_prompts(policy: Policy) -> Policy:
     """Return the policy with prepared weights and a table of no instructions."""
     prompts = policy.processor.prompts
     empty = dataclasses.replace(
@@ -234,20 +212,36 @@ def _encode(processor: Processor, rows: Rows) -> Observation:
 
 
 def _sample(
-    policy: Policy,
-    key: jax.Array,
-    rows: Rows,
-    guidance: jax.Array | None,
-    *,
-    num_steps: int,
-    continues: bool,
+    policy: Policy, key: jax.Array, rows: Rows, guidance: jax.Array | None, **options: Any
 ) -> jax.Array:
-    """Sample `[B, C, J+1]`; a row's result does not depend on the other rows."""
-    processor, config = policy.processor, policy.model.config
+    """`sample` with noise that depends on the key and on the rows' indices."""
+    config = policy.model.config
     noise = jax.vmap(
         lambda i: jax.random.normal(jax.random.fold_in(key, i), (config.chunk, config.action_dim))
     )(rows.index)
-    condition = {}
+    return sample(policy, rows, noise, guidance=guidance, **options)
+
+
+def sample(
+    policy: Policy,
+    rows: Rows,
+    noise: jax.Array,
+    *,
+    num_steps: int,
+    continues: bool,
+    guidance: jax.Array | None = None,
+) -> jax.Array:
+    """Sample `[B, C, J+1]`; a row's result does not depend on the other rows.
+
+    Args:
+        policy: from `without_prompts`.
+        rows: a batch.
+        noise: `[B, C, A]`.
+        num_steps: Euler steps.
+        continues: whether the chunks continue the previous ones, by guidance if it is given.
+        guidance: see `real_time_chunking.sample`.
+    """
+    processor, condition = policy.processor, {}
     if continues:
         condition = {
             "prefix": processor.normalize_actions(rows.previous, rows.state),
@@ -256,7 +250,7 @@ def _sample(
             "guidance": guidance,
         }
     chunk = policy.model.sample_actions(
-        key,
+        None,
         _encode(processor, rows),
         num_steps=num_steps,
         noise=noise,

@@ -12,6 +12,7 @@ them:
 `executed` makes the new chunk continue the previous one, as in `models.real_time_chunking`.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -133,6 +134,37 @@ class Request:
     executed: int | None = None
     delay: int = 0
     previous: np.ndarray | None = field(default=None, repr=False)
+
+
+def choose_prompt(request: Request, default: str, spec: PolicySpec) -> str:
+    """Return the request's instruction, the default, or a policy's only one.
+
+    Raises:
+        ValueError: there is none.
+    """
+    only = spec.instructions[0] if len(spec.instructions) == 1 else ""
+    prompt = request.prompt or default or only
+    if not prompt:
+        raise ValueError("the request must contain a prompt")
+    return prompt
+
+
+def common_spec(specs: Mapping[str, PolicySpec]) -> PolicySpec:
+    """Return the spec of all policies, with the instructions of each.
+
+    Raises:
+        ValueError: they need different observations.
+    """
+    (first, expected), *others = specs.items()
+    for name, spec in others:
+        for key in (each.name for each in dataclasses.fields(spec)):
+            a, b = getattr(expected, key), getattr(spec, key)
+            if a != b and key != "instructions":
+                raise ValueError(
+                    f"{first} and {name} cannot be served together: their {key} is {a} and {b}"
+                )
+    instructions = dict.fromkeys(text for spec in specs.values() for text in spec.instructions)
+    return dataclasses.replace(expected, instructions=tuple(instructions))
 
 
 def parse(message: Any, spec: PolicySpec) -> Request:

@@ -1,7 +1,5 @@
 """Test the command line and what it loads."""
 
-import dataclasses
-import json
 import signal
 import subprocess
 import sys
@@ -14,7 +12,6 @@ import lorasp_jax
 from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io import native
-from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import LoRA
 from lorasp_jax.serving import __main__ as command
 from lorasp_jax.serving import loading
@@ -23,28 +20,7 @@ from lorasp_jax.serving.loading import Checkpoint
 from lorasp_jax.training import export
 from lorasp_jax.training.run_folder import write_json
 from tests import ROOT
-from tests.models.random_models import random_backbone, with_noise
-from tests.runs import CONFIG, make_run
-
-
-@pytest.fixture(scope="module")
-def base(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("base")
-    models.save(folder, random_backbone(Pi0Config.dummy()))
-    moments = {"mean": [0.5] * 7, "std": [2.0] * 7}
-    stats = {f"{kind}_{k}": v for kind in ("state", "action") for k, v in moments.items()}
-    (folder / "statistics.json").write_text(json.dumps(stats))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory, base):
-    model_config = dataclasses.replace(CONFIG.model, checkpoint=str(base))
-    config = dataclasses.replace(CONFIG, model=model_config)
-    run = make_run(tmp_path_factory.mktemp("runs") / "trained", config, models.load(base))
-    run.base_hash = models.weights_hash(base)
-    export.write(run)
-    return run.folder
+from tests.models.random_models import with_noise
 
 
 def refuse(capsys, *arguments):
@@ -107,7 +83,10 @@ def test_checkpoints_that_do_not_say_enough(base):
     ("arguments", "sentence"),
     [
         (["nowhere"], "nowhere does not exist"),
-        (["a=nowhere", "b=nothing"], "several policies must all be folders of finished runs"),
+        (
+            ["a=nowhere", "b=nothing"],
+            "several policies must all be finished runs, or all be exported",
+        ),
         (["x/a", "y/a"], "the policies must have different names: pass NAME=POLICY"),
         (["a", "--host", "0.0.0.0"], "anyone who reaches 0.0.0.0 could use the policy"),
         (["a", "--certificate", "x"], "--certificate and --key must be given together"),
