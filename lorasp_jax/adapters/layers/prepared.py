@@ -7,7 +7,8 @@ time. Layers with a shared input are therefore fused into one input and one outp
     [x W, x P] = x [W, P]         W and P of all layers, concatenated
     y = x W + z diag(U)           with z = f(x P), and diag(U) block-diagonal
 
-The functions f of all layers run as one GPU kernel if their method has one. For stacked layers
+The functions f of all layers run as one GPU kernel if their method has one. Layers without adapters
+and with a shared input become one matmul, x [W1, W2, ...]. For stacked layers
 that run once, such as the vision tower's, copying W would cost more than it saves: only the P are
 concatenated, and P and U are cast to the compute dtype. The original layers are removed. For
 training, see `lorasp_jax.kernels.low_rank_matmul`.
@@ -94,14 +95,29 @@ class SharedProjection:
     """[O] of each layer."""
 
 
+@functools.partial(
+    jax.tree_util.register_dataclass, data_fields=["kernel", "bias"], meta_fields=["out_sizes"]
+)
+@dataclasses.dataclass(frozen=True)
+class FusedKernels:
+    """Fused layers without adapters."""
+
+    kernel: jax.Array
+    """W of all layers, [I, ΣO]."""
+    bias: jax.Array | None
+    """[ΣO], or None if no layer has a bias."""
+    out_sizes: tuple[int, ...]
+    """O of each layer."""
+
+
 class FusedArrays(nnx.Variable[Any]):
-    """Variable that holds `FusedLayers` or `SharedProjection`."""
+    """Variable that holds `FusedLayers`, `SharedProjection` or `FusedKernels`."""
 
 
 class Prepared(nnx.Module):
     """Fused layers, stored in place of the first layer; empty instances replace the others."""
 
-    def __init__(self, arrays: FusedLayers | SharedProjection | None = None) -> None:
+    def __init__(self, arrays: FusedLayers | SharedProjection | FusedKernels | None = None) -> None:
         self.fused = None if arrays is None else FusedArrays(arrays)
 
     def __call__(
@@ -117,6 +133,8 @@ class Prepared(nnx.Module):
         if self.fused is None:
             return []
         fused = self.fused.get_value()
+        if isinstance(fused, FusedKernels):
+            return [(y, Aux()) for y in _call_kernels(fused, x.astype(fused.kernel.dtype))]
         if isinstance(fused, FusedLayers):
             ys, aux = _call_fused(fused, x.astype(fused.input_matrix.dtype), token_mask)
         else:
@@ -145,13 +163,21 @@ def fuse_layers(layers: Sequence[Layer], *, copy_kernels: bool = True) -> list[L
     A single (unstacked) adapted `Dense` can be fused if it has an explicit dtype, and its method
     computes exactly x W + z U and does not need x P in fp32. If all layers can be fused and agree
     on method and dtype, they are fused together. Otherwise each fusable layer is fused alone, and
-    the others are returned unchanged.
+    the others are returned unchanged. Several layers without adapters are fused if `copy_kernels`
+    is true, none is quantized, and all have the same explicit dtype.
 
     Args:
       layers: layers in call order.
       copy_kernels: whether to copy W into the fused input matrix; best for layers that are called
         repeatedly.
     """
+    plain = [layer for layer in layers if _is_plain(layer)]
+    if (
+        copy_kernels
+        and len(layers) == len(plain) > 1
+        and len({layer.dtype for layer in plain}) == 1
+    ):
+        return [Prepared(_fused_kernels(plain)), *(Prepared() for _ in plain[1:])]
     fusable = [layer for layer in layers if _is_fusable(layer)]
     fuse = _fused_layers if copy_kernels else _shared_projection
     if len(fusable) == len(layers) and len({(layer.method, layer.dtype) for layer in fusable}) == 1:
@@ -184,6 +210,13 @@ def _call_fused(
     y = projected[..., : ends[-1]] + z @ fused.output_matrix
     y = y if fused.bias is None else y + fused.bias
     return jnp.split(y, ends[:-1], axis=-1), aux
+
+
+def _call_kernels(fused: FusedKernels, x: jax.Array) -> Sequence[jax.Array]:
+    """Output y of each layer."""
+    y = x @ fused.kernel
+    y = y if fused.bias is None else y + fused.bias
+    return jnp.split(y, list(itertools.accumulate(fused.out_sizes))[:-1], axis=-1)
 
 
 def _call_shared(
@@ -252,6 +285,13 @@ def _is_fusable(layer: Layer) -> TypeGuard[Dense]:
     return is_sum and len(layer.kernel_matrices().shape) == 2  # quantized kernels have no ndim
 
 
+def _is_plain(layer: Layer) -> TypeGuard[Dense]:
+    """Whether the layer has neither an adapter nor a quantized kernel, and an explicit dtype."""
+    if type(layer) is not Dense or layer.adapter is not None or layer.dtype is None:
+        return False
+    return isinstance(layer.kernel_matrices(), jax.Array) and layer.kernel_matrices().ndim == 2
+
+
 def _matrices(
     layers: Sequence[Dense],
 ) -> tuple[list[jax.Array], list[jax.Array], list[jax.Array], list[jax.Array | None]]:
@@ -295,14 +335,30 @@ def _shared_projection(layers: Sequence[Dense]) -> SharedProjection:
 
 def _fused_layers(layers: Sequence[Dense]) -> FusedLayers:
     kernels, downs, ups, biases = _matrices(layers)
-    dense_biases = [
-        jnp.zeros(kernel.shape[1], kernel.dtype) if bias is None else bias
-        for kernel, bias in zip(kernels, biases, strict=True)
-    ]
-    has_bias = any(bias is not None for bias in biases)
     return FusedLayers(
         *_bottleneck_spec(layers, downs),
         input_matrix=pad_columns(jnp.concatenate(kernels + downs, axis=1)),
         output_matrix=jax.scipy.linalg.block_diag(*ups),
-        bias=jnp.concatenate(dense_biases) if has_bias else None,
+        bias=_joined_bias(kernels, biases),
     )
+
+
+def _fused_kernels(layers: Sequence[Dense]) -> FusedKernels:
+    kernels = [layer.kernel_matrices().astype(layer.dtype) for layer in layers]
+    biases = [None if layer.bias is None else layer.bias.get_value() for layer in layers]
+    return FusedKernels(
+        jnp.concatenate(kernels, axis=1),
+        _joined_bias(kernels, biases),
+        tuple(kernel.shape[1] for kernel in kernels),
+    )
+
+
+def _joined_bias(
+    kernels: Sequence[jax.Array], biases: Sequence[jax.Array | None]
+) -> jax.Array | None:
+    """Biases of all layers [ΣO] in the dtype of their kernels, with zeros for those without one."""
+    if all(bias is None for bias in biases):
+        return None
+    zeros = (jnp.zeros(kernel.shape[1], kernel.dtype) for kernel in kernels)
+    pairs = zip(zeros, biases, strict=True)
+    return jnp.concatenate([z if bias is None else bias.astype(z.dtype) for z, bias in pairs])

@@ -170,6 +170,31 @@ def test_layers_with_a_shared_input_run_two_matmuls():
     assert matmuls(model) > matmuls(prepare(model)) == 4
 
 
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_layers_without_adapters_share_one_matmul(dtype):
+    model, x = Net(dtype), jnp.sin(jnp.arange(48.0, dtype=dtype)).reshape(6, 8)
+    model.second.bias.set_value(jnp.arange(12.0))
+    fused = prepare(model)
+    assert (type(fused.first), type(fused.third)) == (prepared.Prepared, Dense)
+    matmuls = lambda model: str(jax.make_jaxpr(lambda x: model(x)[0])(x)).count("dot_general")  # noqa: E731
+    assert (matmuls(model), matmuls(fused)) == (3, 2)
+    (actual, actual_aux), (expected, aux) = fused(x), model(x)
+    assert actual.dtype == expected.dtype
+    np.testing.assert_allclose(*(y.astype(jnp.float32) for y in (actual, expected)), rtol=1e-2)
+    assert jax.tree.structure(actual_aux) == jax.tree.structure(aux)
+
+
+def test_layers_without_adapters_are_not_fused_if_that_would_copy_or_dequantize():
+    model = Net("float32")
+    model.fuse_projections(copy_kernels=False)
+    assert type(model.first) is Dense
+    quantized = prepare(quantize(Net("float32"), [(".*", "int8")]).model)
+    assert type(quantized.first) is Dense
+    mixed = Net("float32")
+    mixed.second.dtype = "bfloat16"
+    assert type(prepare(mixed).first) is Dense
+
+
 @pytest.mark.parametrize(
     ("name", "dtype"),
     [
@@ -195,12 +220,15 @@ def test_layers_of_two_methods_are_fused_individually(second):
     assert jax.tree.structure(actual_aux) == jax.tree.structure(aux)
 
 
+@pytest.mark.parametrize("adapted", [True, False], ids=["adapted", "bare"])
 @pytest.mark.parametrize(
     "backbone", [pi0, pytest.param(smolvla, marks=pytest.mark.slow)], ids=["pi0", "smolvla"]
 )
-def test_sampling_follows_the_velocity(backbone):
+def test_sampling_follows_the_velocity(backbone, adapted):
     config = backbone.Config.dummy()
-    model = trained((".*_proj", METHODS["lora"]), seed=1, net=random_backbone(config), size=0.1)
+    model = random_backbone(config)
+    if adapted:
+        model = trained((".*_proj", METHODS["lora"]), seed=1, net=model, size=0.1)
     obs = observation(config, 2)
     noise = jax.random.normal(jax.random.key(0), (2, config.chunk, config.action_dim))
     velocity = jax.jit(lambda model, x, t: model.velocity(obs, x, jnp.full(2, t)))
