@@ -5,10 +5,12 @@ import functools
 import io
 import json
 
+import jax
 import pytest
 from rich.console import Console
 
-from benchmarks import compile_time, data, long_run, measuring, scaling, serving
+from benchmarks import compile_time, data, deployment, long_run, measuring, scaling, serving
+from benchmarks.deployment import Case
 from lorasp_jax import peft
 from lorasp_jax.data.cache import Cache
 from lorasp_jax.models.pi0 import Pi0Config
@@ -133,3 +135,58 @@ def test_serving():
     assert (times[:, 0] > times[:, 1]).all()
     assert (times[:, 1] >= 10).all()
     assert eight > 2 * one
+
+
+DUMMY = argparse.Namespace(
+    backbones=["pi0"],
+    size="dummy",
+    rank=16,
+    dtype="float32",
+    cameras=0,
+    repeats=1,
+    only_adapters=False,
+)
+
+
+def test_merged_adapters_run_the_program_of_the_base():
+    config = deployment.sized("pi0", DUMMY)
+    text = {
+        adapters: deployment.lowered(Case("pi0", adapters, 1), config, 16)[2].as_text()
+        for adapters in ("none", "merged", "whole", "half")
+    }
+    assert text["none"] == text["merged"]
+    assert len({*text.values()}) == 3
+
+
+def test_half_of_the_bank_is_smaller():
+    config = deployment.sized("pi0", DUMMY)
+    sizes = [
+        sum(leaf.size for leaf in jax.tree.leaves(deployment.abstract_sampler(case, config, 16)))
+        for case in (Case("pi0", name) for name in ("none", "half", "whole"))
+    ]
+    assert sizes[0] < sizes[1] < sizes[2]
+
+
+def test_failing_programs_become_rows(monkeypatch):
+    lowered, table = deployment.lowered, [Case("pi0", "none", 1), Case("pi0", "whole", 1)]
+
+    def fail(case, *arguments):
+        if case.adapters == "whole":
+            raise RuntimeError("cuDNN is not installed")
+        return lowered(case, *arguments)
+
+    monkeypatch.setattr(deployment, "lowered", fail)
+    first, second = deployment.measured(table, DUMMY)
+    assert first["ms"] > 0
+    assert second["error"] == "RuntimeError: cuDNN is not installed"
+    monkeypatch.setattr(deployment, "rows", lambda _: [first, second])
+    assert deployment.main([]) == 1
+
+
+@pytest.mark.slow
+def test_deployment():
+    rows = list(deployment.rows(DUMMY))
+    assert [row["adapters"] for row in rows[:4]] == ["none", "merged", "whole", "half"]
+    assert {row["change"] for row in rows[4:]} == {"", "separate", "graph", "cudnn"}
+    assert rows[0]["ratio"] == 1
+    assert all(row["ms"] > 0 for row in rows)

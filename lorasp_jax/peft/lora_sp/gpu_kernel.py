@@ -25,6 +25,8 @@ class FusedBottleneck(BatchedBottleneck):
     """`LoRASP.bottleneck` with router "gelu", one mask per token and a constant η."""
 
     rank: int
+    num_scores: int
+    """At least `rank`; the scores beyond it belong to pruned directions."""
     hidden_width: int
     energy_target: float
     scale: float
@@ -34,7 +36,7 @@ class FusedBottleneck(BatchedBottleneck):
     @property
     def is_supported(self) -> bool:
         """Whether Triton supports the sizes: powers of two, and at least 16 for its matmuls."""
-        sizes = self.rank, self.hidden_width
+        sizes = self.rank, self.num_scores, self.hidden_width
         return all(size >= 16 and size.bit_count() == 1 for size in sizes)
 
     def pack(self, params: Any) -> Any:
@@ -73,10 +75,10 @@ def bottleneck_block(
     """Compute the bottleneck for a block of n rows, inside the kernel.
 
     Args:
-      router: b1 [H], w2 [H, R], b2 [R].
+      router: b1 [H], w2 [H, S], b2 [S], with S >= R scores.
       columns: V x [n, R] and x W1 [n, H], of the same dtype.
       valid: bool [n, 1], False for padding.
-      mask: bool [n, R], the gate's mask. None in the forward pass, which computes it. No gradient.
+      mask: bool [n, S], the gate's mask. None in the forward pass, which computes it. No gradient.
       energy_target: η.
       scale: α/R.
 
@@ -88,7 +90,17 @@ def bottleneck_block(
     scores, logits = router_scores(router, hidden, "gelu")
     if mask is None:
         mask = energy_gate(scores, energy_target, implementation="block")[0]
+        mask &= jax.lax.broadcasted_iota(jnp.int32, mask.shape, 1) < v_x.shape[1]
     energy = kept_energy(scores, mask)[:, None]
-    z = apply_masked_scores(v_x, scale * scores, mask, energy)
+    in_bank = [_first(a, v_x.shape[1]) for a in (scale * scores, mask.astype(jnp.float32))]
+    z = apply_masked_scores(v_x, in_bank[0], in_bank[1] != 0, energy)
     active_rank = mask.astype(jnp.float32).sum(-1, keepdims=True)
     return z, loss_sums(scores, logits, mask, energy, valid), mask, [active_rank, energy]
+
+
+def _first(x: jax.Array, n: int) -> jax.Array:
+    """x[:, :n] for x [b, k n]. Triton cannot slice, so this sums over k with all others zeroed."""
+    if x.shape[1] == n:
+        return x
+    x = x.reshape(len(x), -1, n)
+    return jnp.where(jax.lax.broadcasted_iota(jnp.int32, x.shape, 1) == 0, x, 0).sum(1)

@@ -133,9 +133,10 @@ class LoRASP(BankMethod):
         """A fused NVIDIA GPU kernel for the default router and gate; None if it does not apply."""
         num_scores = params["router"]["w2"].shape[-1]
         default = (self.router, self.granularity, self.schedule) == ("gelu", "token", None)
-        if not default or num_scores > self.rank or default_implementation(num_scores) != "pallas":
+        if not default or default_implementation(num_scores) != "pallas":
             return None
-        kernel = FusedBottleneck(self.rank, self.hidden_width, self.energy_target, self.scale)
+        sizes = self.rank, num_scores, self.hidden_width
+        kernel = FusedBottleneck(*sizes, self.energy_target, self.scale)
         return kernel if kernel.is_supported else None
 
     def transform(

@@ -157,3 +157,24 @@ def test_needs_lora_sp(batches):
     net = adaptation.adapt(Net(nnx.Rngs(0)), [("heads", LoRA(rank=2))], rngs=nnx.Rngs(1))
     with pytest.raises(ValueError, match="the model has no LoRA-SP layers"):
         lorasp_jax.prune(net, batches)
+
+
+def test_a_rank_keeps_the_most_used_directions(batches):
+    model = lora_sp_model(VARIANTS[0])
+    fractions = active_fractions(model, batches)
+    smaller, report = lorasp_jax.prune(model, batches, rank=RANK // 2, forward=forward)
+    assert {method.rank for method in adaptation.methods(smaller).values()} == {RANK // 2}
+    assert all((ranks == RANK // 2).all() for ranks in report.ranks.values())
+    for i in range(2):
+        kept = np.sort(np.argsort(-fractions[i], kind="stable")[: RANK // 2])
+        u, rest = (m.heads[i].adapter.get_value()["bank"]["u"] for m in (model, smaller))
+        np.testing.assert_array_equal(rest, u[kept])
+    whole, report = lorasp_jax.prune(model, batches, rank=RANK + 1, forward=forward)
+    assert {method.rank for method in adaptation.methods(whole).values()} == {RANK}
+    assert report.output_error < 1e-5
+
+
+@pytest.mark.parametrize("options", [{"rank": 0}, {"rank": 2.0}, {"rank": 2, "tolerance": 0.1}])
+def test_bad_rank(batches, options):
+    with pytest.raises(ValueError, match="rank must be an integer of at least 1, without a tol"):
+        lorasp_jax.prune(lora_sp_model(VARIANTS[0]), batches, **options)

@@ -135,23 +135,23 @@ class WithFusedKernel(LoRASP):
     """Always use the fused kernel: Triton's on a GPU, interpreted elsewhere."""
 
     def fused_kernel(self, params):
-        del params
         interpret = jax.default_backend() != "gpu"
-        return FusedBottleneck(
-            self.rank, self.hidden_width, self.energy_target, self.scale, interpret=interpret
-        )
+        sizes = self.rank, params["router"]["w2"].shape[-1], self.hidden_width
+        return FusedBottleneck(*sizes, self.energy_target, self.scale, interpret=interpret)
 
 
+@pytest.mark.parametrize("num_scores", [32, 64], ids=["whole", "pruned"])
 @pytest.mark.parametrize(
     ("masked", "few"),
     [pytest.param(False, 0, marks=pytest.mark.slow), (True, 0), (True, rowwise_kernel.FEW_ROWS)],
 )
-def test_fused_kernel_equals_the_method(x, monkeypatch, masked, few):
+def test_fused_kernel_equals_the_method(x, monkeypatch, masked, few, num_scores):
     monkeypatch.setattr(rowwise_kernel, "FEW_ROWS", few)
     fields = {"rank": 32, "hidden_width": 16, "energy_target": 0.7}
     params = initial(LoRASP(**fields))
     params["bank"]["u"] = jax.random.normal(jax.random.key(2), (32, D_OUT))
-    params["router"]["w2"] = jax.random.normal(jax.random.key(3), (16, 32))
+    params["router"]["w2"] = jax.random.normal(jax.random.key(3), (16, num_scores))
+    params["router"]["b2"] = jnp.ones(num_scores)
     mask = jax.random.bernoulli(jax.random.key(4), 0.6, x.shape[:2]) if masked else None
 
     def loss(params, x, method):
