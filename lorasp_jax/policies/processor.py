@@ -181,7 +181,7 @@ class Processor:
             ValueError: an image is not uint8 `[B, H, W, 3]`, a camera is missing from `raw`, or the
                 state has the wrong length.
         """
-        state = self._to_slots("state", raw["state"])
+        state = self.normalize_state(raw["state"])
         if state_noise is not None:
             state = state + state_noise * self.slot_mask
         sources = dict(self.cameras) or {name: name for name in raw["image"]}
@@ -205,6 +205,13 @@ class Processor:
             token_mask=prompt.mask,
             state=state,
         )
+
+    def normalize_state(self, state: jax.Array) -> jax.Array:
+        """Normalize states and put them into the backbone's slots.
+
+        `[..., J+1]` [rad, m] -> `[..., A]`.
+        """
+        return self._to_slots("state", state)
 
     def normalize_actions(self, actions: jax.Array, state: jax.Array | None = None) -> jax.Array:
         """Normalize actions and put them into the backbone's slots.

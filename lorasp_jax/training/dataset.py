@@ -15,7 +15,7 @@ from lorasp_jax.data.source import Progress, Source
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.policies.processor import robot_slots
 
-_CACHE = Path("cache", "steps")
+CACHE = Path("cache", "steps")
 _DT_TOLERANCE = 0.01  # relative; 1/30 s has no exact decimal representation
 
 
@@ -27,7 +27,7 @@ def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
     Raises:
         ValueError: the source is not a dataset, is corrupt, or is incompatible with the run.
     """
-    cache_folder = folder / _CACHE
+    cache_folder = folder / CACHE
     path = cache_folder if cache_folder.exists() else config.data.source
     source = open_source(path, Keys(image_size=model.image_size))
     if abs(source.control_dt / config.control_dt - 1) > _DT_TOLERANCE:
@@ -65,9 +65,9 @@ def as_cache(source: Source, folder: Path, progress: Progress) -> Cache:
     """Return the dataset as a cache, created in the run's folder if necessary."""
     if isinstance(source, Cache):
         return source
-    if not (folder / _CACHE).exists():
-        cache.write([source], folder / _CACHE, progress)
-    return Cache(folder / _CACHE)
+    if not (folder / CACHE).exists():
+        cache.write([source], folder / CACHE, progress)
+    return Cache(folder / CACHE)
 
 
 def outline(dataset: Cache) -> dict[str, Episodes]:

@@ -16,6 +16,7 @@ class RandomStream(enum.IntEnum):
     ADAPTERS = 3
     BASE = 4
     STATISTICS = 5
+    CORRECTION = 6
     EVALUATION = 10
     """Evaluations before and during training."""
     FINAL_EVALUATION = 11

@@ -44,7 +44,7 @@ def compilations():
 
     def listen(event, duration, fun_name="", **_):
         name = fun_name.removeprefix("jit(").removesuffix(")")
-        if event == COMPILATION and name in {*POLICY, *WORLD, "_hold"}:
+        if event == COMPILATION and name in {*POLICY, *WORLD, "_hold", "correct_action"}:
             counts[name] = counts.get(name, 0) + 1
 
     monitoring.register_event_duration_secs_listener(listen)

@@ -25,8 +25,10 @@ from lorasp_jax.evaluation.latency.execution import (
 from lorasp_jax.evaluation.latency.smoothness import action_delta, jerk
 from lorasp_jax.evaluation.metrics import position_bias, wilson_interval
 from lorasp_jax.evaluation.programs import prepared
+from lorasp_jax.policies.correction import CorrectionHead
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training import records
+from lorasp_jax.training.correction import files as correction
 from lorasp_jax.training.export import describe, load_policy
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run_folder import CONFIG_FILE, read_json, recorded_ranges, write_json
@@ -52,9 +54,11 @@ SCHEMA: records.Schema = {
     "guidance": float,
     "episodes": int,
     "num_envs": int,
+    "correction?": str,
     "curves": {str: {str: [POINT]}},
 }
-"""Schema of latency.json; its curves are by task and execution."""
+"""Schema of latency.json; its curves are by task and execution, and `correction` is the SHA-256 of
+the correction head."""
 _CONFIG: records.Schema = records.CONFIG | {
     "image_size": int,
     "control_dt": float,
@@ -101,6 +105,10 @@ def measure(run: Path, options: Options, progress: Progress | None = None) -> di
     executions = _executions(run, config, options.executions)
     policy = load_policy(run)
     settings = _settings(config, options, policy.model.config.chunk)
+    head = None
+    if "corrected" in executions:
+        head = correction.load(run, policy)
+        settings["correction"] = correction.describe(run)["sha256"]
     steps, chunk = settings["execute_steps"], settings["chunk"]
     longest = min(MAX_DELAY, steps, chunk - steps)
     delays = options.delays or range(longest + 1)
@@ -114,7 +122,7 @@ def measure(run: Path, options: Options, progress: Progress | None = None) -> di
     ]
     bar = progress.add_task("", total=len(missing)) if progress else None
     policy = prepared(policy)
-    rollout = functools.cache(functools.partial(_rollout, run, config, settings))
+    rollout = functools.cache(functools.partial(_rollout, run, config, settings, head))
     for number, (task, execution, delay) in enumerate(missing):
         if progress and bar is not None:
             text = f"{task}, {execution}, delay {delay}"
@@ -164,7 +172,12 @@ def measure_point(
 
 
 def _rollout(
-    run: Path, config: dict[str, Any], settings: dict[str, Any], task: str, execution: str
+    run: Path,
+    config: dict[str, Any],
+    settings: dict[str, Any],
+    head: CorrectionHead | None,
+    task: str,
+    execution: str,
 ) -> tuple[Env, Callable[[Policy, jax.Array, int], Trace]]:
     """Return the environment of a task and the rollout of an execution."""
     env = _environment(
@@ -176,7 +189,8 @@ def _rollout(
     )
     names = ("execute_steps", "denoise_steps", "guidance")
     how = Settings(execution, **{name: settings[name] for name in names})
-    return env, delayed_rollout(env, how, ranges=recorded_ranges(config))
+    head = head if execution == "corrected" else None
+    return env, delayed_rollout(env, how, ranges=recorded_ranges(config), head=head)
 
 
 @functools.cache
@@ -210,13 +224,13 @@ def _settings(config: dict[str, Any], options: Options, chunk: int) -> dict[str,
 
 def _earlier(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
     """Return the content of latency.json, or what it starts with."""
-    found = read_json(path, SCHEMA) or settings | {"curves": {}}
-    if changed := [name for name in settings if found[name] != settings[name]]:
+    found = read_json(path, SCHEMA) or {"curves": {}}
+    if changed := [name for name in settings if found.get(name, settings[name]) != settings[name]]:
         raise ValueError(
             f"{path} was measured with other settings ({', '.join(changed)}): remove it, or use "
             "the same settings"
         )
-    return found
+    return settings | found
 
 
 def _tasks(run: Path, chosen: Sequence[str]) -> list[str]:
@@ -237,4 +251,5 @@ def _executions(run: Path, config: dict[str, Any], chosen: Sequence[str]) -> lis
     trained = config["optim"].get("rtc_max_delay", 0) > 0
     if "trained" in chosen and not trained:
         raise ValueError(f"{run} was not trained for execution trained: --optim.rtc-max-delay is 0")
-    return [*chosen] or [name for name in EXECUTIONS if trained or name != "trained"]
+    supported = {"trained": trained, "corrected": (run / correction.DESCRIPTION).exists()}
+    return [*chosen] or [name for name in EXECUTIONS if supported.get(name, True)]

@@ -1,0 +1,1 @@
+"""Train the correction head of a finished run; see `policies.correction`."""
