@@ -41,11 +41,11 @@ def _export(options: argparse.Namespace, console: Console) -> None:
     jax.config.update("jax_platforms", "cpu")
     from lorasp_jax.serving import exporting, loading
 
-    loaded = loading.load_runs({"": options.run}, base=options.base, words=options.tokenizer)
+    loaded = loading.load_runs({"run": options.run}, base=options.base, words=options.tokenizer)
     exporting.write(
-        loaded.policies[""],
+        loaded.policies["run"],
         options.out,
-        continues=loading.was_trained(options.run) or False,
+        continues=bool(loading.was_trained(options.run)),
         num_steps=options.num_steps,
         max_batch=options.max_batch,
         metadata=loaded.metadata,

@@ -31,6 +31,9 @@ PLATFORMS = ("cpu", "cuda")
 DESCRIPTION = "policy.json"
 PROCESSOR, INSTRUCTIONS, WEIGHTS = "processor.json", "instructions.json", "weights.safetensors"
 ACT, CONTINUE = "act", "continue"
+"""Kinds of programs."""
+SHOWN = 10
+"""Maximum number of instructions in a message."""
 _REMEDY = "copy the folder or export the policy again"
 
 
@@ -153,8 +156,11 @@ class ExportedPolicy:
         _check("state", state, (needs.state_dim,), np.float32)
         _check("noise", noise, self.noise_shape, np.float32)
         if instruction not in self._tokens:
-            known = ", ".join(map(repr, self._tokens))
-            raise ValueError(f"the instruction must be one of {known}, got {instruction!r}")
+            known = ", ".join(map(repr, self.instructions[:SHOWN]))
+            more = f" and {len(self._tokens) - SHOWN} others" if self.instructions[SHOWN:] else ""
+            raise ValueError(f"the instruction must be one of {known}{more}, got {instruction!r}")
+        if previous is None and delay != 0:
+            raise ValueError(f"delay {delay} was given without previous")
         black = np.zeros(picture, np.uint8)
         row = {
             "images": {name: images.get(name, black) for name in needs.cameras},

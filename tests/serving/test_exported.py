@@ -191,6 +191,7 @@ def test_the_client_of_the_documentation_runs_without_the_package(folder, tmp_pa
         ({"state": np.full(7, np.nan, np.float32)}, "state must be finite"),
         ({"noise": np.zeros((4, 7), np.float32)}, r"noise must be float32 \[4, 8\], got float32"),
         ({"instruction": "dance"}, "instruction must be one of 'press the button', 'push the but"),
+        ({"delay": 1}, "delay 1 was given without previous"),
         ({"previous": np.zeros((5, 7), np.float32)}, r"previous must be float32 \[4, 7\], got "),
         ({"previous": np.zeros(7, np.float32)}, r"previous must be float32 \[4, 7\], got "),
         ({"previous": np.zeros((2, 7), np.float32), "delay": 3}, "delay must be .* from 0 to 2"),
@@ -200,6 +201,15 @@ def test_the_client_of_the_documentation_runs_without_the_package(folder, tmp_pa
 def test_inputs_that_do_not_fit(loaded, changes, sentence):
     with pytest.raises(ValueError, match=sentence):
         loaded.act(**arguments(loaded, **changes))
+
+
+def test_long_lists_of_instructions_are_shortened(loaded):
+    tokens = loaded._tokens[INSTRUCTIONS[0]]
+    many = exported.ExportedPolicy(
+        loaded.description, {}, [], {}, {f"go to {i}": tokens for i in range(12)}
+    )
+    with pytest.raises(ValueError, match="'go to 9' and 2 others, got 'dance'"):
+        many.row(**arguments(many, instruction="dance"))
 
 
 def test_policies_that_cannot_do_it(copy):
