@@ -24,6 +24,7 @@ PACKAGES = [
     "lorasp_jax.evaluation",
     "lorasp_jax.report",
     "lorasp_jax.study",
+    "lorasp_jax.deployment",
     "lorasp_jax.serving",
     "lorasp_jax.cli",
 ]

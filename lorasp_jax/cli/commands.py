@@ -27,6 +27,10 @@ COMMANDS = {
         "lorasp_jax.report.__main__",
         "rebuild the report of a run, or film its active ranks",
     ),
+    "deploy": (
+        "lorasp_jax.deployment.__main__",
+        "compare forms in which a run can be deployed, or save one",
+    ),
     "serve": ("lorasp_jax.serving.__main__", "serve a policy to robots over websockets"),
     "export": ("lorasp_jax.serving.export", "export a policy, to run without this package"),
     "completion": ("lorasp_jax.cli.completion", "print a shell completion script"),

@@ -12,7 +12,9 @@ import jax.numpy as jnp
 
 from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.compress import quantization
 from lorasp_jax.adapters.io import native
+from lorasp_jax.kernels.quantized_weights import Kind
 from lorasp_jax.models import backbone
 from lorasp_jax.policies import tokenizer
 from lorasp_jax.policies.policy import Policy
@@ -27,6 +29,9 @@ from lorasp_jax.training.run_folder import read_json, write_json
 
 BASE = "base"
 """Folder of a fully fine-tuned base."""
+QUANTIZED = "quantized"
+"""Key of the kind of a base that is quantized after loading."""
+_TOWERS = "^(vision|language|action)/"
 
 
 class Export(Callback):
@@ -49,6 +54,35 @@ def write(run: Run) -> None:
         return
     metadata = {"base": hub.portable_path(config.model.source), **metadata}
     native.save_adapters(run.folder, run.policy.model, base=run.base_hash, metadata=metadata)
+
+
+def write_variant(
+    folder: Path, policy: Policy, source: Path, *, quantized: Kind | None = None
+) -> None:
+    """Write a policy made from a run's, with frozen weights in bf16, for `load_policy`.
+
+    Args:
+        folder: folder to create.
+        policy: a policy with adapters, or one without, whose base is then written as well.
+        source: folder of the run.
+        quantized: how to quantize the base whenever the policy is loaded.
+    """
+    metadata = describe(source)
+    fields = metadata["policy"] | {"config": dataclasses.asdict(policy.model.config)}
+    metadata |= {"policy": fields, QUANTIZED: quantized}
+    if adaptation.methods(policy.model):
+        base = native.read_description(source)["base"]
+        native.save_adapters(folder, policy.model, base=base, metadata=metadata)
+        return
+    models.save(folder / BASE, policy.model)
+    statistics = policy.processor.statistics.to_json()
+    (folder / BASE / "statistics.json").write_text(statistics + "\n")
+    write_json(folder / BASE / TRAINING, metadata)
+
+
+def quantized(model: Any, kind: Kind | None) -> Any:
+    """Return the model with the layers of its three towers quantized; None returns it unchanged."""
+    return quantization.quantize(model, [(_TOWERS, kind)]).model if kind else model
 
 
 def _metadata(run: Run) -> dict[str, Any]:
@@ -109,6 +143,7 @@ def load_policy(
         raise ValueError(f"{error}{hint}") from error
     if not is_full:
         model = native.load_adapters(folder, model, any_base=any_base)
+    model = quantized(model, metadata.get(QUANTIZED))
     try:
         return Policy(model, _processor(policy, config, words))
     except (KeyError, TypeError) as error:
