@@ -31,7 +31,7 @@ import functools
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, NamedTuple
 from unittest import mock
 
@@ -162,41 +162,49 @@ def lowered(case: Case, config: BackboneConfig, rank: int) -> tuple[Sampler, Any
 
 
 def programs(table: Sequence[Case], options: argparse.Namespace) -> dict[Case, Program | Exception]:
-    """Compile all programs at once; equal ones, as of "none" and "merged", once."""
+    """Start to compile all programs at once; equal ones, as of "none" and "merged", once."""
     found: dict[Case, Program | Exception] = {}
     compiling: dict[tuple[bool, str], Future] = {}
-    with ThreadPoolExecutor() as pool:
-        for case in table:
-            try:
-                sampler, observation, program = lowered(
-                    case, sized(case.backbone, options), options.rank
-                )
-            except Exception as error:
-                found[case] = error
-                continue
-            is_graph = case.change == "graph"
-            key = is_graph, program.as_text()
-            if key not in compiling:
-                extra = GRAPH_OPTIONS if is_graph else {}
-                compiling[key] = pool.submit(program.compile, extra)
-            found[case] = Program(sampler, observation, compiling[key])
+    pool = ThreadPoolExecutor()
+    for case in table:
+        try:
+            sampler, observation, program = lowered(
+                case, sized(case.backbone, options), options.rank
+            )
+        except Exception as error:
+            found[case] = error
+            continue
+        is_graph = case.change == "graph"
+        key = is_graph, program.as_text()
+        if key not in compiling:
+            extra = GRAPH_OPTIONS if is_graph else {}
+            compiling[key] = pool.submit(program.compile, compiler_options=extra)
+        found[case] = Program(sampler, observation, compiling[key])
+    pool.shutdown(wait=False)
     return found
 
 
-def measured(table: Sequence[Case], options: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Yield a row for each case."""
-    key, weights = None, None
-    for case, program in programs(table, options).items():
+def measured(
+    table: Sequence[Case], options: argparse.Namespace, weights: dict[Any, Sampler]
+) -> Iterator[dict[str, Any]]:
+    """Yield a row for each case; `weights` keeps filled samplers for other tables."""
+    found = programs(table, options)
+    started = {case: p for case, p in found.items() if isinstance(p, Program)}
+    keys = {
+        case: (case.backbone, str(jax.tree.map(jnp.shape, p.sampler.weights)))
+        for case, p in started.items()
+    }
+    for case, program in started.items():
+        if keys[case] not in weights:
+            weights[keys[case]] = filled(program.sampler)
+    wait([program.compiled for program in started.values()])
+    for case, program in found.items():
         row: dict[str, Any] = case._asdict()
         try:
             if isinstance(program, Exception):
                 raise program
-            sampler, observation, future = program
-            compiled = future.result()
-            if key != (key := (case[:2], jax.tree.structure(sampler))):
-                weights = None  # frees the previous ones first
-                weights = filled(sampler)
-            call = functools.partial(compiled, weights, noise(observation))
+            inputs = weights[keys[case]], noise(program.observation)
+            call = functools.partial(program.compiled.result(), *inputs)
             yield row | {"ms": 1e3 * best(call, repeats=options.repeats)}
         except Exception as error:
             yield row | {"error": f"{type(error).__name__}: {error}"[:300]}
@@ -205,9 +213,10 @@ def measured(table: Sequence[Case], options: argparse.Namespace) -> Iterator[dic
 def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yield all rows, with the ratio to the base alone."""
     bases: dict[str, float] = {}
+    weights: dict[Any, Sampler] = {}
     by_adapters, others = cases(options.backbones)
     for table in (by_adapters, [] if options.only_adapters else others):
-        for row in measured(table, options):
+        for row in measured(table, options, weights):
             if (row["adapters"], row["steps"], row["change"]) == ("none", STEPS, ""):
                 bases |= {row["backbone"]: row["ms"]} if "ms" in row else {}
             if "ms" in row and row["backbone"] in bases:

@@ -176,7 +176,7 @@ def test_failing_programs_become_rows(monkeypatch):
         return lowered(case, *arguments)
 
     monkeypatch.setattr(deployment, "lowered", fail)
-    first, second = deployment.measured(table, DUMMY)
+    first, second = deployment.measured(table, DUMMY, {})
     assert first["ms"] > 0
     assert second["error"] == "RuntimeError: cuDNN is not installed"
     monkeypatch.setattr(deployment, "rows", lambda _: [first, second])
