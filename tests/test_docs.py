@@ -18,8 +18,8 @@ OPTION = re.compile(r"^\| `(\w+)` \| `([^`]+)` \| \S", re.MULTILINE)
 LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)|src(?:set)?=\"([^\":]+)\"")
 FILE = re.compile(r"`((?:lorasp_jax|envs|benchmarks|configs|examples|tests)/[\w/]+\.py)[`:]")
 FUNCTION = re.compile(r"`([\w/]+\.py)::(\w+)`")
-NODE = re.compile(r"^    (\w+)\[", re.MULTILINE)
-ARROWS = re.compile(r"^    (\w+(?: --> \w+)+)$", re.MULTILINE)
+NODE = re.compile(r"^    ([\w.]+)\[", re.MULTILINE)
+ARROWS = re.compile(r"^    ([\w.]+(?: --> [\w.]+)+)$", re.MULTILINE)
 
 
 def method_page(name):

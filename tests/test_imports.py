@@ -21,6 +21,8 @@ PACKAGES = [
     "lorasp_jax.policies",
     "lorasp_jax.data",
     "lorasp_jax.training",
+    "lorasp_jax.serving.wire",
+    "lorasp_jax.serving.client",  # needs nothing of the server, and evaluation asks servers
     "lorasp_jax.evaluation",
     "lorasp_jax.report",
     "lorasp_jax.study",

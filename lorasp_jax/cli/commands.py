@@ -13,6 +13,7 @@ import lorasp_jax
 COMMANDS = {
     "train": ("lorasp_jax.cli.train", "adapt a policy to a robot"),
     "study": ("lorasp_jax.study.__main__", "run many experiments and test claims about them"),
+    "judge": ("lorasp_jax.evaluation.__main__", "judge a policy in a Gymnasium environment"),
     "latency": (
         "lorasp_jax.evaluation.latency.__main__",
         "evaluate policies whose actions arrive late",

@@ -18,6 +18,7 @@ from lorasp_jax.deployment import variants
 from lorasp_jax.deployment.variants import BATCH_SIZE, BATCHES, Variant
 from lorasp_jax.evaluation import metrics, results
 from lorasp_jax.evaluation.callback import success
+from lorasp_jax.evaluation.intervals import wilson_interval
 from lorasp_jax.evaluation.programs import split_rollout
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.policies.policy import Policy
@@ -168,7 +169,7 @@ def compared(tasks: Mapping[str, Any], whole: Mapping[str, Any]) -> dict[str, li
         statistics.outcomes([[{"outcomes": {t: r["outcomes"] for t, r in each.items()}}]])
         for each in (tasks, whole)
     ]
-    low, high = metrics.wilson_interval(int(both[0].sum()), both[0].size)
+    low, high = wilson_interval(int(both[0].sum()), both[0].size)
     return {
         "success": [float(both[0].mean()), low, high],
         "difference": list(statistics.difference(*both)),

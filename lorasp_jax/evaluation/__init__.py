@@ -1,6 +1,6 @@
-"""Closed-loop evaluation in simulation."""
+"""Closed-loop evaluation: in this project's simulation, and in Gymnasium environments of others."""
 
-from lorasp_jax.evaluation.results import Result, evaluate
-from lorasp_jax.evaluation.rollout import make_rollout
+import lazy_loader
 
-__all__ = ["Result", "evaluate", "make_rollout"]
+# The judge of Gymnasium environments runs where JAX is not installed.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

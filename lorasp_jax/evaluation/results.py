@@ -11,6 +11,7 @@ from envs.env import Env
 from envs.scene.randomization import Draw
 from envs.state import Poses
 from lorasp_jax.evaluation import metrics
+from lorasp_jax.evaluation.intervals import wilson_interval
 from lorasp_jax.evaluation.programs import split_rollout
 from lorasp_jax.evaluation.rollout import RECORDED_WORLDS, Rollout
 from lorasp_jax.policies.policy import Policy
@@ -92,7 +93,7 @@ def _result(runs: Sequence[Rollout]) -> Result:
     return Result(
         success=successes / episodes,
         episodes=episodes,
-        ci95=metrics.wilson_interval(successes, episodes),
+        ci95=wilson_interval(successes, episodes),
         outcomes=tuple(success.tolist()),
         steps=float(np.mean([run.steps for run in runs])),
         active_rank=jax.tree.map(

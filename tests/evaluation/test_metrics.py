@@ -4,11 +4,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lorasp_jax.evaluation.intervals import wilson_interval
 from lorasp_jax.evaluation.metrics import (
     layer_ranks,
     position_bias,
     rank_histogram,
-    wilson_interval,
 )
 from lorasp_jax.peft import Aux
 

@@ -15,6 +15,7 @@ from rich.progress import Progress
 
 import envs
 from envs.env import Env
+from lorasp_jax.evaluation.intervals import wilson_interval
 from lorasp_jax.evaluation.latency.execution import (
     EXECUTIONS,
     Settings,
@@ -23,7 +24,7 @@ from lorasp_jax.evaluation.latency.execution import (
     delayed_rollout,
 )
 from lorasp_jax.evaluation.latency.smoothness import action_delta, jerk
-from lorasp_jax.evaluation.metrics import position_bias, wilson_interval
+from lorasp_jax.evaluation.metrics import position_bias
 from lorasp_jax.evaluation.programs import prepared
 from lorasp_jax.policies.correction import CorrectionHead
 from lorasp_jax.policies.policy import Policy

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from envs.datasets.writing import atomic_file
-from lorasp_jax.evaluation.metrics import wilson_interval
+from lorasp_jax.evaluation.intervals import wilson_interval
 
 COLORS = {
     "synchronous": "#9498a0",

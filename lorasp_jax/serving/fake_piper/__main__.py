@@ -15,7 +15,7 @@ from envs.cli.errors import parse_arguments, run_command
 from envs.compilation import cache
 from envs.datasets.locks import locked
 from envs.rendering.video import side_by_side, write_video
-from lorasp_jax.evaluation.metrics import wilson_interval
+from lorasp_jax.evaluation.intervals import wilson_interval
 from lorasp_jax.serving.fake_piper.demonstrator import Demonstrator
 from lorasp_jax.serving.fake_piper.firmware import PERIOD, FakePiper
 from lorasp_jax.serving.fake_piper.timing import Lockstep, RealTime

@@ -1,0 +1,122 @@
+"""Judge a policy in a Gymnasium environment: `python -m lorasp_jax.evaluation --help`."""
+
+import argparse
+import importlib.util
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from lorasp_jax.evaluation.gymnasium.actors import Actor, RunActor, ServerActor
+from lorasp_jax.evaluation.gymnasium.judge import judge
+from lorasp_jax.evaluation.gymnasium.task import Task, load_tasks
+
+# As in `envs.cli.errors`, which imports JAX: this command runs without it.
+REFUSED = 2
+"""Exit code after bad input."""
+INTERRUPTED = 130
+"""Exit code after Ctrl-C."""
+
+
+def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.evaluation") -> int:
+    """Judge a policy; return the exit code."""
+    options = parser(program).parse_args(arguments)
+    try:
+        _run(options)
+    except (ValueError, OSError) as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return REFUSED
+    except KeyboardInterrupt:
+        print("interrupted; nothing was written but films", file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
+def _run(options: argparse.Namespace) -> None:
+    _check(options)
+    tasks = load_tasks(options.env, options.tasks)
+    results = judge(
+        tasks,
+        _actor(options, tasks),
+        options.episodes,
+        seed=options.seed,
+        films=options.films,
+        progress=_print_progress if sys.stderr.isatty() else None,
+    )
+    if sys.stderr.isatty():
+        print(file=sys.stderr)
+    print(table(results))
+    if options.out:
+        source = options.server or str(options.run)
+        described = {"policy": source, "env": options.env, "seed": options.seed, **results}
+        with options.out.open("x") as file:
+            json.dump(described, file, indent=1)
+        print(f"written: {options.out}")
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Raise ValueError for options that cannot work, before anything is loaded."""
+    if (options.run is None) == (not options.server):
+        raise ValueError("give either the folder of a run or --server, and not both")
+    if options.out and options.out.exists():
+        raise ValueError(f"{options.out} exists: choose another --out")
+    if options.films and options.films.exists():
+        raise ValueError(f"{options.films} exists: choose another --films")
+    if options.films and importlib.util.find_spec("PIL") is None:
+        raise ValueError("--films needs pip install pillow")
+
+
+def _actor(options: argparse.Namespace, tasks: Sequence[Task]) -> Actor:
+    if options.server:
+        return ServerActor(options.server, token=options.token, wait=options.wait)
+    return RunActor(options.run, [task.instruction for task in tasks])
+
+
+def _print_progress(task: str, done: int, successes: int) -> None:
+    print(f"\r\033[K{task}: {successes} of {done}", end="", file=sys.stderr, flush=True)
+
+
+def table(results: dict[str, Any]) -> str:
+    """Format success rates with their intervals, one line per task and group."""
+    rows = {**results["tasks"], **results["groups"], "all": results}
+    width = max(map(len, rows))
+    lines = []
+    for name, row in rows.items():
+        low, high = (100 * bound for bound in row["ci95"])
+        wins = round(row["success"] * row["episodes"])
+        lines.append(
+            f"{name:{width}}  {100 * row['success']:5.1f} %  [{low:.1f}, {high:.1f}]  "
+            f"{wins} of {row['episodes']}"
+        )
+    return "\n".join([*lines, f"{results['steps_per_second']:.0f} environment steps/s"])
+
+
+def parser(program: str) -> argparse.ArgumentParser:
+    """Define the options."""
+    parser = argparse.ArgumentParser(
+        prog=program,
+        description="Judge a policy in a Gymnasium environment by the environment's own success. "
+        "With --server, JAX is not needed. Execution under latency: "
+        "python -m lorasp_jax.evaluation.latency.",
+    )
+    add = parser.add_argument
+    add("run", type=Path, nargs="?", help="folder of a run, such as runs/NAME")
+    add("--server", default="", metavar="URL", help="ask a policy server, such as ws://HOST:PORT")
+    add("--token", default="", help="token of the server, if it requires one")
+    text = "how long to wait for the server [s] (default: %(default)g)"
+    add("--wait", type=float, default=0.0, metavar="S", help=text)
+    text = "function without arguments that returns one or more lorasp_jax Tasks"
+    add("--env", required=True, metavar="MODULE:FACTORY", help=text)
+    add("--tasks", nargs="+", default=(), metavar="TASK", help="tasks (default: all)")
+    text = "episodes per task (default: %(default)s)"
+    add("--episodes", type=int, default=10, metavar="N", help=text)
+    text = "seed of the first episode; the next has the next seed (default: %(default)s)"
+    add("--seed", type=int, default=0, help=text)
+    add("--out", type=Path, metavar="FILE", help="JSON file to write")
+    add("--films", type=Path, metavar="FOLDER", help="film the first episode of each task")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,272 @@
+"""Test the judge with an environment of another package's kind: a point on a line, and pictures."""
+
+import contextlib
+import dataclasses
+import json
+import subprocess
+import sys
+import threading
+from typing import ClassVar
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+from websockets.sync.server import serve
+
+from lorasp_jax import models
+from lorasp_jax.evaluation.__main__ import main
+from lorasp_jax.evaluation.gymnasium import Task
+from lorasp_jax.evaluation.gymnasium.actors import RunActor, ServerActor
+from lorasp_jax.evaluation.gymnasium.judge import judge
+from lorasp_jax.evaluation.gymnasium.task import load_tasks
+from lorasp_jax.evaluation.intervals import wilson_interval
+from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.peft import FullFineTuning
+from lorasp_jax.serving import wire
+from lorasp_jax.training import export
+from tests import ROOT
+from tests.models.random_models import random_backbone
+from tests.runs import CONFIG, make_run
+
+
+class Line(gymnasium.Env):
+    """A point at distance 1 to 2 from the goal, on either side; one step moves it by 0.1."""
+
+    metadata: ClassVar = {"render_fps": 20}
+    action_space = gymnasium.spaces.Box(-1, 1, (1,))
+
+    def __init__(self, key="success"):
+        self._key = key
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.at = self.np_random.uniform(1, 2) * self.np_random.choice([-1, 1])
+        return self._observe(), {}
+
+    def step(self, action):
+        self.at += 0.1 * float(np.clip(action, -1, 1)[0])
+        return self._observe(), 0.0, False, abs(self.at) > 3, {self._key: abs(self.at) < 0.06}
+
+    def _observe(self):
+        return {"pixels": np.full((8, 8, 3), 100, np.uint8), "at": np.array([self.at])}
+
+
+TASK = Task("line", "go to zero", Line, {"front": "pixels"}, "at", replan=2, max_steps=40)
+
+
+def tasks():
+    """Return what a user's factory returns."""
+    return [TASK, dataclasses.replace(TASK, name="other", group="easy")]
+
+
+def not_tasks():
+    return 3
+
+
+class Mover:
+    """Moves towards the goal, or always to the right; remembers what it saw."""
+
+    def __init__(self, homes=True, size=1, chunk=2):
+        self.homes, self.size, self.chunk, self.seen, self.seeds = homes, size, chunk, [], []
+
+    def reset(self, seed):
+        self.seeds.append(seed)
+
+    def act(self, images, state, instruction):
+        self.seen.append((images, state, instruction))
+        value = -np.sign(state[0]) if self.homes else 1.0
+        return np.full((self.chunk, self.size), value, np.float32)
+
+
+def test_success_is_the_environments():
+    results = judge([TASK], Mover(), 6)
+    assert results["success"] == 1.0
+    assert results["ci95"] == list(wilson_interval(6, 6))
+    assert 9 <= results["steps"] <= 20
+    wins = judge([TASK], Mover(homes=False), 20, seed=5)["tasks"]["line"]["outcomes"]
+    starts = [Line().reset(seed=5 + i)[0]["at"][0] for i in range(20)]
+    assert wins == [start < 0 for start in starts]
+    assert 0 < sum(wins) < 20
+
+
+def test_policy_sees_the_mapped_observation():
+    mover = Mover()
+    task = dataclasses.replace(
+        TASK,
+        cameras={"top": lambda env: np.zeros((4, 6, 3), np.uint8)},
+        state=lambda observation: np.array([observation["at"][0], 7]),
+    )
+    judge([task], mover, 2, seed=3)
+    images, state, instruction = mover.seen[0]
+    assert images["top"].shape == (4, 6, 3)
+    assert state.dtype == np.float32
+    assert state[1] == 7
+    assert instruction == "go to zero"
+    assert mover.seeds == [3, 4]
+
+
+def test_hold_and_replan_count_environment_steps():
+    mover = Mover(homes=False)
+    task = dataclasses.replace(TASK, hold=3, max_steps=9, action=lambda a: 0 * a)
+    assert judge([task], mover, 1)["steps"] == 9
+    assert len(mover.seen) == 2  # looks at steps 0 and 6
+
+
+def test_groups_pool_their_episodes():
+    results = judge(tasks(), Mover(), 2)
+    assert results["episodes"] == 4
+    assert list(results["groups"]) == ["easy"]
+    assert results["groups"]["easy"]["episodes"] == 2
+
+
+def test_film_has_a_frame_per_action(tmp_path):
+    judge([TASK], Mover(), 1, films=tmp_path / "films")
+    with Image.open(tmp_path / "films" / "line.webp") as film:
+        assert film.size == (8, 8)
+
+
+CHANGES = {
+    "never reported 'won' in info, which had success": {"success": "won"},
+    "the observation has no side: it has pixels, at": {"cameras": {"side": "side"}},
+    "must return uint8 pictures [H, W, 3], got float64 [1]": {"cameras": {"side": "at"}},
+    "has no speed: it has pixels, at": {"state": "speed"},
+    "must have one axis, got shape [8, 8, 3]": {"state": "pixels"},
+    "predicts 2: lower the task's replan": {"replan": 3},
+    "takes actions of shape [1], but the policy's have shape [2]": {
+        "action": lambda action: np.zeros(2)
+    },
+}
+
+
+@pytest.mark.parametrize("message", CHANGES)
+def test_misfits_are_named(message):
+    with pytest.raises(ValueError) as error:  # noqa: PT011
+        judge([dataclasses.replace(TASK, **CHANGES[message])], Mover(), 1)
+    assert message in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [({"hold": 0}, "hold of task"), ({"cameras": {}}, "camera"), ({"instruction": ""}, "instruc")],
+)
+def test_bad_tasks_are_refused(fields, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(TASK, **fields)
+
+
+HERE = "tests.evaluation.test_gymnasium"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("line", "must be MODULE:factory"),
+        ("tests.nowhere:tasks", "there is no module tests.nowhere"),
+        (f"{HERE}:nothing", "has no function nothing"),
+        (f"{HERE}:not_tasks", "must return a Task"),
+    ],
+)
+def test_bad_factories_are_named(name, message):
+    with pytest.raises(ValueError, match=message):
+        load_tasks(name)
+
+
+def test_tasks_are_selected_by_name():
+    assert [task.name for task in load_tasks(f"{HERE}:tasks", ["other"])] == ["other"]
+    with pytest.raises(ValueError, match="no task third: choose from line, other"):
+        load_tasks(f"{HERE}:tasks", ["third"])
+
+
+@contextlib.contextmanager
+def policy_server():
+    """Serve `Mover` in openpi's protocol; it refuses instructions other than that of `TASK`."""
+
+    def answer(socket):
+        socket.send(wire.pack({}))
+        for frame in socket:
+            request = wire.unpack(frame)
+            if request["prompt"] != TASK.instruction:
+                socket.send("no such prompt")
+                return
+            chunk = Mover().act(request["image"], request["state"], request["prompt"])
+            socket.send(wire.pack({"actions": chunk}))
+
+    with serve(answer, "127.0.0.1", 0) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
+        server.shutdown()
+        thread.join()
+
+
+def test_command_judges_a_server(tmp_path, capsys):
+    out = tmp_path / "results.json"
+    with policy_server() as url:
+        options = ["--server", url, "--env", f"{HERE}:tasks", "--episodes", "3", "--out", str(out)]
+        assert main(options) == 0
+        assert main(options) == 2  # does not overwrite
+    printed, errors = capsys.readouterr()
+    assert "line   100.0 %" in printed
+    assert "exists: choose another --out" in errors
+    results = json.loads(out.read_text())
+    assert results["tasks"]["other"]["outcomes"] == [True] * 3
+
+
+def test_server_refusals_are_one_sentence():
+    task = dataclasses.replace(TASK, instruction="fly")
+    with policy_server() as url, pytest.raises(ValueError, match="refused: no such prompt"):
+        judge([task], ServerActor(url), 1)
+
+
+@pytest.mark.parametrize("arguments", [[], ["runs/x", "--server", "ws://127.0.0.1:9"]])
+def test_one_policy_is_required(arguments, capsys):
+    assert main([*arguments, "--env", f"{HERE}:tasks"]) == 2
+    assert "either the folder of a run or --server" in capsys.readouterr().err
+
+
+def test_client_needs_no_jax():
+    program = (
+        "import sys; sys.modules.update(dict.fromkeys(['jax', 'mujoco', 'flax', 'envs']))\n"
+        "import lorasp_jax.serving.client\n"
+        "from lorasp_jax.evaluation.__main__ import main\n"
+        "sys.exit(main(['--server', 'ws://127.0.0.1:9', '--env', 'nowhere:tasks']))"
+    )
+    command = [sys.executable, "-c", program]
+    process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert process.returncode == 2
+    assert process.stderr.startswith("error: there is no module nowhere")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Write a finished run of a robot with six joints and a gripper."""
+    folder = tmp_path_factory.mktemp("runs")
+    models.save(folder / "base", random_backbone(Pi0Config.dummy()))
+    model = dataclasses.replace(CONFIG.model, checkpoint=str(folder / "base"))
+    config = dataclasses.replace(CONFIG, model=model, peft=FullFineTuning())
+    run = make_run(folder / "run", config, models.load(folder / "base"))
+    run.base_hash = models.weights_hash(folder / "base")
+    export.write(run)
+    return run
+
+
+def test_run_acts_as_its_policy(run):
+    actor = RunActor(run.folder, ["push the button", "push button"])
+    rng = np.random.default_rng(0)
+    images = {name: rng.integers(0, 255, (32, 32, 3), np.uint8) for name in ("side", "wrist")}
+    state = rng.normal(size=7).astype(np.float32)
+    actor.reset(4)
+    chunk = actor.act(images, state, "push the button")
+    observation = {"image": {k: v[None] for k, v in images.items()}, "state": state[None]}
+    key = jax.random.split(jax.random.key(4))[1]
+    row = run.policy.processor.prompts.rows(["push the button"])
+    (expected,) = run.policy.sample(key, observation, row)
+    np.testing.assert_allclose(chunk, expected, rtol=1e-4, atol=1e-5)
+    actor.reset(4)
+    assert np.abs(actor.act(images, state, "push button") - chunk).max() > 1e-6
+    with pytest.raises(ValueError, match="must contain camera wrist"):
+        actor.act({"side": images["side"]}, state, "push the button")
+    with pytest.raises(ValueError, match="7"):
+        actor.act(images, state[:4], "push the button")
