@@ -47,17 +47,19 @@ def inspect(options: argparse.Namespace, console: Console) -> None:
 
 
 def convert(options: argparse.Namespace, console: Console) -> None:
-    """Convert datasets to a cache for training, or one dataset to RLDS."""
-    from lorasp_jax.data import cache, rlds_export
+    """Convert datasets to a cache for training, or one dataset to RLDS or LeRobot v3.0."""
+    from lorasp_jax.data import cache, lerobot_export, rlds_export
     from lorasp_jax.data.opening import open_source
 
     keys = _keys(options)
     sources = [open_source(path, keys) for path in options.paths]
-    if options.to == "rlds" and len(sources) > 1:
-        raise ValueError(f"--to rlds converts exactly one dataset, got {len(sources)}")
+    if options.to != "cache" and len(sources) > 1:
+        raise ValueError(f"--to {options.to} converts exactly one dataset, got {len(sources)}")
     with _progress_bar(f"writing {options.out.name}") as (progress, print_line):
         if options.to == "rlds":
             rlds_export.to_rlds(sources[0], options.out, progress)
+        elif options.to == "lerobot":
+            lerobot_export.to_lerobot(sources[0], options.out, progress)
         else:
             wait = f"another process is writing {options.out}; waiting for it"
             cache.write(sources, options.out, progress, waiting=lambda: print_line(wait))
@@ -89,7 +91,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     sub.add_argument("paths", nargs="+", metavar="path", help=where)
     sub.add_argument("--out", type=Path, required=True, help="folder to create")
     text = "output format (default: %(default)s)"
-    sub.add_argument("--to", choices=("cache", "rlds"), default="cache", help=text)
+    sub.add_argument("--to", choices=("cache", "rlds", "lerobot"), default="cache", help=text)
     _add_keys(sub)
     return parser
 

@@ -100,7 +100,7 @@ def test_two_datasets_in_one_cache(capsys, tmp_path):
     assert len(found.instructions) == 2
 
 
-@pytest.mark.parametrize("to", ["cache", "rlds"])
+@pytest.mark.parametrize("to", ["cache", "rlds", "lerobot"])
 def test_a_truncated_video(to, capsys, tmp_path):
     folder = copied("v21", tmp_path)
     cut(folder / "videos", "*3.mp4", 0.5)
@@ -118,6 +118,7 @@ def test_a_truncated_video(to, capsys, tmp_path):
     [
         (["inspect", "nothing"], "nothing does not exist"),
         (["convert", golden("v3"), golden("v21"), "--to", "rlds"], "one dataset, got 2"),
+        (["convert", golden("v3"), golden("v21"), "--to", "lerobot"], "one dataset, got 2"),
         (["convert", golden("v3"), "--every", "0"], "every must be at least 1"),
         (["convert", golden("v3"), "--state-numbers", "0", "1"], "2 state and 7 action dimensions"),
     ],
@@ -138,7 +139,7 @@ def test_output_must_be_local(command, capsys, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("to", ["cache", "rlds"])
+@pytest.mark.parametrize("to", ["cache", "rlds", "lerobot"])
 def test_a_refused_conversion_leaves_nothing(to, capsys, tmp_path, monkeypatch):
     """No parent folder of the output is created, and no progress bar is shown."""
 

@@ -1,0 +1,195 @@
+"""Export any dataset as LeRobot v3.0, with pictures as PNG columns; LeRobot is not needed.
+
+The layout is that of `LeRobotDataset` in LeRobot 0.6.1 (`src/lerobot/datasets`), with one file of
+rows per episode.
+"""
+
+import io
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from PIL import Image
+
+from envs.datasets.episodes import Episodes
+from envs.datasets.locks import locked
+from envs.datasets.writing import atomic_folder, write_text
+from lorasp_jax.data.source import Progress, Source
+
+_FILES_PER_CHUNK = 1000
+_ROWS = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_INDICES = ("frame_index", "episode_index", "index", "task_index")
+_PICTURE = pa.struct({"bytes": pa.binary(), "path": pa.string()})
+# Makes pandas, with which LeRobot reads this file, use the tasks as the index.
+_TASK_INDEX = {
+    "index_columns": ["task"],
+    "column_indexes": [],
+    "columns": [
+        {"name": "task_index", "field_name": "task_index", "metadata": None}
+        | {"pandas_type": "int64", "numpy_type": "int64"},
+        {"name": "task", "field_name": "task", "metadata": None}
+        | {"pandas_type": "unicode", "numpy_type": "object"},
+    ],
+    "pandas_version": "2.0.0",
+}
+
+
+def to_lerobot(source: Source, path: str | os.PathLike[str], progress: Progress) -> None:
+    """Write a LeRobot folder, which appears only once it is complete.
+
+    Args:
+        source: a dataset; not modified. Instructions become LeRobot's tasks.
+        path: folder to create.
+        progress: called with the steps done and the total.
+
+    Raises:
+        ValueError: the path already exists, another process is writing it, the frame rate is not a
+            whole number, or metadata differs between episodes.
+        OSError: the disk is full.
+    """
+    with locked(Path(path)), atomic_folder(path) as folder:
+        writer = _Writer(folder, source.control_dt)
+        for number in range(len(source)):
+            writer.append(source.episode(number))
+            progress(writer.steps, source.num_steps)
+        writer.complete()
+
+
+class _Writer:
+    """Writes one episode at a time and keeps the metadata of all."""
+
+    def __init__(self, folder: Path, control_dt: float) -> None:
+        self.folder, self.fps, self.steps = folder, round(1 / control_dt), 0
+        if abs(self.fps * control_dt - 1) > 1e-3:
+            raise ValueError(f"LeRobot needs whole frames per second, got {1 / control_dt:g}")
+        self._tasks: dict[str, int] = {}
+        self._episodes: list[dict[str, Any]] = []
+        self._features: dict[str, Any] = {}
+        self._robot = ""
+        self._moments: dict[str, _Moments] = {}
+
+    def append(self, episode: Episodes) -> None:
+        number, length = len(self._episodes), int(episode.length[0])
+        features = _features(episode)
+        if number and (features, episode.robot) != (self._features, self._robot):
+            raise ValueError(f"episode {number} has another robot or other shapes than the first")
+        self._features, self._robot = features, episode.robot
+        task = episode.instructions[int(episode.instruction[0])]
+        arrays = {
+            "observation.state": np.asarray(episode.state[0, :length]),
+            "action": np.asarray(episode.action[0, :length]),
+            **{_key(c): np.asarray(images[0, :length]) for c, images in episode.image.items()},
+            "timestamp": (np.arange(length) / self.fps).astype(np.float32),
+            "frame_index": np.arange(length),
+            "episode_index": np.full(length, number),
+            "index": self.steps + np.arange(length),
+            "task_index": np.full(length, self._tasks.setdefault(task, len(self._tasks))),
+        }
+        for name, array in arrays.items():
+            self._moments.setdefault(name, _Moments()).add(array)
+        chunk, file = divmod(number, _FILES_PER_CHUNK)
+        rows = self.folder / _ROWS.format(chunk_index=chunk, file_index=file)
+        _write_table(rows, {name: _column(array) for name, array in arrays.items()})
+        self._episodes.append(
+            {"episode_index": number, "tasks": [task], "length": length}
+            | {"data/chunk_index": chunk, "data/file_index": file}
+            | {"dataset_from_index": self.steps, "dataset_to_index": self.steps + length}
+            | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
+        )
+        self.steps += length
+
+    def complete(self) -> None:
+        meta = self.folder / "meta"
+        episodes = {name: [e[name] for e in self._episodes] for name in self._episodes[0]}
+        _write_table(meta / "episodes" / "chunk-000" / "file-000.parquet", episodes)
+        tasks = {"task_index": list(self._tasks.values()), "task": list(self._tasks)}
+        _write_table(meta / "tasks.parquet", tasks, {"pandas": json.dumps(_TASK_INDEX)})
+        stats = {name: moments.summary() for name, moments in self._moments.items()}
+        write_text(meta / "stats.json", json.dumps(stats, indent=2))
+        info = {
+            "codebase_version": "v3.0",
+            "robot_type": self._robot,
+            "fps": self.fps,
+            "total_episodes": len(self._episodes),
+            "total_frames": self.steps,
+            "total_tasks": len(self._tasks),
+            "chunks_size": _FILES_PER_CHUNK,
+            "data_files_size_in_mb": 100,
+            "video_files_size_in_mb": 200,
+            "splits": {"train": f"0:{len(self._episodes)}"},
+            "data_path": _ROWS,
+            "video_path": None,
+            "features": self._features,
+        }
+        write_text(meta / "info.json", json.dumps(info, indent=2))
+
+
+class _Moments:
+    """Running statistics over steps, and over the pixels of pictures, in [0, 1] by channel."""
+
+    def __init__(self) -> None:
+        self.count, self.rows, self.sums = 0, 0, (0.0, 0.0)
+        self.low, self.high, self.picture = np.inf, -np.inf, False
+
+    def add(self, array: np.ndarray) -> None:
+        """Add `[T]`, `[T, N]`, or pictures `[T, H, W, 3]`."""
+        self.count, self.picture = self.count + len(array), array.ndim == 4
+        width = array.shape[-1] if array.ndim > 1 else 1
+        rows = array.reshape(-1, width).astype(np.float64) / (255 if self.picture else 1)
+        self.rows += len(rows)
+        self.sums = (self.sums[0] + rows.sum(0), self.sums[1] + np.square(rows).sum(0))
+        self.low, self.high = np.minimum(self.low, rows.min(0)), np.maximum(self.high, rows.max(0))
+
+    def summary(self) -> dict[str, Any]:
+        """Return LeRobot's statistics; those of pictures have shape `[3, 1, 1]`."""
+        mean, square = (total / self.rows for total in self.sums)
+        std = np.sqrt(np.maximum(square - np.square(mean), 0))
+        values = {"min": self.low, "max": self.high, "mean": mean, "std": std}
+        shape = (3, 1, 1) if self.picture else (-1,)
+        arrays = {name: np.reshape(value, shape).tolist() for name, value in values.items()}
+        return arrays | {"count": [self.count]}
+
+
+def _features(episode: Episodes) -> dict[str, Any]:
+    joints = [*(f"joint_{i + 1}.pos" for i in range(episode.state.shape[2] - 1)), "gripper.pos"]
+    actions = joints if episode.actions == "joint" else None
+    features: dict[str, Any] = {
+        "observation.state": {"dtype": "float32", "shape": [len(joints)], "names": joints},
+        "action": {"dtype": "float32", "shape": [episode.action.shape[2]], "names": actions},
+    }
+    names = ["height", "width", "channels"]
+    for camera, images in episode.image.items():
+        features[_key(camera)] = {"dtype": "image", "shape": [*images.shape[2:]], "names": names}
+    features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
+    return features | {name: {"dtype": "int64", "shape": [1], "names": None} for name in _INDICES}
+
+
+def _key(camera: str) -> str:
+    return f"observation.images.{camera}"
+
+
+def _column(array: np.ndarray) -> pa.Array:
+    if array.ndim == 4:
+        return pa.array([{"bytes": _png(image), "path": None} for image in array], _PICTURE)
+    if array.ndim == 2:
+        flat = pa.array(array.ravel().astype(np.float32))
+        return pa.FixedSizeListArray.from_arrays(flat, array.shape[1])
+    return pa.array(array)
+
+
+def _png(image: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, "png")
+    return file.getvalue()
+
+
+def _write_table(
+    path: Path, columns: dict[str, Any], metadata: dict[str, str] | None = None
+) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    table = pa.table(columns)
+    pq.write_table(table.replace_schema_metadata(metadata) if metadata else table, path)

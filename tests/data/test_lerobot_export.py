@@ -1,0 +1,73 @@
+"""Export to LeRobot v3.0, read back by this project; `test_lerobot_itself` has LeRobot's reader."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from lorasp_jax.data.lerobot import LeRobot
+from lorasp_jax.data.lerobot_export import to_lerobot
+from lorasp_jax.data.opening import open_source
+from tests.data.lerobots import VERSIONS, golden
+from tests.envs.datasets.test_episodes import assert_equal, make
+
+
+def silent(done, total):
+    pass
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_episodes_are_equal(version, tmp_path):
+    source, reports = LeRobot(golden(version)), []
+    to_lerobot(source, tmp_path / "dataset", lambda *done: reports.append(done))
+    assert reports == [(25, 126), (58, 126), (98, 126), (126, 126)]
+    found = LeRobot(tmp_path / "dataset")
+    assert (found.kind, len(found)) == ("LeRobot v3.0", 4)
+    joints = [*(f"joint_{i + 1}.pos" for i in range(6)), "gripper.pos"]
+    assert found.names == {"state": joints, "action": joints}
+    for number in range(4):
+        assert_equal(found.episode(number), source.episode(number))
+
+
+def test_statistics_are_those_of_all_steps(tmp_path):
+    source = LeRobot(golden("v3"))
+    to_lerobot(source, tmp_path / "dataset", silent)
+    stats = json.loads((tmp_path / "dataset" / "meta" / "stats.json").read_text())
+    episodes = [source.episode(number) for number in range(4)]
+    state = np.concatenate([episode.state[0] for episode in episodes]).astype(np.float64)
+    pixels = np.concatenate([e.image["wrist"].reshape(-1, 3) for e in episodes]) / 255
+    for name, rows, shape in (
+        ("observation.state", state, (7,)),
+        ("observation.images.wrist", pixels, (3, 1, 1)),
+    ):
+        for statistic in ("min", "max", "mean", "std"):
+            expected = getattr(np, statistic)(rows, axis=0).reshape(shape)
+            np.testing.assert_allclose(stats[name][statistic], expected, rtol=1e-6, atol=1e-9)
+        assert stats[name]["count"] == [126]
+
+
+def test_actions_other_than_joint_targets(tmp_path):
+    episodes = make(actions="end_effector", robot="panda", control_dt=0.05)
+    episodes.save(tmp_path / "episodes.npz")
+    to_lerobot(open_source(tmp_path / "episodes.npz"), tmp_path / "dataset", silent)
+    info = json.loads((tmp_path / "dataset" / "meta" / "info.json").read_text())
+    assert (info["fps"], info["robot_type"]) == (20, "panda")
+    assert info["features"]["action"]["names"] is None
+    rows = pq.read_table(tmp_path / "dataset" / "data" / "chunk-000" / "file-001.parquet")
+    length = int(episodes.length[1])
+    np.testing.assert_array_equal(rows["action"].to_pylist(), episodes.action[1, :length])
+    np.testing.assert_array_equal(rows["index"], int(episodes.length[0]) + np.arange(length))
+
+
+def test_refusals_leave_nothing(tmp_path):
+    source = LeRobot(golden("v3"))
+    source.control_dt = 0.03
+    with pytest.raises(ValueError, match=r"whole frames per second, got 33\.3"):
+        to_lerobot(source, tmp_path / "dataset", silent)
+    source, first = LeRobot(golden("v3")), LeRobot(golden("v3")).episode(0)
+    source.episode = lambda number: dataclasses.replace(first, robot=f"arm_{number}")
+    with pytest.raises(ValueError, match="episode 1 has another robot or other shapes"):
+        to_lerobot(source, tmp_path / "dataset", silent)
+    assert not list(tmp_path.iterdir())
