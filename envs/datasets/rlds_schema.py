@@ -22,6 +22,7 @@ FEATURES, INFO = "features.json", "dataset_info.json"
 """Files of tfds that describe a dataset, in the dataset's folder."""
 FILES = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_INDEX}"
 """Template of shard names, as used by tfds.core.SequentialWriter."""
+_TFDS_FILES = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"  # of a copy that tfds wrote
 _MAIN = {"side": "image"}  # feature of the main camera; the others are <name>_image
 _COMPRESSION = 1  # level of zlib, the fastest
 _ACTION = {
@@ -46,8 +47,8 @@ _CLASSES = [
 _ALLOWED = {
     "pythonClassName": _CLASSES,
     "python_class_name": _CLASSES,
-    "filepathTemplate": [FILES],
-    "filepath_template": [FILES],
+    "filepathTemplate": [FILES, _TFDS_FILES],
+    "filepath_template": [FILES, _TFDS_FILES],
     "dtype": ["float32", "int64", "bool", "uint8"],
     "encoding": ["none"],
     "encodingFormat": ["png"],
@@ -122,7 +123,7 @@ def check_description(folder: Path, *names: str) -> None:
 
     Raises:
         RefusedError: a file names a class, data type or encoding that `features` does not use, or
-            shards other than `FILES`.
+            shards other than `FILES` and those of tfds.
         ValueError: a file is damaged.
         OSError: a file is missing.
     """

@@ -3,8 +3,6 @@
 import dataclasses
 import json
 import subprocess
-import sys
-import venv
 
 import numpy as np
 import pytest
@@ -17,7 +15,7 @@ from lorasp_jax.policies.processor import Processor
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.statistics import Statistics
 from lorasp_jax.serving.policies import CompiledPolicies
-from tests import ROOT
+from tests import ROOT, foreign
 from tests.models.random_models import random_backbone
 from tests.serving.stand_in import serving
 
@@ -28,15 +26,11 @@ CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")
 
 
 @pytest.fixture(scope="module")
-def python(tmp_path_factory):
-    """Return the interpreter of an environment with openpi's client."""
-    folder = tmp_path_factory.mktemp("openpi")
-    venv.create(folder, with_pip=True)
-    python = folder / ("Scripts" if sys.platform == "win32" else "bin") / "python"
+def python():
+    """Yield the interpreter of an environment with openpi's client."""
     # The client imports typing_extensions, which it does not declare.
-    packages = ["openpi-client==0.1.2", "typing_extensions"]
-    subprocess.run([python, "-m", "pip", "install", "-q", *packages], check=True)
-    return python
+    with foreign.environment("openpi-client==0.1.2", "typing_extensions") as python:
+        yield python
 
 
 def policy(dims):
