@@ -11,8 +11,8 @@ from lorasp_jax import peft
 from tests import ROOT, test_imports
 
 PAGES = sorted([*ROOT.glob("docs/*.md"), *ROOT.glob("docs/methods/*.md")])
-WITHOUT_EXAMPLES = {"runs", "benchmarks", "architecture", "study", "libero"}
-"""Reference pages, and one about another package."""
+WITHOUT_EXAMPLES = {"runs", "benchmarks", "architecture", "study", "libero", "metaworld"}
+"""Reference pages, and two about other packages."""
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 OPTION = re.compile(r"^\| `(\w+)` \| `([^`]+)` \| \S", re.MULTILINE)
 LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)|src(?:set)?=\"([^\":]+)\"")

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import threading
+from pathlib import Path
 from typing import ClassVar
 
 import gymnasium
@@ -237,6 +238,12 @@ def test_client_needs_no_jax():
     process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert process.returncode == 2
     assert process.stderr.startswith("error: there is no module nowhere")
+
+
+def test_run_without_jax_names_the_way_out(monkeypatch):
+    monkeypatch.setitem(sys.modules, "jax", None)
+    with pytest.raises(ValueError, match=r"needs jax, .* give --server"):
+        RunActor(Path("runs/x"), ["go"])
 
 
 @pytest.fixture(scope="module")

@@ -70,13 +70,20 @@ class RunActor:
         """Load the policy, with prompts of any instructions.
 
         Raises:
-            ValueError: the run has no policy, or an instruction is too long for it.
+            ValueError: the run has no policy, an instruction is too long for it, or this project's
+                dependencies are not installed.
         """
-        import jax
+        try:
+            import jax
 
-        from lorasp_jax.policies.tokenizer import load_tokenizer
-        from lorasp_jax.storage import hub
-        from lorasp_jax.training.export import describe, load_policy
+            from lorasp_jax.policies.tokenizer import load_tokenizer
+            from lorasp_jax.storage import hub
+            from lorasp_jax.training.export import describe, load_policy
+        except ModuleNotFoundError as error:
+            raise ValueError(
+                f"{run} needs {error.name}, which is not installed here: serve it elsewhere with "
+                f"python -m lorasp_jax.serving {run}, and give --server"
+            ) from error
 
         policy = load_policy(run)
         words = load_tokenizer(hub.resolve_portable(describe(run)["policy"]["tokenizer"]))

@@ -1,0 +1,78 @@
+"""Test the Meta-World example without Meta-World: its tasks, and that its datasets can be read."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from examples.metaworld import dataset
+from examples.metaworld.tasks import GROUPS, INSTRUCTIONS
+from lorasp_jax.data import open_source
+from lorasp_jax.evaluation.gymnasium.task import load_tasks
+from lorasp_jax.policies import tokenizer
+
+MAX_TOKENS = 32
+"""As in the page's command."""
+
+
+def test_groups_are_the_usual_ones():
+    assert {name: len(tasks) for name, tasks in GROUPS.items()} == {
+        "easy": 28,
+        "medium": 11,
+        "hard": 6,
+        "very hard": 5,
+    }
+    assert len(INSTRUCTIONS) == len(set(INSTRUCTIONS.values())) == 50
+
+
+def test_instructions_fit_the_bundled_tokenizer():
+    ids, _ = tokenizer.Offline().encode([*INSTRUCTIONS.values()], MAX_TOKENS)
+    assert len(np.unique(ids, axis=0)) == 50
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """Write two tasks of two and one episodes; return the folder and the episodes."""
+    folder = tmp_path_factory.mktemp("data") / "mt"
+    rng = np.random.default_rng(0)
+    episodes = [
+        (
+            rng.integers(0, 255, (length, 8, 8, 3), np.uint8),
+            rng.normal(size=(length, 4)).astype(np.float32),
+            rng.uniform(-1, 1, (length, 4)).astype(np.float32),
+        )
+        for length in (3, 5, 4)
+    ]
+    encoded = [([dataset.png(p) for p in pictures], *rest) for pictures, *rest in episodes]
+    writer = dataset.Writer(folder, 8)
+    writer.add_task("open the drawer", encoded[:2])
+    writer.add_task("turn the dial", encoded[2:])
+    writer.close()
+    return folder, episodes
+
+
+def test_a_dataset_is_read_as_written(written):
+    folder, episodes = written
+    source = open_source(folder)
+    assert source.kind == "LeRobot v3.0"
+    assert source.control_dt == pytest.approx(0.1)
+    assert len(source) == 3
+    for number, (pictures, state, action) in enumerate(episodes):
+        read = source.episode(number)
+        np.testing.assert_array_equal(read.image["corner2"][0], pictures)
+        np.testing.assert_array_equal(read.state[0], state)
+        np.testing.assert_array_equal(read.action[0], action)
+        expected = "turn the dial" if number == 2 else "open the drawer"
+        assert read.instructions[read.instruction[0]] == expected
+
+
+def test_a_dataset_is_not_overwritten(written):
+    with pytest.raises(FileExistsError):
+        dataset.Writer(written[0], 8)
+
+
+def test_missing_package_names_the_command(monkeypatch):
+    monkeypatch.setitem(sys.modules, "metaworld.env_dict", None)
+    monkeypatch.delitem(sys.modules, "examples.metaworld.world", raising=False)
+    with pytest.raises(ValueError, match=r"pip install metaworld==3\.1\.1 packaging"):
+        load_tasks("examples.metaworld.world:mt50")
