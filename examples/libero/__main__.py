@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from lorasp_jax.evaluation.metrics import wilson_interval
+from lorasp_jax.evaluation.intervals import wilson_interval
 from lorasp_jax.serving.client import PolicyClient, PolicyError, ServerGone
 from lorasp_jax.serving.pictures import to_square
 
