@@ -130,7 +130,7 @@ def test_the_servers_policy_is_measured_and_reported(libero, monkeypatch, capsys
     modules = {
         "libero.libero": types.SimpleNamespace(get_libero_path=lambda _: "root"),
         "libero.libero.benchmark": types.SimpleNamespace(
-            get_benchmark_dict=lambda: {"libero_goal_swap": Suite}
+            get_benchmark_dict=lambda: {"libero_goal_swap": Suite, "libero_100": Suite}
         ),
         "libero.libero.envs": types.SimpleNamespace(OffScreenRenderEnv=Env),
     }
@@ -147,8 +147,12 @@ def test_the_servers_policy_is_measured_and_reported(libero, monkeypatch, capsys
         ]
         with pytest.raises(ValueError, match=r"libero_goal_swap has tasks 0 to 1, got 2"):
             libero.main(libero.Config(tasks=(2,), address=server.address, **options))
-    with pytest.raises(ValueError, match=r"no suite nonsense; LIBERO has libero_goal_swap"):
-        libero.main(libero.Config(suite="nonsense", random=True))
+    for suite, sentence in (
+        ("nonsense", "no suite nonsense; LIBERO has libero_100, libero_goal_swap"),
+        ("libero_100", "no limit of steps for libero_100: choose --steps"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            libero.main(libero.Config(suite=suite, random=True))
 
 
 @pytest.mark.parametrize("name", ["episodes", "steps", "replan"])

@@ -123,7 +123,9 @@ def measure(config: Config, act: Act, size: int) -> Iterator[tuple[str, int, int
     suite = suites[config.suite]()
     if missing := [task for task in config.tasks if not 0 <= task < suite.n_tasks]:
         raise ValueError(f"{config.suite} has tasks 0 to {suite.n_tasks - 1}, got {missing[0]}")
-    steps = config.steps or STEPS[config.suite.split("_")[1]]
+    steps = config.steps or STEPS.get(config.suite.split("_")[1])
+    if steps is None:
+        raise ValueError(f"openpi has no limit of steps for {config.suite}: choose --steps")
     for number in config.tasks or range(suite.n_tasks):
         task, starts = suite.get_task(number), suite.get_task_init_states(number)
         folder = Path(libero.get_libero_path("bddl_files"), task.problem_folder)
@@ -190,5 +192,5 @@ def line(name: str, successes: int, episodes: int) -> str:
 if __name__ == "__main__":
     try:
         main(tyro.cli(Config, description=__doc__))
-    except (ValueError, ModuleNotFoundError, PolicyError, ServerGone) as error:
+    except (ValueError, FileNotFoundError, ModuleNotFoundError, PolicyError, ServerGone) as error:
         raise SystemExit(f"error: {error}") from None
