@@ -1,6 +1,10 @@
 """Test the Meta-World example without Meta-World: its tasks, and that its datasets can be read."""
 
+import json
+import os
+import subprocess
 import sys
+import venv
 
 import numpy as np
 import pytest
@@ -10,6 +14,8 @@ from examples.metaworld.tasks import GROUPS, INSTRUCTIONS
 from lorasp_jax.data import open_source
 from lorasp_jax.evaluation.gymnasium.task import load_tasks
 from lorasp_jax.policies import tokenizer
+from tests import ROOT
+from tests.evaluation.policy_servers import policy_server
 
 MAX_TOKENS = 32
 """As in the page's command."""
@@ -76,3 +82,45 @@ def test_missing_package_names_the_command(monkeypatch):
     monkeypatch.delitem(sys.modules, "examples.metaworld.world", raising=False)
     with pytest.raises(ValueError, match=r"pip install metaworld==3\.1\.1 packaging"):
         load_tasks("examples.metaworld.world:mt50")
+
+
+@pytest.mark.slow
+def test_unmodified_metaworld_records_and_judges(tmp_path):
+    """In an environment of its own, which pins another MuJoCo and has no JAX."""
+    venv.create(tmp_path / "venv", with_pip=True)
+    python = str(tmp_path / "venv" / "bin" / "python")
+    packages = ["metaworld==3.1.1", "packaging", "pyarrow", "lazy_loader", "msgpack", "websockets"]
+    run([python, "-m", "pip", "install", "-q", *packages])
+    data = tmp_path / "data"
+    collect = [python, "-m", "examples.metaworld.collect", str(data), "--tasks", "reach"]
+    run([*collect, "--episodes", "2", "--processes", "1"])
+    source = open_source(data)
+    episode = source.episode(1)
+    assert len(source) == 2
+    assert episode.image["corner2"].shape[2:] == (128, 128, 3)
+    assert episode.image["corner2"].std() > 20  # not black
+    assert np.abs(episode.action).max() <= 1
+    assert "hand" in episode.instructions[0]
+
+    def act(request):
+        """Move to the place where the second demonstration ended: the same seed, the same layout.
+
+        Five actions of eight steps of 1 cm cover the distance at a gain of 2.5 / m.
+        """
+        move = 2.5 * (episode.state[0, -1] - request["state"])
+        return np.tile(np.clip(move, -1, 1), (5, 1)).astype(np.float32)
+
+    out = tmp_path / "results.json"
+    with policy_server(act) as url:
+        judge = [python, "-m", "lorasp_jax.evaluation", "--server", url, "--tasks", "reach"]
+        judge += ["--env", "examples.metaworld.world:mt50", "--episodes", "2", "--out", str(out)]
+        run([*judge, "--seed", str(1_000_001)])
+    assert json.loads(out.read_text())["tasks"]["reach"]["outcomes"][0] is True
+
+
+def run(command):
+    environment = {**os.environ, "MUJOCO_GL": "egl", "PYTHONPATH": str(ROOT)}
+    process = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+    )
+    assert process.returncode == 0, process.stderr[-2000:]

@@ -45,6 +45,7 @@ class World(gymnasium.Env):
             seed=0
         )
         self.inner._freeze_rand_vec = False  # a new layout at every reset
+        self.inner.seeded_rand_vec = True  # from the seed, not from NumPy's global generator
         self.metadata = self.inner.metadata
         self.action_space = self.inner.action_space
         self.observation_space = self.inner.observation_space

@@ -1,10 +1,11 @@
 """Judge a policy in a Gymnasium environment: `python -m lorasp_jax.evaluation --help`."""
 
 import argparse
+import contextlib
 import importlib.util
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,14 +37,15 @@ def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.evaluati
 def _run(options: argparse.Namespace) -> None:
     _check(options)
     tasks = load_tasks(options.env, options.tasks)
-    results = judge(
-        tasks,
-        _actor(options, tasks),
-        options.episodes,
-        seed=options.seed,
-        films=options.films,
-        progress=_print_progress if sys.stderr.isatty() else None,
-    )
+    with _actor(options, tasks) as actor:
+        results = judge(
+            tasks,
+            actor,
+            options.episodes,
+            seed=options.seed,
+            films=options.films,
+            progress=_print_progress if sys.stderr.isatty() else None,
+        )
     if sys.stderr.isatty():
         print(file=sys.stderr)
     print(table(results))
@@ -67,10 +69,14 @@ def _check(options: argparse.Namespace) -> None:
         raise ValueError("--films needs pip install pillow")
 
 
-def _actor(options: argparse.Namespace, tasks: Sequence[Task]) -> Actor:
-    if options.server:
-        return ServerActor(options.server, token=options.token, wait=options.wait)
-    return RunActor(options.run, [task.instruction for task in tasks])
+@contextlib.contextmanager
+def _actor(options: argparse.Namespace, tasks: Sequence[Task]) -> Iterator[Actor]:
+    if not options.server:
+        yield RunActor(options.run, [task.instruction for task in tasks])
+        return
+    server = ServerActor(options.server, token=options.token, wait=options.wait)
+    with contextlib.closing(server):
+        yield server
 
 
 def _print_progress(task: str, done: int, successes: int) -> None:

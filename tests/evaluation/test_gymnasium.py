@@ -5,7 +5,6 @@ import dataclasses
 import json
 import subprocess
 import sys
-import threading
 from pathlib import Path
 from typing import ClassVar
 
@@ -14,7 +13,6 @@ import jax
 import numpy as np
 import pytest
 from PIL import Image
-from websockets.sync.server import serve
 
 from lorasp_jax import models
 from lorasp_jax.evaluation.__main__ import main
@@ -25,9 +23,9 @@ from lorasp_jax.evaluation.gymnasium.task import load_tasks
 from lorasp_jax.evaluation.intervals import wilson_interval
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import FullFineTuning
-from lorasp_jax.serving import wire
 from lorasp_jax.training import export
 from tests import ROOT
+from tests.evaluation.policy_servers import policy_server
 from tests.models.random_models import random_backbone
 from tests.runs import CONFIG, make_run
 
@@ -180,31 +178,16 @@ def test_tasks_are_selected_by_name():
         load_tasks(f"{HERE}:tasks", ["third"])
 
 
-@contextlib.contextmanager
-def policy_server():
-    """Serve `Mover` in openpi's protocol; it refuses instructions other than that of `TASK`."""
-
-    def answer(socket):
-        socket.send(wire.pack({}))
-        for frame in socket:
-            request = wire.unpack(frame)
-            if request["prompt"] != TASK.instruction:
-                socket.send("no such prompt")
-                return
-            chunk = Mover().act(request["image"], request["state"], request["prompt"])
-            socket.send(wire.pack({"actions": chunk}))
-
-    with serve(answer, "127.0.0.1", 0) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
-        server.shutdown()
-        thread.join()
+def act(request):
+    """Act like `Mover`, refusing instructions other than that of `TASK`."""
+    if request["prompt"] != TASK.instruction:
+        raise ValueError("no such prompt")
+    return Mover().act(request["image"], request["state"], request["prompt"])
 
 
 def test_command_judges_a_server(tmp_path, capsys):
     out = tmp_path / "results.json"
-    with policy_server() as url:
+    with policy_server(act) as url:
         options = ["--server", url, "--env", f"{HERE}:tasks", "--episodes", "3", "--out", str(out)]
         assert main(options) == 0
         assert main(options) == 2  # does not overwrite
@@ -217,8 +200,12 @@ def test_command_judges_a_server(tmp_path, capsys):
 
 def test_server_refusals_are_one_sentence():
     task = dataclasses.replace(TASK, instruction="fly")
-    with policy_server() as url, pytest.raises(ValueError, match="refused: no such prompt"):
-        judge([task], ServerActor(url), 1)
+    with (
+        policy_server(act) as url,
+        contextlib.closing(ServerActor(url)) as actor,
+        pytest.raises(ValueError, match="refused: no such prompt"),
+    ):
+        judge([task], actor, 1)
 
 
 @pytest.mark.parametrize("arguments", [[], ["runs/x", "--server", "ws://127.0.0.1:9"]])

@@ -62,6 +62,10 @@ class ServerActor:
         except PolicyError as error:
             raise ValueError(f"the policy server refused: {error}") from error
 
+    def close(self) -> None:
+        """Close the connection."""
+        self._client.close()
+
 
 class RunActor:
     """Samples the policy of a finished run in this process."""
