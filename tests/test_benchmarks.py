@@ -129,11 +129,12 @@ def test_compile_time(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_serving():
-    command = serving.waiting_command(image_size=16, cameras=1, seconds=0.01)
-    (one, times), (eight, times_of_eight) = serving.measure(command, calls=20)
-    assert (times.shape, times_of_eight.shape) == ((20, 3), (160, 3))
+    # A batch takes so long that this holds on a machine busy with other tests, too.
+    command = serving.waiting_command(image_size=16, cameras=1, seconds=0.1)
+    (one, times), (eight, times_of_eight) = serving.measure(command, calls=10)
+    assert (times.shape, times_of_eight.shape) == ((10, 3), (80, 3))
     assert (times[:, 0] > times[:, 1]).all()
-    assert (times[:, 1] >= 10).all()
+    assert (times[:, 1] >= 100).all()
     assert eight > 2 * one
 
 
