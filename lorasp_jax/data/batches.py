@@ -77,30 +77,33 @@ class Raw:
 
 
 def flatten(episodes: Sequence[Episodes]) -> Steps:
-    """Concatenate all episodes without padding, and number their instructions consecutively."""
+    """Concatenate all episodes without padding, and number their instructions consecutively.
+
+    The result is in host memory: on a device, the copies would take several times its size.
+    """
     parts: list[Steps] = []
     step_offset = instruction_offset = 0
     for group in episodes:
         length = np.asarray(group.length)
         valid = np.flatnonzero(np.arange(group.state.shape[1]) < length[:, None])
 
-        def keep(array: Array, valid: np.ndarray = valid) -> jax.Array:
-            return jnp.asarray(array).reshape(-1, *array.shape[2:])[valid]
+        def keep(array: Array, valid: np.ndarray = valid) -> np.ndarray:
+            return np.asarray(array).reshape(-1, *array.shape[2:])[valid]
 
         parts.append(
             Steps(
                 image={name: keep(image) for name, image in group.image.items()},
                 state=keep(group.state),
                 action=keep(group.action),
-                end=jnp.asarray(np.repeat(np.cumsum(length), length) + step_offset, jnp.int32),
-                instruction=jnp.asarray(
-                    np.repeat(group.instruction, length) + instruction_offset, jnp.int32
+                end=np.repeat(np.cumsum(length) + step_offset, length).astype(np.int32),
+                instruction=np.repeat(
+                    np.asarray(group.instruction, np.int32) + np.int32(instruction_offset), length
                 ),
             )
         )
         step_offset += int(length.sum())
         instruction_offset += len(group.instructions)
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
 def fit_to_size(steps: Steps, size: int) -> Steps:

@@ -45,7 +45,7 @@ def sampler(policy: Policy, episodes: Episodes, batch_size: int) -> Sample:
     """
     processor, chunk = policy.processor, policy.model.config.chunk
     rows = processor.prompts.rows(episodes.instructions)
-    steps = jax.device_get(flatten([episodes]))
+    steps = flatten([episodes])
     steps = dataclasses.replace(steps, instruction=rows[steps.instruction])
 
     def sample(key: jax.Array) -> Batch:

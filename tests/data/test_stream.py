@@ -1,6 +1,10 @@
 """The order of training data: every step once per epoch, for any number of processes."""
 
+import dataclasses
+import functools
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -16,7 +20,7 @@ from tests.runs import random_episodes
 @pytest.fixture(scope="module")
 def steps():
     """42 steps in NumPy; the first state dimension is the index of the step."""
-    found = jax.tree.map(np.asarray, flatten([random_episodes("a", 0), random_episodes("b", 1)]))
+    found = flatten([random_episodes("a", 0), random_episodes("b", 1)])
     state = np.array(found.state)
     state[:, 0] = np.arange(42)
     return found.__class__(found.image, state, found.action, found.end, found.instruction)
@@ -68,6 +72,13 @@ def test_windows_stay_in_their_episode(steps):
         assert windows.instruction[row] == steps.instruction[start]
 
 
+def test_demonstrations_are_concatenated_in_host_memory():
+    episodes = random_episodes("a", 0)
+    on_device = dataclasses.replace(episodes, image=jax.tree.map(jnp.asarray, episodes.image))
+    for leaf in jax.tree.leaves(flatten([on_device, episodes])):
+        assert type(leaf) is np.ndarray
+
+
 def test_a_streamed_window_trains_as_one_on_the_device():
     parts = [random_episodes("a", 0), random_episodes("b", 1)]
     phrases = [phrase for part in parts for phrase in part.instructions]
@@ -75,10 +86,10 @@ def test_a_streamed_window_trains_as_one_on_the_device():
     steps, table = flatten(parts), processor(parts, Pi0Config.dummy(), prompts)
     key = jax.random.key(0)
     sizes = {"batch_size": 6, "chunk": 4, "state_noise": 0.1}
-    batch = jax.jit(lambda key: sample_batch(key, steps, table, **sizes))(key)
+    batch = jax.jit(functools.partial(sample_batch, **sizes))(key, steps, table)
     start_key, noise_key = jax.random.split(key)
     start = np.asarray(jax.random.randint(start_key, (6,), 0, 42))
-    windows = gather(jax.tree.map(np.asarray, steps), start, 4)
+    windows = gather(steps, start, 4)
     found = jax.jit(lambda key, w: encode(key, w, table, state_noise=0.1))(noise_key, windows)
     jax.tree.map(np.testing.assert_array_equal, found, batch)
 

@@ -32,7 +32,7 @@ from tests.runs import CONFIG, Terminate, leaves, make_run, random_episodes, rep
 
 def streamed(folder, devices=1):
     run = make_run(folder, devices=devices)
-    run.dataset = jax.tree.map(np.asarray, flatten(list(run.episodes.values())))
+    run.dataset = flatten(list(run.episodes.values()))
     run.streams = True
     return run
 
