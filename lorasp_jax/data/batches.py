@@ -144,6 +144,12 @@ def gather(steps: Steps, start: Array, chunk: int) -> Raw:
     )
 
 
+def draw(key: jax.Array, steps: Steps, *, batch_size: int, chunk: int) -> Raw:
+    """Gather `batch_size` windows that start at uniformly random steps."""
+    start = jax.random.randint(key, (batch_size,), 0, steps.end.shape[0])
+    return gather(steps, start, chunk)
+
+
 def encode(key: jax.Array, raw: Raw, processor: Processor, *, state_noise: float) -> Batch:
     """Normalize a batch for the model; `key` seeds the noise added to the normalized state."""
     batch: Any = jax.tree.map(jnp.asarray, raw)
@@ -163,7 +169,7 @@ def sample_batch(
     chunk: int,
     state_noise: float,
 ) -> Batch:
-    """Sample `batch_size` windows that start at uniformly random steps."""
+    """Draw and normalize `batch_size` windows."""
     start_key, noise_key = jax.random.split(key)
-    start = jax.random.randint(start_key, (batch_size,), 0, steps.end.shape[0])
-    return encode(noise_key, gather(steps, start, chunk), processor, state_noise=state_noise)
+    raw = draw(start_key, steps, batch_size=batch_size, chunk=chunk)
+    return encode(noise_key, raw, processor, state_noise=state_noise)

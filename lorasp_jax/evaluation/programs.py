@@ -70,7 +70,8 @@ class Worlds:
             ValueError: the policy has no prompt for one of the instructions.
         """
         rows = policy.processor.prompts.rows(env.instructions)
-        self._env, self._policy = env, _without_names(prepared(policy))
+        self._env = env
+        self._policy = Policy(prepared(policy).model, policy.processor.shared())
         # Programs are compiled again for arrays placed otherwise, so all follow the keys.
         self._place = _placement(policy)
         reset_key, self._sample_key = jax.device_put(tuple(jax.random.split(key)), self._place)
@@ -180,12 +181,6 @@ def _correct() -> Callable[..., Any]:
         return correct(head, processor, observation, chunk[:, step], indices)
 
     return jax.jit(correct_action, compiler_options=fast_cpu.without_simulation())
-
-
-def _without_names(policy: Policy) -> Policy:
-    """Drop the instructions, which are static, so that policies for other tasks look the same."""
-    prompts = dataclasses.replace(policy.processor.prompts, instructions=())
-    return Policy(policy.model, dataclasses.replace(policy.processor, prompts=prompts))
 
 
 def _placement(policy: Policy) -> Any:

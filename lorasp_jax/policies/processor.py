@@ -153,6 +153,10 @@ class Processor:
         check_delta(inputs.delta, num_joints)
         return cls(slots, statistics, prompts, config.image_size, inputs, pairs)
 
+    def shared(self) -> "Processor":
+        """Return a processor for rows of the prompt table alone; see `PromptTable.shared`."""
+        return dataclasses.replace(self, prompts=self.prompts.shared())
+
     @property
     def slot_mask(self) -> np.ndarray:
         """Mask of the robot's slots, `[A]` bool."""

@@ -19,6 +19,9 @@ from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.policies import prompts
 from lorasp_jax.policies.tokenizer import Tokenizer
 
+SHARED_ROWS = 64
+"""The tables of `PromptTable.shared` have a multiple of as many rows."""
+
 
 class Ids(NamedTuple):
     """Token ids `[N, K]` int32, each row padded on the right, and mask `[N, K]` bool."""
@@ -101,6 +104,16 @@ class PromptTable:
         rows = self.rows(instructions)
         start = Ids(*(array[rows] for array in self.start))
         return dataclasses.replace(self, start=start, instructions=tuple(instructions))
+
+    def shared(self) -> "PromptTable":
+        """Drop the instructions and repeat rows up to a multiple of `SHARED_ROWS`.
+
+        Programs that take such a table are the same for most sets of tasks.
+        """
+        count = len(self.start.ids)
+        rows = np.arange(-(-count // SHARED_ROWS) * SHARED_ROWS) % count
+        start = Ids(*(jnp.asarray(array)[rows] for array in self.start))
+        return dataclasses.replace(self, start=start, instructions=())
 
     def with_instructions(self, words: Tokenizer, instructions: Sequence[str]) -> "PromptTable":
         """Return a table of other instructions, as long as these.

@@ -4,7 +4,7 @@ import contextlib
 import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 from flax import nnx
@@ -12,8 +12,9 @@ from flax import nnx
 from envs.cli.bars import bars
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config, OptimConfig
-from lorasp_jax.data.batches import Raw, Steps, encode, sample_batch
+from lorasp_jax.data.batches import Raw, encode
 from lorasp_jax.policies.policy import Policy
+from lorasp_jax.policies.processor import Processor
 from lorasp_jax.training.checkpoint import Checkpoints
 from lorasp_jax.training.demonstrations import fresh_demonstrations
 from lorasp_jax.training.distributed import mesh as meshes
@@ -21,7 +22,7 @@ from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.guard import summarize
 from lorasp_jax.training.interrupt import deferred
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
-from lorasp_jax.training.random_streams import RandomStream
+from lorasp_jax.training.random_streams import RandomStream, StepKeys
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import MetricsLog
 from lorasp_jax.training.step import TrainState, init_state, train_step
@@ -60,11 +61,12 @@ def train(
     mesh = meshes.make_mesh(run.config.fsdp, run.devices)
     shardings = meshes.shardings(state, mesh)
     state = processes.device_put(state, shardings)
+    frozen = Frozen(frozen, run.policy.processor.shared())
     frozen = processes.device_put(frozen, meshes.shardings(frozen, mesh))
     processor = run.policy.processor
 
     def policy(state: TrainState) -> Policy:
-        return Policy(nnx.merge(graphdef, state.eval_adapters, frozen), processor)
+        return Policy(nnx.merge(graphdef, state.eval_adapters, frozen.parameters), processor)
 
     run.policy = policy(state)
     checkpoints = Checkpoints(run.folder, run.base_hash, run.console)
@@ -117,14 +119,26 @@ def _local_policy(run: Run, name: str) -> Iterator[None]:
     processes.barrier(name)
 
 
-def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) -> Callable:
-    """Return the jitted scan over steps: (frozen, data, state, key, count) -> state, metrics.
+class Frozen(NamedTuple):
+    """What training does not change.
 
-    `data` is the whole dataset or one raw batch; metrics have a leading axis over steps.
-    `shardings` are those of the state, from `meshes.shardings`.
+    Attributes:
+        parameters: frozen parameters of the model.
+        processor: normalizes the batches; an input of the training program and not a part of it, so
+            that runs on other demonstrations have the same program.
     """
-    optim, processor = run.config.optim, run.policy.processor
-    mesh = shardings.step.mesh
+
+    parameters: Any
+    processor: Processor
+
+
+def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) -> Callable:
+    """Return the jitted scan over steps: (frozen, batches, state, key) -> state, metrics.
+
+    `frozen` is a `Frozen`, `batches` a `Raw`; the batches and the metrics have a leading axis over
+    steps. `shardings` are those of the state, from `meshes.shardings`.
+    """
+    optim, mesh = run.config.optim, shardings.step.mesh
     step = functools.partial(
         train_step,
         graphdef=graphdef,
@@ -135,25 +149,22 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
         spike=optim.spike,
         max_delay=optim.rtc_max_delay,
     )
-    chunk = run.policy.model.config.chunk
-    sample = functools.partial(sample_batch, batch_size=optim.batch_size, chunk=chunk)
 
-    def body(state: TrainState, frozen: Any, data: Steps | Raw, key: jax.Array) -> Any:
-        batch_key, loss_key = jax.random.split(jax.random.fold_in(key, state.step))
-        make_batch: Any = encode if isinstance(data, Raw) else sample
-        batch = make_batch(batch_key, data, processor, state_noise=optim.state_noise)
+    def body(state: TrainState, raw: Raw, frozen: Frozen, key: jax.Array) -> Any:
+        keys = StepKeys.of(key, state.step)
+        noise = optim.state_noise
+        batch = encode(keys.state_noise, raw, frozen.processor, state_noise=noise)
         batch = jax.lax.with_sharding_constraint(batch, meshes.batch_sharding(mesh))
-        return step(state, frozen, batch, loss_key)
+        return step(state, frozen.parameters, batch, keys.loss)
 
     # Keep the state's sharding: the compiled program accepts no other as its input.
     @functools.partial(
         jax.jit,
-        static_argnames="count",
         donate_argnames="state",
         out_shardings=(shardings, meshes.replicated(mesh)),
     )
-    def scan(frozen: Any, data: Steps | Raw, state: TrainState, key: jax.Array, count: int) -> Any:
-        return jax.lax.scan(lambda state, _: body(state, frozen, data, key), state, length=count)
+    def scan(frozen: Frozen, batches: Raw, state: TrainState, key: jax.Array) -> Any:
+        return jax.lax.scan(lambda state, raw: body(state, raw, frozen, key), state, batches)
 
     return scan
 

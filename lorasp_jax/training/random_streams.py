@@ -2,6 +2,7 @@
 
 import enum
 import zlib
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -26,3 +27,18 @@ class RandomStream(enum.IntEnum):
         key = jax.random.fold_in(jax.random.key(seed), self)
         # Python's hash of a string differs between processes.
         return jax.random.fold_in(key, np.uint32(zlib.crc32(name.encode()))) if name else key
+
+
+class StepKeys(NamedTuple):
+    """Keys of one training step: for the windows to draw, the noise of the state, and the loss."""
+
+    windows: jax.Array
+    state_noise: jax.Array
+    loss: jax.Array
+
+    @classmethod
+    def of(cls, key: jax.Array, step: jax.Array) -> "StepKeys":
+        """Derive the keys of step `step`, `[]` int32, from the key of `RandomStream.TRAINING`."""
+        batch, loss = jax.random.split(jax.random.fold_in(key, step))
+        windows, state_noise = jax.random.split(batch)
+        return cls(windows, state_noise, loss)

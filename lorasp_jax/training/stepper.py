@@ -23,44 +23,58 @@ from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.run import Run
 from lorasp_jax.training.step import TrainState
+from lorasp_jax.training.windows import DrawnWindows, StreamedWindows, Windows
 
 Collect = Callable[[Config, int], dict[str, Episodes]]
 """Collects demonstrations per task for generation 1, 2, ... (see `fresh_demonstrations`)."""
 
 
 class Stepper:
-    """Runs steps, (state, key, count) -> state, metrics; compiles once per value of `count`."""
+    """Runs steps, (state, key, count) -> state, metrics.
 
-    def __init__(self, jitted: Callable, frozen: Any, data: Steps | Raw, speed: Speed) -> None:
+    The training program takes batches, not the dataset: it is the same for datasets of any size.
+    """
+
+    def __init__(self, jitted: Callable, frozen: Any, windows: Windows, speed: Speed) -> None:
         """Store the arguments; nothing is compiled yet.
 
         Args:
             jitted: step function from `loop.jit_steps`.
-            frozen: frozen parameters, on the mesh.
-            data: the whole dataset or one raw batch, on the mesh.
+            frozen: a `loop.Frozen`, on the mesh.
+            windows: source of batches.
             speed: meter of training speed.
         """
-        self._jitted, self._frozen, self._data = jitted, frozen, data
+        self._jitted, self._frozen, self._windows = jitted, frozen, windows
         self.speed: Speed = speed
         self._compiled: dict[int, Future[Any]] = {}
 
     def compile(self, state: TrainState, count: int) -> Future[Any]:
-        """Start compiling `count` steps in a background thread, unless already started."""
-        if count not in self._compiled:
-            self._compiled[count] = _in_thread(self._compile, state, count)
-        return self._compiled[count]
+        """Start compiling the calls that run `count` steps in a background thread, once."""
+        size = self._windows.call_size(count)
+        if size not in self._compiled:
+            self._compiled[size] = _in_thread(self._compile, state, size)
+        return self._compiled[size]
 
-    def _compile(self, state: TrainState, count: int) -> Any:
+    def _compile(self, state: TrainState, size: int) -> Any:
         key = jax.random.key(0)
         with messages.announce("the training step"):
-            lowered = self._jitted.lower(self._frozen, self._data, state, key, count)
+            lowered = self._jitted.lower(self._frozen, self._windows.shapes(size), state, key)
             return lowered.compile(compiler_options=fast_cpu.without_simulation())
 
     def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
         """Run `count` steps; metrics have a leading axis over steps."""
-        compiled = self.compile(state, count).result()
+        compiled, size = self.compile(state, count).result(), self._windows.call_size(count)
         self.speed.begin()
-        return compiled(self._frozen, self._data, state, key)
+        rows = []
+        for _ in range(count // size):
+            batches = self._windows(key, state.step, size)
+            state, metrics = compiled(self._frozen, batches, state, key)
+            self._called(metrics)
+            rows.append(metrics)
+        return state, jax.tree.map(lambda *values: jnp.concatenate(values), *rows)
+
+    def _called(self, metrics: Any) -> None:
+        """Do what is due while the device runs a call that will return `metrics`."""
 
 
 class StreamingStepper(Stepper):
@@ -68,22 +82,12 @@ class StreamingStepper(Stepper):
 
     def __init__(self, jitted: Callable, frozen: Any, batches: Iterator[Raw], speed: Speed) -> None:
         """Read the first batch; for the other arguments see `Stepper`."""
-        super().__init__(jitted, frozen, next(batches), speed)
-        self._batches = batches
+        self._streamed = StreamedWindows(batches)
+        super().__init__(jitted, frozen, self._streamed, speed)
 
-    def compile(self, state: TrainState, count: int) -> Future[Any]:  # noqa: ARG002
-        """Start compiling a single step, because every step has its own batch."""
-        return super().compile(state, 1)
-
-    def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
-        """Run `count` steps, reading the next batch during each one."""
-        rows = []
-        for _ in range(count):
-            state, metrics = super().__call__(state, key, 1)
-            with self.speed.waiting(metrics):
-                self._data = next(self._batches)
-            rows.append(metrics)
-        return state, jax.tree.map(lambda *values: jnp.concatenate(values), *rows)
+    def _called(self, metrics: Any) -> None:
+        with self.speed.waiting(metrics):
+            self._streamed.read_next()
 
 
 class RefreshingStepper(Stepper):
@@ -97,6 +101,7 @@ class RefreshingStepper(Stepper):
         self,
         jitted: Callable,
         frozen: Any,
+        windows: Callable[[Steps], DrawnWindows],
         speed: Speed,
         config: Config,
         collect: Callable[[int], Steps],
@@ -104,14 +109,16 @@ class RefreshingStepper(Stepper):
     ) -> None:
         """Collect the generation of step `start` and start collecting the next one.
 
-        `collect` returns a generation on the device; all generations have the same shapes.
+        `windows` draws from a generation. `collect` returns a generation on the device; all
+        generations have the same shapes.
         """
         self._every, self._last = config.data.fresh_every, config.optim.steps - 1
         self._collect = collect
         self._generation = self._generation_of(min(start, self._last))
         # After the last step nothing trains: use generation 0, which exists already.
         first = self._generation if start <= self._last else 0
-        super().__init__(jitted, frozen, collect(first), speed)
+        self._drawn = windows(collect(first))
+        super().__init__(jitted, frozen, self._drawn, speed)
         self._collect_next()
 
     def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
@@ -119,7 +126,7 @@ class RefreshingStepper(Stepper):
         if self._generation_of(int(state.step)) > self._generation:
             self.speed.begin()
             with self.speed.waiting(state):
-                self._data = self._next.result()
+                self._drawn.steps = self._next.result()
             self._generation += 1
             self._collect_next()
         return super().__call__(state, key, count)
@@ -157,9 +164,14 @@ def make_stepper(
             steps = fit_to_size(flatten(list(episodes.values())), len(steps.end))
         return processes.device_put(steps, meshes.replicated(mesh))
 
+    sizes = {
+        "batch_size": run.config.optim.batch_size,
+        "chunk": run.policy.model.config.chunk,
+    }
+    windows = functools.partial(DrawnWindows, mesh=mesh, **sizes)
     if run.config.data.fresh_every:
-        return RefreshingStepper(jitted, frozen, speed, run.config, generation, start)
-    return Stepper(jitted, frozen, generation(0), speed)
+        return RefreshingStepper(jitted, frozen, windows, speed, run.config, generation, start)
+    return Stepper(jitted, frozen, windows(generation(0)), speed)
 
 
 def _in_thread(function: Callable, *arguments: Any) -> Future[Any]:
@@ -171,7 +183,10 @@ def _in_thread(function: Callable, *arguments: Any) -> Future[Any]:
 
 
 def _batches(run: Run, mesh: jax.sharding.Mesh, start: int) -> Iterator[Raw]:
-    """Return the dataset's batches from step `start` on, sharded over the devices."""
+    """Return the dataset's batches from step `start` on, sharded over the devices.
+
+    They have a leading axis of length 1, see `StreamedWindows`.
+    """
     stream = Stream(
         run.steps,
         batch_size=run.config.optim.batch_size,
@@ -180,7 +195,8 @@ def _batches(run: Run, mesh: jax.sharding.Mesh, start: int) -> Iterator[Raw]:
         start=start,
         process=(jax.process_index(), jax.process_count()),
     )
-    put = functools.partial(jax.make_array_from_process_local_data, meshes.batch_sharding(mesh))
+    sharding = meshes.batches_sharding(mesh)
+    put = lambda x: jax.make_array_from_process_local_data(sharding, x[None])  # noqa: E731
     return (jax.tree.map(put, raw) for raw in stream)
 
 

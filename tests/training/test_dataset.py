@@ -1,7 +1,6 @@
 """Runs on a dataset: preparation from the command line, and exact streaming from files."""
 
 import dataclasses
-import functools
 import io
 import json
 import time
@@ -27,7 +26,7 @@ from lorasp_jax.training.loop import train
 from lorasp_jax.training.run_folder import read_metrics, to_json, write_json
 from lorasp_jax.training.stepper import StreamingStepper, _batches
 from tests.models.random_models import random_backbone
-from tests.runs import CONFIG, Terminate, leaves, make_run, random_episodes, repeatable
+from tests.runs import CONFIG, StepCount, Terminate, leaves, make_run, random_episodes, repeatable
 
 
 def streamed(folder, devices=1):
@@ -62,19 +61,19 @@ def test_every_step_has_the_next_batch(tmp_path):
     run = streamed(tmp_path / "run")
     mesh = meshes.make_mesh()
 
-    @functools.partial(jax.jit, static_argnames="count")
-    def record(frozen, raw, state, key, count):
-        assert count == 1
-        return state + 1, {"sum": jnp.atleast_1d(raw.state.sum() + frozen)}
+    @jax.jit
+    def record(frozen, batches, state, key):
+        assert len(batches.state) == 1
+        return StepCount(state.step + 1), {"sum": jnp.atleast_1d(batches.state.sum() + frozen)}
 
     def sums(start, *counts):
         stepper = StreamingStepper(record, 1.0, _batches(run, mesh, start), Speed(8, None))
-        state, totals = start, []
+        state, totals = StepCount(jnp.asarray(start)), []
         for count in counts:
             state, metrics = stepper(state, jax.random.key(0), count)
             assert metrics["sum"].shape == (count,)
             totals += [float(metrics["sum"].sum())]
-        assert state == start + sum(counts)
+        assert state.step == start + sum(counts)
         return totals
 
     batches = _batches(run, mesh, 0)
@@ -82,7 +81,7 @@ def test_every_step_has_the_next_batch(tmp_path):
     np.testing.assert_allclose(sums(0, 2, 4, 3), [sum(each[:2]), sum(each[2:6]), sum(each[6:])])
     np.testing.assert_allclose(sums(5, 1, 3), [each[5], sum(each[6:])])
     shards = next(batches).image["side"].addressable_shards
-    assert [shard.data.shape[0] for shard in shards] == [1] * 8
+    assert [shard.data.shape[:2] for shard in shards] == [(1, 1)] * 8
 
 
 @pytest.mark.slow

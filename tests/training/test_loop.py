@@ -94,7 +94,7 @@ def test_signal_handlers_are_restored(tmp_path):
 def test_steps_are_compiled_without_options_for_simulation(monkeypatch):
     jitted, options = Mock(), Mock()
     monkeypatch.setattr(fast_cpu, "without_simulation", options)
-    Stepper(jitted, None, None, Mock()).compile(Mock(), 3).result()
+    Stepper(jitted, None, Mock(), Mock()).compile(Mock(), 3).result()
     compiled = jitted.lower.return_value.compile
     compiled.assert_called_once_with(compiler_options=options.return_value)
 

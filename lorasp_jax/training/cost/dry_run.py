@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from rich.console import Console
@@ -16,7 +15,7 @@ from envs.compilation import fast_cpu, messages
 from envs.datasets.episodes import Episodes
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config
-from lorasp_jax.data.batches import Raw, Steps, flatten, gather
+from lorasp_jax.data.batches import flatten
 from lorasp_jax.dense import AdaptedLayer
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.storage import hub
@@ -28,6 +27,7 @@ from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.optim import make_optimizer
 from lorasp_jax.training.run import Run
 from lorasp_jax.training.step import init_state
+from lorasp_jax.training.windows import DrawnWindows, nbytes
 
 
 def dry_run(
@@ -47,12 +47,11 @@ def dry_run(
     console.print(setup.headline(config, built.model))
     console.print(_parameter_table(built.model))
     run = Run(config, folder, console, built.base_hash)
-    data = _abstract_data(run, built)
+    held, batches = _abstract_data(run, built)
     with messages.announce("the training step"):
         options = fast_cpu.without_simulation()
-        compiled = _lower(run, data).compile(compiler_options=options)
-    local_bytes = _bytes(data) / _shards(data)
-    console.print(_memory_table(built, local_bytes, compiled.memory_analysis()))
+        compiled = _lower(run, batches).compile(compiler_options=options)
+    console.print(_memory_table(built, held, batches, compiled.memory_analysis()))
     step_flops = preflight.step_flops(config, built.base.config)
     console.print(
         f"one step of {config.optim.batch_size} windows: {step_flops / 1e12:.4g} TFLOP; "
@@ -61,11 +60,12 @@ def dry_run(
     console.print("dry run: nothing was collected, trained or written")
 
 
-def _abstract_data(run: Run, built: setup.RunSetup) -> Any:
-    """Return the shapes of a step's data, `Steps` or `Raw`, and set `run.policy`.
+def _abstract_data(run: Run, built: setup.RunSetup) -> tuple[int, Any]:
+    """Set `run.policy`, and return the bytes of the dataset and the shapes of a call's batches.
 
-    Statistics come from the dataset's first episode. Without a dataset, they come from a blank
-    step, and all demonstrations are assumed to have the maximum length.
+    A streamed dataset has 0 bytes on the device. Statistics come from the dataset's first episode.
+    Without a dataset, they come from a blank step, and all demonstrations are assumed to have the
+    maximum length.
     """
     config, source = run.config, built.source
     first = source.episode(0) if source else _blank_episode(config, built)
@@ -76,14 +76,14 @@ def _abstract_data(run: Run, built: setup.RunSetup) -> Any:
     run.policy = Policy(
         built.model, setup.processor([first], model, built.prompts, relative=relative)
     )
-    mesh = meshes.make_mesh(config.fsdp, run.devices)
+    mesh, size = meshes.make_mesh(config.fsdp, run.devices), config.optim.batch_size
     episode = jax.eval_shape(lambda: flatten([first]))
     steps = jax.tree.map(lambda x: jax.ShapeDtypeStruct((count, *x.shape[1:]), x.dtype), episode)
-    if source is None or _bytes(steps) <= built.free_bytes:
-        return _with_sharding(steps, meshes.replicated(mesh))
-    starts = jax.ShapeDtypeStruct((config.optim.batch_size,), jnp.int32)
-    raw = jax.eval_shape(functools.partial(gather, chunk=model.chunk), steps, starts)
-    return _with_sharding(raw, meshes.batch_sharding(mesh))
+    windows = DrawnWindows(steps, mesh, size, model.chunk)
+    if source is None or nbytes(steps) <= built.free_bytes:
+        call_size = windows.call_size(min(config.log_every, config.optim.steps))
+        return nbytes(steps), windows.shapes(call_size)
+    return 0, windows.shapes(1)
 
 
 def _blank_episode(config: Config, built: setup.RunSetup) -> Episodes:
@@ -105,7 +105,7 @@ def _blank_episode(config: Config, built: setup.RunSetup) -> Episodes:
     )
 
 
-def _lower(run: Run, data: Steps | Raw) -> Any:
+def _lower(run: Run, batches: Any) -> Any:
     """Lower the steps that `loop.train` compiles first, from shapes alone."""
     config, model = run.config, run.policy.model
     optimizer = make_optimizer(config.optim, adaptation.methods(model).values())
@@ -115,26 +115,17 @@ def _lower(run: Run, data: Steps | Raw) -> Any:
         functools.partial(init_state, optimizer=optimizer, ema=config.optim.ema > 0), adapters
     )
     shardings = meshes.shardings(state, mesh)
+    frozen = loop.Frozen(frozen, run.policy.processor.shared())
     frozen = jax.tree.map(_with_sharding, frozen, meshes.shardings(frozen, mesh))
     state = jax.tree.map(_with_sharding, state, shardings)
-    count = 1 if isinstance(data, Raw) else min(config.log_every, config.optim.steps)
     steps = loop.jit_steps(run, graphdef, optimizer, shardings)
-    return steps.lower(frozen, data, state, jax.random.key(0), count)
+    return steps.lower(frozen, batches, state, jax.random.key(0))
 
 
 def _with_sharding(tree: Any, sharding: jax.sharding.Sharding) -> Any:
     """Attach a sharding to the shapes of a tree."""
     shape = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)  # noqa: E731
     return jax.tree.map(shape, tree)
-
-
-def _shards(data: Steps | Raw) -> int:
-    """Return the number of devices that the data is sharded over."""
-    return jax.device_count() if isinstance(data, Raw) else 1
-
-
-def _bytes(shapes: Any) -> float:
-    return float(sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(shapes)))
 
 
 def _parameter_table(model: nnx.Module) -> Table:
@@ -151,20 +142,22 @@ def _parameter_table(model: nnx.Module) -> Table:
     return table
 
 
-def _memory_table(built: setup.RunSetup, data: float, analysis: Any) -> Table:
+def _memory_table(built: setup.RunSetup, held: int, batches: Any, analysis: Any) -> Table:
     """Tabulate the memory per device, as estimated and as compiled.
 
-    `data` is the size per device of the demonstrations or of a streamed batch [bytes]. `analysis`
-    is the `memory_analysis` of the compiled step, or None if the backend does not provide it.
+    `held` is the size of the dataset on every device [bytes], which is no argument of the compiled
+    program; `batches` are the shapes of those that a call takes. `analysis` is the
+    `memory_analysis` of the compiled step, or None if the backend does not provide it.
     """
-    estimate = {"demonstrations": data, **dataclasses.asdict(built.memory)}
+    local = nbytes(batches) / len(jax.tree.leaves(batches)[0].sharding.device_set)
+    estimate = {"demonstrations": held + local, **dataclasses.asdict(built.memory)}
     resident = ("base", "adapters", "optimizer", "demonstrations")
     arguments = sum(estimate[name] for name in resident)
     temporaries = sum(estimate[name] for name in estimate if name not in resident)
     headroom = built.memory.peak * (1 - 1 / HEADROOM)
     compiled: list[Any] = [None, None, None]
     if analysis is not None:
-        inputs, temporary = analysis.argument_size_in_bytes, analysis.temp_size_in_bytes
+        inputs, temporary = analysis.argument_size_in_bytes + held, analysis.temp_size_in_bytes
         temporary += analysis.output_size_in_bytes - analysis.alias_size_in_bytes
         compiled = [inputs, temporary, inputs + temporary]
     peak = arguments + temporaries + headroom

@@ -38,6 +38,11 @@ def batch_sharding(mesh: Mesh) -> NamedSharding:
     return NamedSharding(mesh, PartitionSpec(("data", "fsdp")))
 
 
+def batches_sharding(mesh: Mesh) -> NamedSharding:
+    """Return `batch_sharding` for batches with a leading axis over steps."""
+    return NamedSharding(mesh, PartitionSpec(None, ("data", "fsdp")))
+
+
 def split_axis(shape: Sequence[int], size: int, fsdp: int, minimum: int) -> int | None:
     """Return the axis to shard over `fsdp` devices, or None to replicate the array.
 
