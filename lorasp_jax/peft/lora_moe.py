@@ -82,8 +82,10 @@ class LoRAMoE(Method):
         """Eq. (2) of the LoRA-SP paper: z = scale · w(x) ⊙ (x A); each w_i scales R columns."""
         del params
         expert_inputs, logits = jnp.split(rows, [self.experts * self.rank], axis=-1)
-        logits = cast_and_clip(logits)
-        probabilities = jax.nn.softmax(logits)
+        # On an H100, JAX 0.11.2 computed three of four rows of a policy with LoRA-MoE wrongly. The
+        # barriers keep this softmax out of the fusions that jax-ml/jax#39486 reports as wrong.
+        logits = jax.lax.optimization_barrier(cast_and_clip(logits))
+        probabilities = jax.lax.optimization_barrier(jax.nn.softmax(logits))
         columns = jnp.repeat(self.scale * self._weights(probabilities), self.rank, axis=-1)
         z = expert_inputs * columns
         active = self.rank * (1 if self.routing == "top1" else self.experts)
