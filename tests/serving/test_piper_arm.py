@@ -88,6 +88,15 @@ def test_commands_take_the_latency(world):
     assert moved[1] < moved[0] / 4
 
 
+def test_a_new_layout_starts_at_its_start_pose_whatever_was_commanded_before(bench):
+    arm, fake, clock = ready(bench)
+    arm.command(fake.world.pose + np.array([0.5, 0, 0, 0, 0, 0, -0.02]))
+    fake.reset(5)
+    start = fake.world.pose
+    wait(clock, 0.3)
+    np.testing.assert_allclose(fake.world.pose, start, atol=2e-3)
+
+
 def test_frames_that_stop_are_noticed_within_60_ms(bench):
     arm, fake, clock = ready(bench)
     fake.faults.silent = True

@@ -90,9 +90,13 @@ class FakePiper:
         self._turn = threading.Lock()  # the arm may live in a thread of its own
 
     def reset(self, seed: int) -> None:
-        """Start a random layout, with the arm at rest in its start pose."""
+        """Start a random layout, with the arm at rest in its start pose.
+
+        Commands that are still on their way are lost: they were meant for the previous layout.
+        """
         with self._turn:
             self.world.reset(seed)
+            self._receive()
             self._waiting.clear()
             self._target, self._setpoint = self.world.pose, self.world.pose
 
@@ -103,8 +107,7 @@ class FakePiper:
 
     def _take_turn(self) -> None:
         self.time = round(self.time + PERIOD, 6)
-        while (message := self._bus.recv(0)) is not None:
-            self._waiting.append((self.time + self._latency, message))
+        self._receive()
         while self._waiting and self._waiting[0][0] <= self.time + 1e-9:
             self._obey(self._waiting.popleft()[1])
         self._move()
@@ -112,6 +115,10 @@ class FakePiper:
         self._tick += 1
         if not self.faults.silent:
             self._report()
+
+    def _receive(self) -> None:
+        while (message := self._bus.recv(0)) is not None:
+            self._waiting.append((self.time + self._latency, message))
 
     @property
     def stamp(self) -> float:
