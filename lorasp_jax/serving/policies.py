@@ -29,7 +29,7 @@ class Rows(NamedTuple):
         present: camera -> bool.
         state: f32 `[J+1]`.
         ids, mask: `[T]`, the instruction's tokens.
-        index: int32, number of the request in its episode; not for `sample`.
+        index: int32, number of the request on its connection; not for `sample`.
         previous: f32 `[C, J+1]`, what remains of the previous chunk, then zeros.
         overlap: int32, number of actions that remain; 0: the new chunk does not continue any.
         delay: int32, number of these that the robot will execute.

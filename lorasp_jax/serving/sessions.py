@@ -12,12 +12,13 @@ from lorasp_jax.serving.requests import Request
 class Session:
     """State of one connection.
 
-    The noise of the flow depends only on the server's seed and on the number of requests since the
-    episode's start, so an episode can be repeated exactly after a reset.
+    The noise of the flow depends only on the server's seed and on the number of requests on the
+    connection, so a connection can be repeated exactly. A reset does not start the noise again:
+    an unlucky draw would be that of every episode.
 
     Attributes:
         client: distinguishes connections.
-        requests: requests since the start of the episode.
+        requests: requests on this connection.
         previous: the last chunk of the episode, f32 `[C, J+1]`.
         previous_ms: time from receiving the previous request to having sent its reply.
     """
@@ -28,13 +29,13 @@ class Session:
     previous_ms: float | None = None
 
     def advance(self, request: Request) -> tuple[Request, int]:
-        """Return the request with the previous chunk, and its number in the episode.
+        """Return the request with the previous chunk, and its number on the connection.
 
         Raises:
             ValueError: it should continue a chunk, but is the first of its episode.
         """
         if request.reset:
-            self.requests, self.previous = 0, None
+            self.previous = None
         if request.executed is not None and self.previous is None:
             raise ValueError("the first request of an episode must not have the key executed")
         index = self.requests

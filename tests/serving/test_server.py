@@ -52,12 +52,12 @@ def test_replies(server):
     assert second["server_timing"].keys() == {"infer_ms", "prev_total_ms"}
 
 
-def test_a_reset_starts_an_episode_of_this_connection_only(server):
+def test_connections_repeat_each_others_noise_but_episodes_do_not(server):
     with connect(server) as client, connect(server) as other:
         numbers = [c.infer(observation())["actions"][0, 0] for c in (client, client, other)]
         client.reset()
         numbers += [c.infer(observation())["actions"][0, 0] for c in (client, client, other)]
-    assert numbers == [0, 1, 0, 0, 1, 1]
+    assert numbers == [0, 1, 0, 2, 3, 1]
 
 
 def test_a_session_keeps_the_previous_chunk():
