@@ -43,9 +43,10 @@ def prepare(folder: Path, steps: int, devices: int | None = None):
     """Return a run that logs and saves at every step."""
     from tests.runs import CONFIG, Miniature, make_run
 
+    # Two processes have 16 devices, and a batch is a multiple of that.
     config = dataclasses.replace(
         CONFIG,
-        optim=dataclasses.replace(CONFIG.optim, steps=steps),
+        optim=dataclasses.replace(CONFIG.optim, steps=steps, batch_size=16),
         targets=("inp", "out"),
         log_every=1,
         checkpoint_every=1,
