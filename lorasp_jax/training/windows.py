@@ -50,10 +50,11 @@ class DrawnWindows:
             static_argnames="size",
             out_shardings=self._sharding,
         )
+        self._batch_bytes = nbytes(self.shapes(1))
 
     def call_size(self, count: int) -> int:
         """Return the largest divisor of `count` whose batches fit into `MAX_BYTES`, at least 1."""
-        limit = max(MAX_BYTES // nbytes(self.shapes(1)), 1)
+        limit = max(MAX_BYTES // self._batch_bytes, 1)
         return max(size for size in range(1, min(limit, count) + 1) if count % size == 0)
 
     def shapes(self, size: int) -> Any:
