@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from lorasp_jax.data.batches import Raw, Steps, draw
+from lorasp_jax.training.cost.preflight import nbytes
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.random_streams import StepKeys
 
@@ -101,8 +102,3 @@ def _draw(
 ) -> Raw:
     keys = jax.vmap(lambda step: StepKeys.of(key, step).windows)(first + jnp.arange(size))
     return jax.vmap(lambda key: draw(key, steps, batch_size=batch_size, chunk=chunk))(keys)
-
-
-def nbytes(shapes: Any) -> int:
-    """Return the size of a pytree of arrays or shapes [bytes]."""
-    return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(shapes))

@@ -10,6 +10,7 @@ import pytest
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.data.batches import encode, flatten, sample_batch
 from lorasp_jax.training import loop, windows
+from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.optim import make_optimizer
 from lorasp_jax.training.random_streams import StepKeys
@@ -59,7 +60,7 @@ def test_shapes_are_those_of_the_batches(drawn):
     ("batches", "count", "size"), [(1000, 125, 125), (30, 125, 25), (4.9, 7, 1), (0.5, 6, 1)]
 )
 def test_calls_divide_the_interval_and_fit_into_memory(drawn, monkeypatch, batches, count, size):
-    limit = int(batches * windows.nbytes(drawn.shapes(1)))
+    limit = int(batches * preflight.nbytes(drawn.shapes(1)))
     monkeypatch.setattr(windows, "MAX_BYTES", limit)
     assert drawn.call_size(count) == size
 

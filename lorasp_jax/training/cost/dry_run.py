@@ -22,12 +22,12 @@ from lorasp_jax.storage import hub
 from lorasp_jax.training import loop, setup
 from lorasp_jax.training.base import base_model
 from lorasp_jax.training.cost import preflight
-from lorasp_jax.training.cost.preflight import HEADROOM, byte_unit
+from lorasp_jax.training.cost.preflight import HEADROOM, byte_unit, nbytes
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.optim import make_optimizer
 from lorasp_jax.training.run import Run
 from lorasp_jax.training.step import init_state
-from lorasp_jax.training.windows import DrawnWindows, nbytes
+from lorasp_jax.training.windows import DrawnWindows
 
 
 def dry_run(

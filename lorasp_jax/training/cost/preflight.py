@@ -124,8 +124,8 @@ def estimate_memory(config: Config, backbone: BackboneConfig) -> Memory:
         adapters=adapters,
         gradients=adapters * (1 if config.optim.accumulate == 1 else 2),
         optimizer=local_bytes(jax.eval_shape(init, step.adapters)) - adapters,
-        activations=_bytes(list(residuals.values()))
-        + _bytes(abstract_batch(backbone, local_batch)),
+        activations=nbytes(list(residuals.values()))
+        + nbytes(abstract_batch(backbone, local_batch)),
     )
 
 
@@ -179,6 +179,7 @@ def available_bytes() -> float:
     return host_bytes / jax.local_device_count()
 
 
-def _bytes(tree: Any) -> float:
+def nbytes(tree: Any) -> int:
+    """Return the size of the arrays or shapes in a pytree [bytes]."""
     leaves = [leaf for leaf in jax.tree.leaves(tree) if hasattr(leaf, "dtype")]
-    return float(sum(leaf.size * leaf.dtype.itemsize for leaf in leaves))
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in leaves)
