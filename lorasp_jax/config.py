@@ -53,6 +53,10 @@ class ModelConfig:
     """Compute dtype of matrix products."""
     param_dtype: Literal["float32", "bfloat16"] = "float32"
     """Storage dtype of the base parameters; adapters are always float32."""
+    base_dtype: Literal["", "float8", "int8", "nf4"] = ""
+    """Quantize the matrices of the three towers: 8 bits per weight (float8, int8) or 4.5 (nf4). On
+    NVIDIA GPUs since Ada and Hopper, large matrix products are then in float8 too, which is faster.
+    Empty: keep them in param_dtype."""
     relative_actions: bool = False
     """Learn joint targets relative to the state at the start of the chunk, as openpi does for
     pi0."""
@@ -279,6 +283,8 @@ class Config:
                 "control_dt must be above 0 and seed must lie in [0, 2**32), "
                 f"got {self.control_dt} and {self.seed}"
             )
+        if self.model.base_dtype and self.peft.trains_base:
+            raise ValueError("model.base_dtype must be empty for full, which trains the base")
         self.scene.check(self.control_dt)
         if self.data.fresh_every % self.log_every:
             raise ValueError(

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 from flax.typing import Dtype
 
 from lorasp_jax.dense import validate
+from lorasp_jax.kernels.frozen_matmul import frozen_matmul
+from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import Aux, Method, _validate
 from lorasp_jax.peft._method import Params
 from lorasp_jax.peft._shared_input import AdaptedKernel, apply_shared_input
@@ -56,7 +58,7 @@ def dense(
     layer = DenseLayer(kernel, bias, params, method, dropout_key)
     matrix = _checked_matrix(layer, x, token_mask)
     if method is None or params is None:
-        result = x @ matrix.astype(x.dtype), Aux()
+        result = _base(x, matrix), Aux()
     elif dropout_key is not None:
         result = method.apply_with_dropout(params, x, matrix, dropout_key, token_mask=token_mask)
     else:
@@ -99,6 +101,12 @@ def _checked_matrix(layer: DenseLayer, x: jax.Array, token_mask: jax.Array | Non
     _validate.tokens(x, token_mask)
     validate.layer(layer, x.shape[-1])
     return layer.kernel.reshape(layer.kernel.shape[0], math.prod(layer.kernel.shape[1:]))
+
+
+def _base(x: jax.Array, matrix: jax.Array | QuantizedKernel) -> jax.Array:
+    if isinstance(matrix, QuantizedKernel):
+        return frozen_matmul(x, matrix)
+    return x @ matrix.astype(x.dtype)
 
 
 def _with_bias(

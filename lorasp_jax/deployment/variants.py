@@ -13,12 +13,12 @@ from envs.datasets.episodes import Episodes
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.data.batches import Batch
 from lorasp_jax.dense import AdapterParam
-from lorasp_jax.kernels.quantized_weights import Kind
+from lorasp_jax.kernels.quantized_weights import Kind, QuantizedKernel
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.peft.lora_sp.bank import BankMethod
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.study.held_out import keyed_batches
-from lorasp_jax.training.export import quantized
+from lorasp_jax.training.base import quantized
 
 BATCH_SIZE, BATCHES = 64, 8
 """Windows per batch, and batches per task, for calibration and for the loss."""
@@ -109,7 +109,8 @@ def on_base(policy: Policy, base: str) -> Policy:
 def in_bf16(model: Backbone) -> Backbone:
     """Return the model with its frozen weights rounded to bf16, as they are saved."""
     graphdef, frozen, rest = nnx.split(model, nnx.All(nnx.Param, nnx.Not(AdapterParam)), ...)
-    frozen = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), frozen)
+    is_kernel = lambda leaf: isinstance(leaf, QuantizedKernel)  # noqa: E731
+    frozen = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), frozen, is_leaf=is_kernel)
     model = nnx.merge(graphdef, frozen, rest)
     model.config = dataclasses.replace(model.config, param_dtype="bfloat16")
     return model

@@ -13,8 +13,9 @@ therefore merges matmuls. Let g be the gradient of the output, and q that of x P
   [g, q] [W, P]ᵀ.
 
 The last three copy W, which pays off only for I or more tokens. They are not used on a CPU, where
-they save no time and triple the compile time. W is stored in its own dtype and cast to the dtype of
-x in each pass, so quantized weights are only briefly dequantized.
+they save no time and triple the compile time, nor where x W is in float8 (`frozen_matmul`), whose
+product is added to z U in place. W is stored in its own dtype and cast to the dtype of x in each
+pass, so quantized weights are only briefly dequantized.
 """
 
 import functools
@@ -26,6 +27,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
+from lorasp_jax.kernels.frozen_matmul import matmul, matmul_transposed, uses_float8
 from lorasp_jax.kernels.platform import platform
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 
@@ -140,11 +142,11 @@ def base_plus_low_rank(
     x: jax.Array, z: jax.Array, kernel: jax.Array | QuantizedKernel, up: jax.Array
 ) -> jax.Array:
     """Compute x W + z U, [..., O], in the dtype of x [..., I], from z [..., R]."""
-    w, u, z = kernel.astype(x.dtype), up.astype(x.dtype), z.astype(x.dtype)
-    d_in, d_out = w.shape
-    if d_out >= d_in and _should_concat(w, x):
-        return jnp.concatenate([x, z], axis=-1) @ jnp.concatenate([w, u])
-    return x @ w + z @ u
+    d_in, d_out = kernel.shape
+    u, z = up.astype(x.dtype), z.astype(x.dtype)
+    if d_out >= d_in and _should_concat(kernel, x, d_out):
+        return jnp.concatenate([x, z], axis=-1) @ jnp.concatenate([kernel.astype(x.dtype), u])
+    return matmul(x, kernel) + z @ u
 
 
 def _backward(
@@ -156,9 +158,9 @@ def _backward(
     base_input_grads, dz_aux = [], []
     for layer, (g, d_aux) in zip(layers, cotangents, strict=True):
         d_in, d_out = layer.kernel.shape
-        w, u = layer.kernel.astype(x.dtype), layer.up.astype(x.dtype)
-        base_input_grad, dz = None, None
-        if d_out > 2 * d_in and _should_concat(w, x):
+        u, base_input_grad, dz = layer.up.astype(x.dtype), None, None
+        if d_out > 2 * d_in and _should_concat(layer.kernel, g, d_in):
+            w = layer.kernel.astype(x.dtype)
             base_input_grad, dz = jnp.split(g @ jnp.concatenate([w, u]).T, [d_in], axis=-1)
         base_input_grads.append(base_input_grad)
         dz_aux.append((g @ u.T if dz is None else dz, d_aux))
@@ -183,19 +185,25 @@ def _input_gradient(
     q: jax.Array,
 ) -> jax.Array:
     """Compute Σ g Wᵀ + q Pᵀ, [..., I]; `base_input_grads` holds each g Wᵀ if already computed."""
-    p = _concat_downs(layers, x)
-    w = [layer.kernel.astype(x.dtype) for layer in layers]
-    if sum(g.shape[-1] for g in gradients) <= x.shape[-1] and _should_concat(w[0], x):
+    p, kernels, d_in = _concat_downs(layers, x), [layer.kernel for layer in layers], x.shape[-1]
+    is_narrow = sum(g.shape[-1] for g in gradients) <= d_in
+    pairs = list(zip(gradients, kernels, strict=True))
+    if is_narrow and all(_should_concat(kernel, g, d_in) for g, kernel in pairs):
+        w = [kernel.astype(x.dtype) for kernel in kernels]
         return jnp.concatenate([*gradients, q], axis=-1) @ jnp.concatenate([*w, p], axis=1).T
     dx = q @ p.T
-    for g, kernel, base_input_grad in zip(gradients, w, base_input_grads, strict=True):
-        dx += g @ kernel.T if base_input_grad is None else base_input_grad
+    for (g, kernel), base_input_grad in zip(pairs, base_input_grads, strict=True):
+        dx += matmul_transposed(g, kernel) if base_input_grad is None else base_input_grad
     return dx
 
 
-def _should_concat(w: jax.Array, x: jax.Array) -> bool:
-    """Return whether concatenating W pays off (see the module docstring)."""
-    return math.prod(x.shape[:-1]) >= w.shape[0] and platform() != "cpu"
+def _should_concat(kernel: jax.Array | QuantizedKernel, x: jax.Array, width: int) -> bool:
+    """Return whether concatenating W pays off for a product with x of `width` columns.
+
+    See the module docstring.
+    """
+    has_many_rows = math.prod(x.shape[:-1]) >= kernel.shape[0]
+    return has_many_rows and platform() != "cpu" and not uses_float8(kernel, x, width)
 
 
 def _concat_downs(layers: Sequence[LowRankLayer], x: jax.Array) -> jax.Array:

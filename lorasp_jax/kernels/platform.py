@@ -13,3 +13,15 @@ def platform() -> str:
     if device is None:
         return jax.default_backend()
     return "gpu" if device.platform in ("cuda", "rocm") else device.platform
+
+
+def multiplies_float8() -> bool:
+    """Return whether `platform()` is an NVIDIA GPU that multiplies float8: Ada, Hopper or later.
+
+    An abstract device does not tell its age; a GPU is taken for such a one.
+    """
+    device = jax.sharding.get_abstract_mesh().abstract_device
+    if device is not None:
+        return device.platform == "cuda"
+    capability = getattr(jax.devices()[0], "compute_capability", "0")  # AMD's reads gfx942
+    return capability.replace(".", "").isdigit() and float(capability) >= 8.9

@@ -1,11 +1,13 @@
-"""Frozen weights quantized to int8 or nf4.
+"""Frozen weights quantized to float8, int8 or nf4.
 
-There is no zero point, only a scale: one per column in int8, one per 64 inputs of a column in nf4.
-nf4 is the 4-bit NormalFloat of QLoRA (Dettmers et al., arXiv 2305.14314, appendix E) without double
-quantization of the scales, and takes 4.5 bits per weight. Let m be the largest magnitude of the
-weights that share a scale. Their error is at most m/255 in int8, and 0.152 m in nf4 (half the
-widest gap of the table). Adapted layers store only codes and scales, and dequantize the kernel at
-each matmul of both passes.
+There is no zero point, only a scale: one per matrix in float8, one per column in int8, one per 64
+inputs of a column in nf4. float8 is e4m3: 4 bits of exponent, 3 of mantissa. nf4 is the 4-bit
+NormalFloat of QLoRA (Dettmers et al., arXiv 2305.14314, appendix E) without double quantization of
+the scales, and takes 4.5 bits per weight. Let m be the largest magnitude of the weights that share
+a scale. Their error is at most 1/16 of a weight or 2⁻¹⁰ m/448 in float8, m/255 in int8, and 0.152 m
+in nf4 (half the widest gap of the table). Adapted layers store only codes and scales, and
+dequantize the kernel at each matmul of both passes, unless the device multiplies float8 (see
+`lorasp_jax.kernels.frozen_matmul`).
 """
 
 import dataclasses
@@ -17,8 +19,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-Kind: TypeAlias = Literal["int8", "nf4"]
-KINDS: tuple[Kind, ...] = ("int8", "nf4")
+Kind: TypeAlias = Literal["float8", "int8", "nf4"]
+KINDS: tuple[Kind, ...] = ("float8", "int8", "nf4")
+FLOAT8_BOUND = 448.0
+"""Largest finite number of e4m3; the scale is the largest magnitude divided by this."""
 NF4_BLOCK = 64
 """Inputs per scale in nf4 (arXiv 2305.14314, section 3)."""
 INT8_BOUND = 127.5
@@ -42,10 +46,10 @@ class QuantizedKernel:
     """
 
     codes: jax.Array
-    """int8: [..., 1, I, O]. nf4: uint8 [..., I/64, 32, O], with row i of a block in the low four
-    bits and row i + 32 in the high four."""
+    """float8 (e4m3fn), int8: [..., 1, I, O]. nf4: uint8 [..., I/64, 32, O], with row i of a block
+    in the low four bits and row i + 32 in the high four."""
     scale: jax.Array
-    """f32 [..., 1 or I/64, 1, O]."""
+    """f32 [..., 1 or I/64, 1, O]; float8: [..., 1, 1, 1]."""
     d_in: int = dataclasses.field(metadata={"static": True})
     """I; the last nf4 block is padded unless I is a multiple of 64."""
     dtype: Any = dataclasses.field(metadata={"static": True})
@@ -65,17 +69,23 @@ class QuantizedKernel:
         return *leading[: len(leading) - self.batch], *self.axes
 
     @property
+    def kind(self) -> Kind:
+        """How the kernel is quantized."""
+        kinds: dict[str, Kind] = {"float8_e4m3fn": "float8", "int8": "int8", "uint8": "nf4"}
+        return kinds[self.codes.dtype.name]
+
+    @property
     def nbytes(self) -> int:
         """Size of codes and scales in bytes."""
         return self.codes.nbytes + self.scale.nbytes
 
     def astype(self, dtype: Any) -> jax.Array:
         """Dequantize to an array [..., I, O]."""
-        if self.codes.dtype == jnp.int8:
-            values = self.codes.astype(jnp.float32)
-        else:
+        if self.kind == "nf4":
             halves = [self.codes & 15, self.codes >> 4]
             values = jnp.array(NF4, jnp.float32)[jnp.concatenate(halves, axis=-2)]
+        else:
+            values = self.codes.astype(jnp.float32)
         *leading, blocks, rows, d_out = values.shape
         kernel = (values * self.scale).astype(dtype).reshape(*leading, blocks * rows, d_out)
         return kernel[..., : self.d_in, :]
@@ -99,15 +109,15 @@ class QuantizedKernel:
 
 
 def quantize_kernel(kernel: jax.Array, kind: Kind) -> QuantizedKernel:
-    """Quantize a kernel [..., I, O] to int8 or nf4, rounding to the nearest code.
+    """Quantize a kernel [..., I, O], rounding to the nearest code.
 
     Raises:
-      ValueError: unknown kind, or non-finite values.
+      ValueError: unknown kind, or non-finite values, which go unnoticed while JAX traces.
     """
     if kind not in KINDS:
         raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
     codes, scale = _codes(kernel, kind)
-    if not bool(jnp.isfinite(scale).all()):
+    if not isinstance(scale, jax.core.Tracer) and not bool(jnp.isfinite(scale).all()):
         raise ValueError("the kernel has NaN or infinite values")
     return QuantizedKernel(codes, scale, kernel.shape[-2], jnp.dtype(kernel.dtype))
 
@@ -123,10 +133,14 @@ def _codes(kernel: jax.Array, kind: Kind) -> tuple[jax.Array, jax.Array]:
         values = jnp.pad(values, padding).reshape(*leading, blocks, NF4_BLOCK, d_out)
     else:
         values = values[..., None, :, :]
-    largest = jnp.abs(values).max(-2, keepdims=True)
-    scale = largest / (1 if kind == "nf4" else INT8_BOUND)
-    relative = values / jnp.where(scale > 0, scale, 1)
-    return _nf4(relative) if kind == "nf4" else _int8(relative), scale
+    largest = jnp.abs(values).max((-2, -1) if kind == "float8" else -2, keepdims=True)
+    scale = largest / {"float8": FLOAT8_BOUND, "int8": INT8_BOUND, "nf4": 1}[kind]
+    encode = {"float8": _float8, "int8": _int8, "nf4": _nf4}[kind]
+    return encode(values / jnp.where(scale > 0, scale, 1)), scale
+
+
+def _float8(relative: jax.Array) -> jax.Array:
+    return relative.astype(jnp.float8_e4m3fn)
 
 
 def _int8(relative: jax.Array) -> jax.Array:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from lorasp_jax.kernels.frozen_matmul import frozen_matmul
 from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul
 from lorasp_jax.peft import _fields, _validate
 from lorasp_jax.peft._aux import Aux
@@ -229,12 +230,11 @@ class Method:
         `key` is a typed random key. See `apply` for the other arguments.
         """
         x_dropped = dropout(x, dropout_rate(self), key)
-        kernel = jax.lax.stop_gradient(kernel.astype(x.dtype))
         if self.additive:
             delta, aux = self.delta(params, x_dropped, token_mask=token_mask)
-            return x @ kernel + delta, aux
+            return frozen_matmul(x, kernel) + delta, aux
         y, aux = self.apply(params, x_dropped, kernel, token_mask=token_mask)
-        return (x - x_dropped) @ kernel + y, aux
+        return frozen_matmul(x - x_dropped, kernel) + y, aux
 
     def low_rank_layer(self, params: Params, kernel: jax.Array) -> LowRankLayer:
         """The arrays of one layer for `low_rank_matmul`."""

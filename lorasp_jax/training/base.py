@@ -2,13 +2,15 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from flax import nnx
 
 import envs
 from lorasp_jax import models
+from lorasp_jax.adapters.compress import quantization
 from lorasp_jax.config import Config
+from lorasp_jax.kernels.quantized_weights import Kind
 from lorasp_jax.models import backbone
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.checkpoints import loading
@@ -18,6 +20,7 @@ from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run_folder import read_json
 
 SIZES = ("nano", "small", "base", "nano_pi05", "base_pi05")
+_TOWERS = "^(vision|language|action)/"
 TRAINING = "training.json"
 """File beside the base weights that describes their training, such as the control period."""
 
@@ -65,6 +68,11 @@ def with_config(model: Backbone, **changes: Any) -> Backbone:
         return model
     abstract = nnx.eval_shape(lambda: model_config.create(nnx.Rngs(0)))
     return nnx.merge(nnx.graphdef(abstract), nnx.state(model))
+
+
+def quantized(model: Any, kind: Kind | Literal[""] | None) -> Any:
+    """Return the model with the layers of its three towers quantized, or unchanged if no `kind`."""
+    return quantization.quantize(model, [(_TOWERS, kind)]).model if kind else model
 
 
 def _check_control_dt(folder: Path, control_dt: float) -> None:

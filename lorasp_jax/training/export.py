@@ -12,7 +12,6 @@ import jax.numpy as jnp
 
 from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
-from lorasp_jax.adapters.compress import quantization
 from lorasp_jax.adapters.io import native
 from lorasp_jax.kernels.quantized_weights import Kind
 from lorasp_jax.models import backbone
@@ -23,7 +22,7 @@ from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.statistics import Statistics
 from lorasp_jax.storage import hub
 from lorasp_jax.storage.digest import digest
-from lorasp_jax.training.base import TRAINING
+from lorasp_jax.training.base import TRAINING, quantized
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import read_json, write_json
 
@@ -31,7 +30,6 @@ BASE = "base"
 """Folder of a fully fine-tuned base."""
 QUANTIZED = "quantized"
 """Key of the kind of a base that is quantized after loading."""
-_TOWERS = "^(vision|language|action)/"
 
 
 class Export(Callback):
@@ -53,6 +51,8 @@ def write(run: Run) -> None:
         write_json(folder / TRAINING, metadata)
         return
     metadata = {"base": hub.portable_path(config.model.source), **metadata}
+    if config.model.base_dtype:
+        metadata[QUANTIZED] = config.model.base_dtype
     native.save_adapters(run.folder, run.policy.model, base=run.base_hash, metadata=metadata)
 
 
@@ -78,11 +78,6 @@ def write_variant(
     statistics = policy.processor.statistics.to_json()
     (folder / BASE / "statistics.json").write_text(statistics + "\n")
     write_json(folder / BASE / TRAINING, metadata)
-
-
-def quantized(model: Any, kind: Kind | None) -> Any:
-    """Return the model with the layers of its three towers quantized; None returns it unchanged."""
-    return quantization.quantize(model, [(_TOWERS, kind)]).model if kind else model
 
 
 def _metadata(run: Run) -> dict[str, Any]:

@@ -38,8 +38,9 @@ STOPPED = "stopped.json"
 """File with the reason why training stopped; removed when training continues."""
 
 
-ADDED = (("model", "chunk"), ("optim", "rtc_max_delay"))
-"""Settings that earlier versions lack; like them, `to_json` omits those that are 0, the default."""
+ADDED = (("model", "base_dtype"), ("model", "chunk"), ("optim", "rtc_max_delay"))
+"""Settings that earlier versions lack; like them, `to_json` omits those at their defaults, which
+are 0 or empty."""
 
 
 def to_json(config: Config) -> dict[str, Any]:

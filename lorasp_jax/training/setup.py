@@ -33,7 +33,7 @@ from lorasp_jax.policies.processor import Processor, Statistics, check_delta, ro
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Tokenizer, load_tokenizer
 from lorasp_jax.storage import hub
-from lorasp_jax.training.base import base_model, with_config
+from lorasp_jax.training.base import base_model, quantized, with_config
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.dataset import as_cache, is_simulated, open_dataset, outline
 from lorasp_jax.training.demonstrations import Progress, demonstrations
@@ -235,10 +235,11 @@ def _adapt(
     method: peft.Method,
     statistics: Mapping[str, jax.Array] = MappingProxyType({}),
 ) -> Backbone:
-    """Add the method's adapters to the target layers, initialized from the run's seed."""
+    """Add the method's adapters, initialized from the run's seed, and quantize the base."""
     rngs = nnx.Rngs(RandomStream.ADAPTERS.key(config.seed))
     rules = presets.rules(config.targets, method)
-    return adaptation.adapt(model, rules, rngs=rngs, statistics=statistics)
+    adapted = adaptation.adapt(model, rules, rngs=rngs, statistics=statistics)
+    return quantized(adapted, config.model.base_dtype)
 
 
 def input_moments(run: Run, model: Backbone, processor: Processor) -> dict[str, jax.Array]:

@@ -25,6 +25,7 @@ from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Offline
 from lorasp_jax.training import base, export, setup
+from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.overrides import override
 from lorasp_jax.training.run import Run
@@ -164,6 +165,37 @@ def test_pi05_on_the_command_line_trains_and_acts(config, tmp_path):
     assert (model.config.pi05, model.config.inputs) == (True, inputs.OURS_PI05)
     again = sample(Policy(model, run.policy.processor), jax.random.key(0), raw, jnp.zeros(3, int))
     np.testing.assert_allclose(again, actions, atol=0.05)  # the file is bf16
+
+
+def test_a_quantized_base_on_the_command_line_trains_and_acts(config, tmp_path):
+    """Only adapters change; the estimate of memory counts its bytes; the policy loads again."""
+    models.save(tmp_path / "base", random_backbone(Pi0Config.dummy()))
+    config = dataclasses.replace(config, peft=LoRA(rank=4), model=ModelConfig())
+    options = ["--model.base-dtype", "float8", "--optim.steps", "2"]
+    config = override(config, [*options, "--model.checkpoint", str(tmp_path / "base")])
+    base_model = models.load(tmp_path / "base"), models.weights_hash(tmp_path / "base")
+    (tmp_path / "run").mkdir()
+    run = prepare(config, tmp_path / "run", load_base=lambda *_, **__: base_model)
+    run.devices = jax.devices()[:1]
+    _, adapters, frozen = adaptation.split(run.policy.model)
+    codes = [leaf for leaf in jax.tree.leaves(frozen) if leaf.dtype == jnp.float8_e4m3fn]
+    assert sum(code.size for code in codes) > 0.5 * preflight.nbytes(frozen)  # the rest: fp32
+    abstract = preflight.abstract_model(config, run.policy.model.config)
+    assert preflight.nbytes(adaptation.split(abstract)[2]) == preflight.nbytes(frozen)
+    train(run)
+    _, trained, after = adaptation.split(run.policy.model)
+    assert all((a == b).all() for a, b in zip(*map(jax.tree.leaves, (frozen, after)), strict=True))
+    assert all(
+        (a != b).any() for a, b in zip(*map(jax.tree.leaves, (adapters, trained)), strict=True)
+    )
+    export.write(run)
+    loaded = leaves(nnx.state(export.load_policy(run.folder).model, nnx.Param))
+    expected = leaves(nnx.state(run.policy.model, nnx.Param))
+    assert loaded.keys() == expected.keys()
+    for name, value in loaded.items():
+        np.testing.assert_array_equal(value, expected[name], err_msg=name)
+    with pytest.raises(ValueError, match=r"model\.base_dtype must be empty for full"):
+        dataclasses.replace(config, peft=FullFineTuning())
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
+from lorasp_jax.kernels.frozen_matmul import frozen_matmul
 from lorasp_jax.peft import Aux, LoRA, Method
 from lorasp_jax.peft._method import Params
 
@@ -136,7 +137,7 @@ class AdapterSet(Method):
             if not method.additive:
                 own_params = params["others"][name]
                 adapted, own_aux = method.apply(own_params, x, kernel, token_mask=token_mask)
-                delta = adapted - x @ jax.lax.stop_gradient(kernel.astype(x.dtype))
+                delta = adapted - frozen_matmul(x, kernel)
                 y += weights[name].astype(x.dtype)[..., None] * delta
                 rank += _active_rank(weights[name], own_aux)
         return y, dataclasses.replace(aux, active_rank=rank)

@@ -22,6 +22,7 @@ from flax import nnx
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdapterAux, AdapterParam, validate
+from lorasp_jax.kernels.frozen_matmul import frozen_matmul
 from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Aux, Method, Params
 
@@ -100,7 +101,7 @@ class Observed(Method):
                 reference_params, x, kernel, token_mask=token_mask
             )
         if self.inner is None:
-            y, aux = x @ kernel.astype(x.dtype), Aux()
+            y, aux = frozen_matmul(x, kernel), Aux()
         else:
             y, aux = self.inner.apply(params, x, kernel, token_mask=token_mask)
         valid = jnp.ones(x.shape[:-1], bool) if token_mask is None else token_mask

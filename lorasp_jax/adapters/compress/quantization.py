@@ -5,12 +5,14 @@
 Kernels of dense layers and einsums (flattened to matrices) are quantized to 8 or 4.5 bits per
 weight. Adapters, biases, norms, embeddings and convolutions are unchanged. Gradients still flow to
 x and the adapters, and adapters can still be attached, saved and combined. `merge` dequantizes the
-kernel of each adapted layer before adding the delta.
+kernel of each adapted layer before adding the delta. With "float8", NVIDIA GPUs since Ada and
+Hopper also multiply large matrices in float8, which is faster; all other kinds only save memory.
 
 Adapters that split a kernel (PiSSA, OLoRA) must be attached before quantization, which then
 quantizes the residual.
 """
 
+import math
 import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeAlias
@@ -37,7 +39,7 @@ class QuantizationResult(NamedTuple):
       model: with quantized kernels.
       errors: relative error ‖W − Ŵ‖ / ‖W‖ of the quantized kernel Ŵ by path, in the Frobenius norm
         over all layers of a stack. For isotropic inputs, this is also the relative RMS error of the
-        layer's output, without bias.
+        layer's output, without bias. NaN while JAX traces, as inside `nnx.eval_shape`.
     """
 
     model: nnx.Module
@@ -49,8 +51,8 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
 
     Args:
       model: not modified; the result shares all other arrays.
-      rules: (pattern, kind) pairs, where kind is "int8", "nf4" or None. As for `adapt`, the first
-        match wins, and None skips the path. Rules apply to `Dense`, `nnx.Linear`,
+      rules: (pattern, kind) pairs, where kind is "float8", "int8", "nf4" or None. As for `adapt`,
+        the first match wins, and None skips the path. Rules apply to `Dense`, `nnx.Linear`,
         `nnx.LinearGeneral`, `nnx.Einsum` and adapted layers of other einsum classes.
 
     Raises:
@@ -102,7 +104,9 @@ def _quantize_layer(layer: nnx.Module, kind: Kind, shared: Shared) -> tuple[Adap
     if key not in shared:
         quantized_kernel = quantize_kernel(kernel, kind)
         layer.set_kernel_matrices(quantized_kernel)
-        shared[key] = layer.kernel_variable(), variable, float(_error(kernel, quantized_kernel))
+        error = _error(kernel, quantized_kernel)
+        error = math.nan if isinstance(error, jax.core.Tracer) else float(error)
+        shared[key] = layer.kernel_variable(), variable, error
     new, _, error = shared[key]
     layer.set_kernel_variable(new)
     return layer, error

@@ -21,6 +21,7 @@ from lorasp_jax.models import presets
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.observation import abstract_observation
+from lorasp_jax.training.base import quantized
 from lorasp_jax.training.cost import flops
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
@@ -95,6 +96,8 @@ def _out_of_memory_message(config: Config, memory: Memory, remat: Remat, availab
         hints += [f"--optim.accumulate {accumulate}"]
     hints += ["--model.remat full"] if remat != "full" else []
     hints += ["--model.param-dtype bfloat16"] if config.model.param_dtype != "bfloat16" else []
+    if not (config.model.base_dtype or config.peft.trains_base):
+        hints += ["--model.base-dtype float8"]
     hints += [f"--fsdp {2 * config.fsdp} on {2 * config.fsdp} or more devices"]
     return (
         f"this run needs about {memory.peak / GIB:.1f} GiB per device, but only "
@@ -133,7 +136,8 @@ def adapted_model(config: Config, backbone: BackboneConfig, key: jax.Array) -> B
     """Create a random model with the run's adapters; works under `nnx.eval_shape`."""
     base, adapters = (nnx.Rngs(k) for k in jax.random.split(key))
     rules = presets.rules(config.targets, config.peft.as_saved)
-    return adaptation.adapt(backbone.create(base), rules, rngs=adapters)
+    adapted = adaptation.adapt(backbone.create(base), rules, rngs=adapters)
+    return quantized(adapted, config.model.base_dtype)
 
 
 def abstract_model(config: Config, backbone: BackboneConfig) -> Backbone:

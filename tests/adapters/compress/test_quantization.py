@@ -38,7 +38,10 @@ def size(model):
     return sum(leaf.nbytes for leaf in jax.tree.leaves(nnx.state(model, nnx.Param)))
 
 
-@pytest.mark.parametrize(("kind", "bits", "error"), [("int8", 8.125, 0.0051), ("nf4", 4.5, 0.092)])
+@pytest.mark.parametrize(
+    ("kind", "bits", "error"),
+    [("float8", 8 + 32 / 2**17, 0.0265), ("int8", 8.125, 0.0051), ("nf4", 4.5, 0.092)],
+)
 def test_memory_and_error(kind, bits, error):
     """Check the parameter bytes, and the reported error against outputs for isotropic inputs."""
     wide = nnx.Linear(256, 512, rngs=nnx.Rngs(0))
@@ -168,7 +171,7 @@ def test_rules():
             r"rule 'blcks' applies to nothing; available dense layers and einsums: blocks",
         ),
         ([("", "nf4"), ("out", "int8")], "rule 'out' applies to nothing"),
-        ([("out", "fp4")], "rule 'out' must have 'int8' or 'nf4' or None, got 'fp4'"),
+        ([("out", "fp4")], "rule 'out' must have 'float8' or 'int8' or 'nf4' or None, got 'fp4'"),
         ([("(", "nf4")], r"rule '\(' is not a valid regular expression"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -1,0 +1,100 @@
+"""Products in float8: their rounding, where they are used, and that only their factors are."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lorasp_jax.dense import dense
+from lorasp_jax.kernels import frozen_matmul as fm
+from lorasp_jax.kernels.quantized_weights import quantize_kernel
+from lorasp_jax.peft import LoRASP
+
+METHOD = LoRASP(rank=8)
+
+
+def normal(seed, *shape):
+    return jax.random.normal(jax.random.key(seed), shape)
+
+
+@pytest.fixture
+def on_hopper(monkeypatch):
+    """Multiply in float8 here as well, whatever the shape, though this device emulates it."""
+    monkeypatch.setattr(fm, "multiplies_float8", lambda: True)
+    monkeypatch.setattr(fm, "MIN_WIDTH", 0)
+    monkeypatch.setattr(fm, "MIN_PRODUCTS", 0)
+    jax.clear_caches()
+    yield
+    jax.clear_caches()
+
+
+def relative_error(found, expected):
+    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
+
+
+def test_errors_are_those_of_rounding(on_hopper):
+    """Both factors are rounded, e4m3 to 2.65 % and e5m2 to 5.3 %; a stray scale would show."""
+    kernel, x, g = 0.03 * normal(0, 256, 384), 7 * normal(1, 64, 256), 1e-6 * normal(2, 64, 384)
+    quantized = quantize_kernel(kernel, "float8")
+    y, vjp = jax.vjp(lambda x: fm.frozen_matmul(x, quantized), x)
+    assert relative_error(y, x @ kernel) == pytest.approx(0.037, rel=0.05)
+    assert relative_error(vjp(g)[0], g @ kernel.T) == pytest.approx(0.059, rel=0.05)
+
+
+@pytest.mark.parametrize("dtype", ["float8_e4m3fn", "float8_e5m2"])
+def test_scaling_reaches_the_largest_code_and_no_further(dtype):
+    largest = float(jnp.finfo(dtype).max)
+    for size in (1e-30, 1e-6, 1.0, 3e38):
+        x = size * jnp.array([-1, 0.5, 2**-8, 0.0])
+        np.testing.assert_allclose(fm.scaled(x, dtype), x, rtol=1e-6)
+    codes = fm.scaled(jnp.array([1.0, 1.3]) * largest / 1.3, dtype)
+    np.testing.assert_allclose(codes, np.array([1, 1.3]) * largest / 1.3, rtol=0.08)
+    np.testing.assert_array_equal(fm.scaled(jnp.zeros(3), dtype), 0)
+    assert np.isnan(fm.scaled(jnp.array([1.0, jnp.nan]), dtype)).all()  # the guard must see it
+    assert np.isnan(fm.scaled(jnp.array([1.0, jnp.inf]), dtype)).any()
+
+
+@pytest.mark.parametrize("method", [None, METHOD])
+def test_codes_are_the_only_difference(on_hopper, method):
+    """An adapted layer in float8 is the layer on rounded factors: gradients, aux and all."""
+    kernel, x = quantize_kernel(normal(0, 24, 16), "float8"), normal(1, 8, 24)
+    params, _ = method.init(jax.random.key(2), jnp.zeros((24, 16))) if method else (None, None)
+    rounded = fm.scaled(x, jnp.float8_e4m3fn)
+    y, _ = dense(x, kernel, None, params, method)
+    expected, _ = dense(x, jnp.zeros((24, 16)), None, params, method)
+    np.testing.assert_allclose(y, rounded @ kernel.astype(jnp.float32) + expected, atol=1e-5)
+    gradient = jax.grad(lambda x: dense(x, kernel, None, params, method)[0].sum())(x)
+    of_adapter = jax.grad(lambda x: dense(x, jnp.zeros((24, 16)), None, params, method)[0].sum())
+    of_base = jnp.ones((8, 16)) @ kernel.astype(jnp.float32).T
+    np.testing.assert_allclose(gradient, of_base + of_adapter(x), atol=1e-5)
+
+
+def formats(tokens, d_in, d_out, kind="float8", platform="cuda"):
+    """Float8 formats that an adapted layer rounds to, forward and backward, once each."""
+    kernel = jax.eval_shape(lambda: quantize_kernel(jnp.zeros((d_in, d_out)), kind))
+    params, _ = jax.eval_shape(lambda: METHOD.init(jax.random.key(0), jnp.zeros((d_in, d_out))))
+    x = jax.ShapeDtypeStruct((tokens, d_in), jnp.bfloat16)
+
+    def loss(params, x, kernel):
+        return METHOD.apply(params, x, kernel)[0].astype(jnp.float32).sum()
+
+    device = jax.sharding.AbstractDevice("", num_cores=None, platform=platform)
+    mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
+    with jax.sharding.use_abstract_mesh(mesh):
+        traced = jax.jit(jax.value_and_grad(loss, (0, 1))).trace(params, x, kernel)
+        text = traced.lower(lowering_platforms=(platform,)).as_text()
+    return sorted(re.findall(r"convert .*-> tensor<[^>]*x(f8\w+)>", text))
+
+
+def test_used_where_it_pays():
+    """On NVIDIA GPUs, for many tokens and a wide result; each pass decides for itself."""
+    both = ["f8E4M3FN", "f8E5M2"]
+    assert formats(26112, 2048, 16384) == formats(8192, 2048, 2048) == both
+    assert formats(26112, 4096, 512) == both[1:]
+    assert formats(26112, 512, 4096) == both[:1]
+    assert formats(1024, 2048, 2048) == []
+    assert formats(26112, 2048, 16384, kind="int8") == []
+    assert formats(26112, 2048, 16384, platform="cpu") == []
+    assert formats(26112, 2048, 16384, platform="rocm") == []
