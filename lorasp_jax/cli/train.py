@@ -88,9 +88,11 @@ def resume_command(arguments: Sequence[str], program: str) -> str:
 
 def run(command: "Command", folder: Path, console: Console, started: float) -> None:
     """Evaluate, train, evaluate again, export the policy and write the report."""
+    import jax
+
     from lorasp_jax.evaluation.callback import Evaluation, NoEvaluation
     from lorasp_jax.report.callback import Report
-    from lorasp_jax.training import loop, setup
+    from lorasp_jax.training import early, loop, setup
     from lorasp_jax.training.distributed import processes
     from lorasp_jax.training.export import Export
     from lorasp_jax.training.weights_and_biases import WeightsAndBiases
@@ -101,9 +103,12 @@ def run(command: "Command", folder: Path, console: Console, started: float) -> N
             callbacks += [
                 stack.enter_context(WeightsAndBiases(command.wandb, command.config, folder))
             ]
-        training_run = setup.prepare(command.config, folder, console, started)
-        evaluation = Evaluation() if training_run.simulated else NoEvaluation()
-        callbacks = [Export(), evaluation, Report(), *callbacks]
+        evaluation = Evaluation()
+        several = jax.process_count() > 1  # they compile together, and one collects first
+        meanwhile = () if several else (early.compile_training, evaluation.compile_early)
+        training_run = setup.prepare(command.config, folder, console, started, meanwhile=meanwhile)
+        judge = evaluation if training_run.simulated else NoEvaluation()
+        callbacks = [Export(), judge, Report(), *callbacks]
         first = processes.is_first()
         loop.train(training_run, callbacks if first else [], resume=bool(command.resume))
     report = folder / "report.html"

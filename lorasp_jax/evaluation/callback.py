@@ -24,11 +24,12 @@ from lorasp_jax.evaluation import metrics, video
 from lorasp_jax.evaluation.programs import compiled_rollout, prepared
 from lorasp_jax.evaluation.results import Result, evaluate
 from lorasp_jax.policies.policy import Policy
-from lorasp_jax.training import records
+from lorasp_jax.training import early, records
 from lorasp_jax.training.demonstrations import map_threads
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import read_json, write_json
+from lorasp_jax.training.setup import RunSetup
 
 TOWERS = ("vision", "language", "action")
 
@@ -62,6 +63,23 @@ class Evaluation(Callback):
         self._rollouts: dict[str, tuple[Env, Callable]] = {}
         self._video_thread = ThreadPoolExecutor(1)
         self._pending_videos: Future | None = None
+
+    def compile_early(self, run: Run, built: RunSetup) -> None:
+        """Compile the rollouts of a run, whose demonstrations other threads may be collecting.
+
+        One policy call per task compiles everything. Warp is not thread-safe and compiles later.
+        """
+        if built.source or physics.default_backend() == "warp":
+            return
+        policy = prepared(early.blank_policy(run, built))
+
+        def compile_task(task: str) -> None:
+            with messages.announce(f"the evaluation of {task}"):
+                env, rollout = self._compile_rollout(run.config, task)
+                jax.block_until_ready(rollout(policy, jax.random.key(0), calls=1))
+            self._rollouts[task] = env, rollout
+
+        map_threads(compile_task, run.config.tasks)
 
     def on_start(self, run: Run) -> None:
         """Evaluate the base and write before.json, unless `evaluation.before` is false."""

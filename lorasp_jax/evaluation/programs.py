@@ -33,19 +33,20 @@ def split_rollout(
     execute_steps: int = 5,
     denoise_steps: int = 10,
     ranges: Randomization | None = None,
-) -> Callable[[Policy, jax.Array], Rollout]:
+) -> Callable[..., Rollout]:
     """Create a function like a jitted `make_rollout`, with equal results up to rounding.
 
     One program samples a policy's chunk; it is shared by all environments with as many worlds and
     equal cameras. Three programs reset, render and step the environment; they are shared by all
-    policies. Several threads may call the function.
+    policies. Several threads may call the function. Its argument `calls` is the number of policy
+    calls, by default as many as an episode can have.
     """
 
-    def rollout(policy: Policy, key: jax.Array) -> Rollout:
-        calls = num_calls(env, policy, execute_steps)
+    def rollout(policy: Policy, key: jax.Array, calls: int | None = None) -> Rollout:
+        most = num_calls(env, policy, execute_steps)
         worlds = Worlds(env, policy, key, ranges)
         records = []
-        for call in range(calls):
+        for call in range(calls or most):
             actions, ranks = worlds.predict(call, denoise_steps=denoise_steps)
             records.append((worlds.act(actions, execute_steps), *ranks))
         state, records = jax.device_get((worlds.state, records))
@@ -118,9 +119,7 @@ def prepared(policy: Policy) -> Policy:
     return dataclasses.replace(policy, model=_sampler(policy.model))
 
 
-def compiled_rollout(
-    config: Config, task: str
-) -> tuple[Env, Callable[[Policy, jax.Array], Rollout]]:
+def compiled_rollout(config: Config, task: str) -> tuple[Env, Callable[..., Rollout]]:
     """Return the environment of a task, shared by all runs of this process, and its rollout."""
     settings, size = config.evaluation, config.image_size
     env = _environment(task, config.robot, settings.worlds, size, config.control_dt)

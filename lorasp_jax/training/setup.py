@@ -1,7 +1,9 @@
 """Build a run from a config: base, adapters, demonstrations and processor."""
 
+import contextlib
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -50,6 +52,8 @@ LoadBase = Callable[..., tuple[Backbone, str]]
 """Signature of `base_model`."""
 Collect = Callable[[Config, Path, Progress], dict[str, Episodes]]
 """Signature of `demonstrations`."""
+Meanwhile = Callable[[Run, "RunSetup"], Any]
+"""What `prepare` runs while it collects demonstrations."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,10 +134,19 @@ def prepare(
     *,
     load_base: LoadBase = base_model,
     collect: Collect = demonstrations,
+    meanwhile: Sequence[Meanwhile] = (),
 ) -> Run:
     """Build a run and load or collect its demonstrations.
 
-    `started` is the value of `time.perf_counter()` when this process started.
+    Args:
+        config: the run's config.
+        folder: the run's folder.
+        console: prints progress.
+        started: `time.perf_counter()` when this process started.
+        load_base: returns the base, like `base_model`.
+        collect: collects demonstrations, like `demonstrations`.
+        meanwhile: functions that run in threads of their own until the demonstrations are there, to
+            compile what the run needs next. Their errors are raised here.
 
     Raises:
         ValueError: see `build`; also if the dataset cannot be read or the expert fails.
@@ -144,7 +157,11 @@ def prepare(
     console.print(headline(config, model))
     console.print(f"memory per device: {built.memory}; rematerialization: {base.config.remat}")
     run = Run(config, folder, console, built.base_hash, started)
-    with run.timed("collect"), processes.first_process_first("collected"):
+    with (
+        run.timed("collect"),
+        processes.first_process_first("collected"),
+        _in_threads(meanwhile, run, built),
+    ):
         if built.source:
             _load_dataset(run, built.source, built.free_bytes)
         else:
@@ -159,6 +176,17 @@ def prepare(
         console.print(_camera_summary(run, inputs), markup=False, soft_wrap=True)
     run.policy = Policy(model, inputs)
     return run
+
+
+@contextlib.contextmanager
+def _in_threads(functions: Sequence[Meanwhile], run: Run, built: RunSetup) -> Iterator[None]:
+    """Run functions during this block and wait for them, unless it raises."""
+    pool = ThreadPoolExecutor()
+    futures = [pool.submit(function, run, built) for function in functions]
+    pool.shutdown(wait=False)
+    yield
+    for future in futures:
+        future.result()
 
 
 def headline(config: Config, model: Backbone) -> str:

@@ -1,33 +1,23 @@
 """Dry run: parameter counts, memory and FLOPs of a run, from shapes alone."""
 
 import dataclasses
-import functools
 from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 from flax import nnx
 from rich.console import Console
 from rich.table import Table
 
-from envs.compilation import fast_cpu, messages
-from envs.datasets.episodes import Episodes
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config
-from lorasp_jax.data.batches import flatten
 from lorasp_jax.dense import AdaptedLayer
-from lorasp_jax.policies.policy import Policy
 from lorasp_jax.storage import hub
-from lorasp_jax.training import loop, setup
+from lorasp_jax.training import early, setup
 from lorasp_jax.training.base import base_model
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.cost.preflight import HEADROOM, byte_unit, nbytes
-from lorasp_jax.training.distributed import mesh as meshes
-from lorasp_jax.training.optim import make_optimizer
 from lorasp_jax.training.run import Run
-from lorasp_jax.training.step import init_state
-from lorasp_jax.training.windows import DrawnWindows
 
 
 def dry_run(
@@ -47,10 +37,8 @@ def dry_run(
     console.print(setup.headline(config, built.model))
     console.print(_parameter_table(built.model))
     run = Run(config, folder, console, built.base_hash)
-    held, batches = _abstract_data(run, built)
-    with messages.announce("the training step"):
-        options = fast_cpu.without_simulation()
-        compiled = _lower(run, batches).compile(compiler_options=options)
+    held, batches = early.data_shapes(run, built)
+    compiled = early.compile_training(run, built)
     console.print(_memory_table(built, held, batches, compiled.memory_analysis()))
     step_flops = preflight.step_flops(config, built.base.config)
     console.print(
@@ -58,74 +46,6 @@ def dry_run(
         f"all {config.optim.steps} steps: {step_flops * config.optim.steps / 1e15:.4g} PFLOP"
     )
     console.print("dry run: nothing was collected, trained or written")
-
-
-def _abstract_data(run: Run, built: setup.RunSetup) -> tuple[int, Any]:
-    """Set `run.policy`, and return the bytes of the dataset and the shapes of a call's batches.
-
-    A streamed dataset has 0 bytes on the device. Statistics come from the dataset's first episode.
-    Without a dataset, they come from a blank step, and all demonstrations are assumed to have the
-    maximum length.
-    """
-    config, source = run.config, built.source
-    first = source.episode(0) if source else _blank_episode(config, built)
-    limits = sum(env.max_steps for env in built.environments)
-    count = source.num_steps if source else config.data.episodes * limits
-    model = built.base.config
-    relative = config.model.relative_actions
-    run.policy = Policy(
-        built.model, setup.processor([first], model, built.prompts, relative=relative)
-    )
-    mesh, size = meshes.make_mesh(config.fsdp, run.devices), config.optim.batch_size
-    episode = jax.eval_shape(lambda: flatten([first]))
-    steps = jax.tree.map(lambda x: jax.ShapeDtypeStruct((count, *x.shape[1:]), x.dtype), episode)
-    windows = DrawnWindows(steps, mesh, size, model.chunk)
-    if source is None or nbytes(steps) <= built.free_bytes:
-        call_size = windows.call_size(min(config.log_every, config.optim.steps))
-        return nbytes(steps), windows.shapes(call_size)
-    return 0, windows.shapes(1)
-
-
-def _blank_episode(config: Config, built: setup.RunSetup) -> Episodes:
-    """Return an episode of the first task with a single step, all zeros."""
-    env, size = built.environments[0], config.image_size
-    zeros = np.zeros((1, 1, built.joints + 1), np.float32)
-    return Episodes(
-        image={name: np.zeros((1, 1, size, size, 3), np.uint8) for name in env.cameras},
-        state=zeros,
-        action=zeros,
-        length=np.ones(1, np.int32),
-        instruction=np.zeros(1, np.int32),
-        instructions=tuple(built.prompts.instructions),
-        task=config.tasks[0],
-        robot=config.robot,
-        control_dt=config.control_dt,
-        physics_dt=0.0,
-        attempted=1,
-    )
-
-
-def _lower(run: Run, batches: Any) -> Any:
-    """Lower the steps that `loop.train` compiles first, from shapes alone."""
-    config, model = run.config, run.policy.model
-    optimizer = make_optimizer(config.optim, adaptation.methods(model).values())
-    mesh = meshes.make_mesh(config.fsdp, run.devices)
-    graphdef, adapters, frozen = adaptation.split(model)
-    state = jax.eval_shape(
-        functools.partial(init_state, optimizer=optimizer, ema=config.optim.ema > 0), adapters
-    )
-    shardings = meshes.shardings(state, mesh)
-    frozen = loop.Frozen(frozen, run.policy.processor.shared())
-    frozen = jax.tree.map(_with_sharding, frozen, meshes.shardings(frozen, mesh))
-    state = jax.tree.map(_with_sharding, state, shardings)
-    steps = loop.jit_steps(run, graphdef, optimizer, shardings)
-    return steps.lower(frozen, batches, state, jax.random.key(0))
-
-
-def _with_sharding(tree: Any, sharding: jax.sharding.Sharding) -> Any:
-    """Attach a sharding to the shapes of a tree."""
-    shape = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)  # noqa: E731
-    return jax.tree.map(shape, tree)
 
 
 def _parameter_table(model: nnx.Module) -> Table:

@@ -15,7 +15,7 @@ from lorasp_jax.data.batches import flatten
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import LoRA
 from lorasp_jax.storage import hub
-from lorasp_jax.training import setup
+from lorasp_jax.training import early, setup
 from lorasp_jax.training.cost import dry_run, preflight
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.overrides import load
@@ -103,7 +103,7 @@ def test_a_dataset_larger_than_the_free_memory_streams(config, tmp_path):
     whole = preflight.nbytes(flatten([random_episodes("press", 0)]))
     for free, bytes_held, steps in ((1e12, whole, config.log_every), (1.0, 0, 1)):
         device = dataclasses.replace(built, available=built.memory.peak + free)
-        held, batches = dry_run._abstract_data(run, device)
+        held, batches = early.data_shapes(run, device)
         assert held == bytes_held
         assert batches.state.shape == (steps, config.optim.batch_size, 7)
         assert batches.image["side"].shape == (steps, config.optim.batch_size, 32, 32, 3)
