@@ -60,9 +60,10 @@ class ModelConfig:
     relative_actions: bool = False
     """Learn joint targets relative to the state at the start of the chunk, as openpi does for
     pi0."""
-    remat: Literal["auto", "none", "products", "full"] = "auto"
+    remat: Literal["auto", "none", "products", "narrow", "full"] = "auto"
     """Rematerialization: the backward pass recomputes nothing (none), everything except matrix
-    products (products) or the whole layer (full); auto: the first that fits in device memory."""
+    products (products) or narrow ones (narrow), or the whole layer (full); auto: the first that
+    fits in device memory."""
     unroll: bool | None = None
     """Unroll the scan over layers: faster steps in the same memory, slower compilation; None:
     unroll unless remat is full."""

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 
 from lorasp_jax.kernels.platform import multiplies_float8
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
+from lorasp_jax.kernels.rematerialization import save_for_backward
 
 Kernel = jax.Array | QuantizedKernel
 
@@ -69,7 +70,8 @@ def _float8_product(x: jax.Array, dtype: Any, kernel: QuantizedKernel, axis: int
     codes, scale = encode(x, dtype)
     axes = ((x.ndim - 1,), (axis,)), ((), ())
     sums = jax.lax.dot_general(codes, kernel.codes[0], axes, preferred_element_type=x.dtype)
-    return sums * (scale * kernel.scale.reshape(())).astype(x.dtype)
+    product = sums * (scale * kernel.scale.reshape(())).astype(x.dtype)
+    return save_for_backward(product, x.shape[-1])
 
 
 def _forward(x: jax.Array, kernel: Kernel) -> tuple[jax.Array, Kernel]:

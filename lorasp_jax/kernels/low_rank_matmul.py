@@ -30,6 +30,7 @@ import jax.numpy as jnp
 from lorasp_jax.kernels.frozen_matmul import matmul, matmul_transposed, uses_float8
 from lorasp_jax.kernels.platform import platform
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
+from lorasp_jax.kernels.rematerialization import save_for_backward
 
 
 class Bottleneck(Protocol):
@@ -146,7 +147,7 @@ def base_plus_low_rank(
     u, z = up.astype(x.dtype), z.astype(x.dtype)
     if d_out >= d_in and _should_concat(kernel, x, d_out):
         return jnp.concatenate([x, z], axis=-1) @ jnp.concatenate([kernel.astype(x.dtype), u])
-    return matmul(x, kernel) + z @ u
+    return save_for_backward(matmul(x, kernel) + z @ u, d_in)
 
 
 def _backward(

@@ -14,7 +14,7 @@ from lorasp_jax.peft import _fields
 VOCABULARY_SIZE = 320
 """Rows of the embedding table in this project's base models, including reserved tokens."""
 
-Remat = Literal["none", "products", "full"]
+Remat = Literal["none", "products", "narrow", "full"]
 _MAX_SIZE = 2**24
 """Upper bound for sizes, far beyond existing models; rejects absurd values in config files."""
 _MAX_DEPTH = 1000
@@ -103,7 +103,8 @@ class BackboneConfig:
     """Dtype of the stored parameters."""
     remat: Remat = "none"
     """Rematerialization in the backward pass. "none" recomputes nothing. "products" recomputes all
-    but products with weights: half the memory, a few percent more compute. "full" recomputes whole
+    but products with weights: half the memory, a few percent more compute. "narrow" also recomputes
+    products with more than twice the columns of their input, as in MLPs. "full" recomputes whole
     layers: the least memory, a third more compute."""
     unroll: bool | None = None
     """Unroll the loop over layers. Compilation takes two to three times as long, but training runs

@@ -7,30 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jax.ad_checkpoint import checkpoint_name
 
 from lorasp_jax.dense import AdapterParam
+from lorasp_jax.kernels.rematerialization import save_narrow_products, save_products
 from lorasp_jax.models.config import Remat
 
-_EXPENSIVE_TO_RECOMPUTE = ("dot_product_attention_fwd_wrapper", "custom_vmap_call")
-"""Primitives of cuDNN attention and of kernels on sharded rows (`kernels.row_sharding`), which are
-`short_attention` and the adapters' fused kernel."""
-_SAVED = "saved"
-
-
-def save_for_backward(x: jax.Array) -> jax.Array:
-    """Mark x to be saved for the backward pass, in place of the matmul results it comes from."""
-    return checkpoint_name(x, _SAVED)
-
-
-def _save_products(primitive: Any, *shapes: Any, **params: Any) -> Any:
-    """Save matmuls without batch axes, expensive primitives and values marked for saving."""
-    if primitive.name in _EXPENSIVE_TO_RECOMPUTE or params.get("name") == _SAVED:
-        return True
-    return jax.checkpoint_policies.dots_with_no_batch_dims_saveable(primitive, *shapes, **params)
-
-
-_REMAT_POLICIES = {"products": _save_products, "full": None}
+_REMAT_POLICIES = {"products": save_products, "narrow": save_narrow_products, "full": None}
 
 Block = TypeVar("Block", bound=nnx.Module)
 

@@ -15,9 +15,10 @@ from flax import nnx
 
 from lorasp_jax.adapters.layers.prepared import Layer, fuse_layer, fuse_layers
 from lorasp_jax.dense import Dense
+from lorasp_jax.kernels.rematerialization import save_for_backward
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig
 from lorasp_jax.models.transformer.attention import attention
-from lorasp_jax.models.transformer.depth import save_for_backward, scan_depth, stack
+from lorasp_jax.models.transformer.depth import scan_depth, stack
 from lorasp_jax.models.transformer.layers import (
     AdaptiveRMSNorm,
     LayerAux,

@@ -29,7 +29,7 @@ from lorasp_jax.training.step import Metrics, init_state, loss_fn
 
 HEADROOM = 1.1
 """Factor on the total to cover temporaries, the executable and fragmentation."""
-REMATS: tuple[Remat, ...] = ("none", "products", "full")
+REMATS: tuple[Remat, ...] = ("none", "products", "narrow", "full")
 GIB, MIB = 2**30, 2**20
 
 

@@ -8,7 +8,8 @@ from flax import nnx
 
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.dense import AdapterParam, Dense
-from lorasp_jax.models.transformer.depth import save_for_backward, scan_depth, stack
+from lorasp_jax.kernels.rematerialization import save_for_backward
+from lorasp_jax.models.transformer.depth import scan_depth, stack
 from lorasp_jax.peft import LoRA
 from tests.nets import METHODS, trained
 from tests.peft.lora_sp.test_method import WithFusedKernel
