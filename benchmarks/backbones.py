@@ -19,7 +19,7 @@ import functools
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,8 @@ from rich.console import Console
 from benchmarks.measuring import best, machine, print_table
 from lorasp_jax import peft
 from lorasp_jax.adapters import adaptation
-from lorasp_jax.config import Config, OptimConfig
+from lorasp_jax.config import Config, ModelConfig, OptimConfig
+from lorasp_jax.kernels.quantized_weights import KINDS, Kind
 from lorasp_jax.models import backbone
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
@@ -58,10 +59,12 @@ def sized(name: str, options: argparse.Namespace, remat: Remat = "none") -> Back
     )
 
 
-def run_config(method: peft.Method, targets: tuple[str, ...], batch: int) -> Config:
+def run_config(
+    method: peft.Method, targets: tuple[str, ...], batch: int, base_dtype: Kind | Literal[""] = ""
+) -> Config:
     """Return the config of a run."""
-    optim = OptimConfig(batch_size=batch)
-    return Config(name="benchmark", scale="", peft=method, targets=targets, optim=optim)
+    parts = {"model": ModelConfig(base_dtype=base_dtype), "optim": OptimConfig(batch_size=batch)}
+    return Config(name="benchmark", scale="", peft=method, targets=targets, **parts)
 
 
 def arrays(config: BackboneConfig, run: Config | None) -> tuple[Any, Any, Any]:
@@ -144,6 +147,7 @@ def training(name: str, label: str, run: Config, options: argparse.Namespace, re
     return {
         "backbone": name,
         "trainable": label,
+        "base": run.model.base_dtype or options.dtype,
         "batch": size,
         "remat": remat,
         "ms": 1e3 * seconds,
@@ -157,7 +161,7 @@ def training(name: str, label: str, run: Config, options: argparse.Namespace, re
 
 def largest(name: str, run: Config, options: argparse.Namespace) -> int:
     """Extrapolate from two batch sizes to the largest one expected to fit in `options.gib` GiB."""
-    config = sized(name, options, "full")
+    config = sized(name, options, options.largest_remat)
 
     def bytes_of(batch: int) -> float:
         optim = dataclasses.replace(run.optim, batch_size=batch)
@@ -187,14 +191,15 @@ def sampling(name: str, label: str, run: Config | None, options: argparse.Namesp
 def rows(name: str, table: str, options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yield the rows of one backbone in one table."""
     method = peft.LoRASP(rank=options.rank)
-    everywhere = run_config(method, ("all-linear",), options.batch)
+    everywhere = run_config(method, ("all-linear",), options.batch, options.base_dtype)
     if table == "training":
         expert = run_config(peft.FullFineTuning(), ("expert-only",), options.batch)
         yield training(name, "LoRA-SP", everywhere, options, options.remat)
         yield training(name, "expert only", expert, options, options.remat)
     elif table == "largest":
-        run = run_config(method, ("all-linear",), largest(name, everywhere, options))
-        yield training(name, f"LoRA-SP, {options.gib:g} GiB", run, options, "full")
+        batch = largest(name, everywhere, options)
+        run = run_config(method, ("all-linear",), batch, options.base_dtype)
+        yield training(name, f"LoRA-SP, {options.gib:g} GiB", run, options, options.largest_remat)
     else:
         yield from sampling(name, "none", None, options)
         yield from sampling(name, "LoRA-SP", everywhere, options)
@@ -206,6 +211,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--remat", choices=REMATS, default="products")
     parser.add_argument("--unroll", choices=["yes", "no"], help="default: depends on the size")
     parser.add_argument("--dtype", default="bfloat16")
+    parser.add_argument("--base-dtype", choices=["", *KINDS], default="")
     parser.add_argument("--calls", type=int, default=5, help="steps queued at once")
     parser.add_argument("--json", type=Path, help="file for the results")
 
@@ -222,6 +228,7 @@ def main() -> None:
     parser.add_argument(
         "--gib", type=float, default=24, help="memory [GiB] that the largest batch must fit in"
     )
+    parser.add_argument("--largest-remat", choices=REMATS, default="full")
     parser.add_argument("--only", choices=["training", "largest", "sampling"])
     add_options(parser)
     options = parser.parse_args()

@@ -10,7 +10,8 @@ Each shape [I, O] has these rows:
 - this project's methods at rank R, with their losses
 
 Gradients are with respect to the input and the adapter, as in training. Ratios are relative to the
-usual LoRA in the same run. Memory is that of the compiled program without its arguments.
+usual LoRA in the same run. With `--float8`, two more columns (f8) are for both passes with a float8
+base. Memory is that of the compiled program without its arguments.
 
 A second table compares separate with grouped calls of layers that share an input ("I:O,O,O"). A
 third compares the energy gate with a copy of its scores. Everything is warmed up twice, and ten
@@ -31,6 +32,8 @@ from rich.console import Console
 from benchmarks.measuring import best, machine, print_table
 from lorasp_jax import peft
 from lorasp_jax.kernels.energy_gate import energy_gate
+from lorasp_jax.kernels.frozen_matmul import Kernel, frozen_matmul
+from lorasp_jax.kernels.quantized_weights import quantize_kernel
 from lorasp_jax.peft._shared_input import apply_shared_input
 
 SHAPES = ((2048, 16384), (16384, 2048), (2048, 2048), (1152, 4304))
@@ -44,10 +47,10 @@ LOSS_WEIGHT = 1e-2
 Layer = Callable[[Any, jax.Array, Any], tuple[Any, Any]]
 
 
-def bare(params: Any, x: jax.Array, kernel: jax.Array) -> tuple[jax.Array, Any]:
+def bare(params: Any, x: jax.Array, kernel: Kernel) -> tuple[jax.Array, Any]:
     """Apply only the frozen layer."""
     del params
-    return x @ kernel, {}
+    return frozen_matmul(x, kernel), {}
 
 
 def usual_lora(params: Any, x: jax.Array, kernel: jax.Array) -> tuple[jax.Array, Any]:
@@ -148,18 +151,10 @@ def measure(options: argparse.Namespace, shape: tuple[int, int]) -> Iterator[dic
     base: dict[str, float] = {}
     for name, layer, method in layers(options.rank):
         params, x, kernel, g = inputs(method, shape, options.tokens, options.dtype)
-        forward = jax.jit(lambda p, x, w, layer=layer: layer(p, x, w)[0])
-        forward = forward.lower(params, x, kernel).compile()
-        backward = jax.jit(functools.partial(with_gradients, layer))
-        backward = backward.lower(params, x, kernel, g).compile()
-        seconds = {
-            "forward": best(functools.partial(forward, params, x, kernel), calls=QUEUED),
-            "both": best(functools.partial(backward, params, x, kernel, g), calls=QUEUED),
-        }
+        seconds, memory = measure_layer(layer, params, x, kernel, g)
         if name == "usual LoRA":
             base = seconds
-        memory: Any = backward.memory_analysis()
-        yield {
+        row = {
             "shape": "x".join(map(str, shape)),
             "layer": name,
             "fwd ms": 1e3 * seconds["forward"],
@@ -168,6 +163,29 @@ def measure(options: argparse.Namespace, shape: tuple[int, int]) -> Iterator[dic
             "ratio": seconds["both"] / base["both"] if base else "",
             "MiB": (memory.temp_size_in_bytes + memory.output_size_in_bytes) / 2**20,
         }
+        if options.float8:
+            row |= {"f8 ms": "", "f8 ratio": ""}
+            if name != "usual LoRA" and not method.trains_base:
+                quantized = quantize_kernel(kernel, "float8")
+                both = measure_layer(layer, params, x, quantized, g)[0]["both"]
+                row["f8 ms"] = 1e3 * both
+                row["f8 ratio"] = both / base["both"] if base else ""
+        yield row
+
+
+def measure_layer(layer: Layer, *arrays: Any) -> tuple[dict[str, float], Any]:
+    """Time a layer on (parameters, x, kernel, gradient): its forward pass, and both passes.
+
+    Returns:
+        The times [s], and the memory analysis of both passes.
+    """
+    forward = jax.jit(lambda p, x, w: layer(p, x, w)[0]).lower(*arrays[:3]).compile()
+    both = jax.jit(functools.partial(with_gradients, layer)).lower(*arrays).compile()
+    seconds = {
+        "forward": best(functools.partial(forward, *arrays[:3]), calls=QUEUED),
+        "both": best(functools.partial(both, *arrays), calls=QUEUED),
+    }
+    return seconds, both.memory_analysis()
 
 
 def measure_gate(options: argparse.Namespace) -> dict[str, Any]:
@@ -206,6 +224,7 @@ def main() -> None:
     parser.add_argument("--tokens", type=int, default=26112)
     parser.add_argument("--rank", type=int, default=128)
     parser.add_argument("--dtype", default="bfloat16")
+    parser.add_argument("--float8", action="store_true", help="also with a float8 base")
     parser.add_argument("--json", type=Path, help="file for the results")
     options = parser.parse_args()
     console = Console(soft_wrap=True)
