@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lorasp_jax.peft import LoRA, LoRASP
-from lorasp_jax.peft.lora_moe import LoRAMoE, balance_loss, z_loss
+from lorasp_jax.peft.lora_moe import LoRAMoE, balance_loss, softmax, z_loss
 from tests import GOLDEN
 
 GOLDEN = GOLDEN / "moe_switch_losses.npz"
@@ -217,3 +217,18 @@ def test_merge_suggests_an_alternative():
 def test_invalid_fields(fields, message):
     with pytest.raises(ValueError, match=message):
         LoRAMoE(**fields)
+
+
+@pytest.mark.parametrize("experts", [1, 4, 7])
+def test_softmax(experts):
+    """Values and gradients, also of large logits; no reduction for XLA to fuse."""
+    logits = 30 * jax.random.normal(jax.random.key(0), (5, 3, experts))
+    weights = jax.random.normal(jax.random.key(1), logits.shape)
+    found, expected = (
+        jax.value_and_grad(lambda x, f=f: (weights * f(x)).sum())(logits)
+        for f in (softmax, jax.nn.softmax)
+    )
+    np.testing.assert_allclose(softmax(logits), jax.nn.softmax(logits), rtol=1e-5, atol=1e-7)
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
+    assert "reduce" not in str(jax.make_jaxpr(softmax)(logits))
