@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import types
 
 import numpy as np
 import pytest
@@ -146,6 +147,35 @@ def test_asking_ahead_skips_what_is_past(bench):
     late = times > 1.2  # the first chunk could not be asked for ahead
     expected = base[0] + times[late] * 0.3
     np.testing.assert_allclose(run.path[late, 0], expected, atol=0.004)
+
+
+@pytest.mark.parametrize(
+    ("latency", "delay", "wait"), [(0.0, 0, 0), (0.2, 2, 0), (0.16, 2, 0), (0.5, 3, 2)]
+)
+def test_a_new_chunk_takes_over_as_in_the_simulation(bench, latency, delay, wait):
+    """It starts where the previous one was, at the end of an action, even if they disagree."""
+    chunks, targets, recorded = [], [], []
+    base = bench.arm.read().pose[0]
+
+    def ask(observation):
+        chunk = np.tile(observation["state"], (8, 1))
+        chunk[:, 0] = base + 0.001 * (len(chunks) + 0.1) * np.arange(1, 9)
+        chunks.append(chunk[:, 0])
+        return chunk
+
+    recorder = types.SimpleNamespace(step=lambda images, state, action: recorded.append(action[0]))
+    run = Run(bench, ask, latency=latency, settings={"ahead": 3}, recorder=recorder)
+    step = run.session._governor.step
+    run.session._governor.step = lambda target: targets.append(target[0]) or step(target)
+    run(latency + 1.5)
+    parts = [chunks[0][: 5 + delay], *(chunk[delay : 5 + delay] for chunk in chunks[1:])]
+    waits = [np.repeat(part[-1], wait) for part in parts]
+    actions = np.concatenate([x for both in zip(parts, waits, strict=True) for x in both])
+    first, last = 0.1, 1.4  # s; the way to the first action depends on where the arm was
+    times = np.arange(first, last, PERIOD)
+    expected = np.interp(times, 0.1 * np.arange(1, 1 + len(actions)), actions)
+    np.testing.assert_allclose(targets[round(first / PERIOD) :][: len(times)], expected, atol=1e-6)
+    np.testing.assert_array_equal(recorded, np.concatenate(parts)[: len(recorded)])
 
 
 def test_frames_that_stop_for_a_while(bench):

@@ -30,10 +30,18 @@ class Path:
         """Return this path from another start [7]."""
         return Path(start, self._knots[1:], self._dt)
 
-    @property
-    def end(self) -> np.ndarray:
-        """The last action, [7]."""
-        return self._knots[-1]
+    def switching(self, observed: int, step: int, actions: np.ndarray) -> "Path":
+        """Return the path that follows this one up to a step, and then a new chunk.
+
+        Args:
+            observed: this path's step at which the new chunk was asked for; the returned path, and
+                the new chunk, count from there.
+            step: this path's step from which on the new chunk is followed.
+            actions: [C, 7] the new chunk.
+        """
+        under_way = self._knots[observed + 1 : step + 1]
+        actions = np.concatenate([under_way, actions[step - observed :]])
+        return Path(self._knots[observed], actions, self._dt)
 
     def action(self, step: int) -> np.ndarray:
         """Return the action of a control step from 0, [7]."""

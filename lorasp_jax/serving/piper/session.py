@@ -6,6 +6,7 @@ pose and stays there, powered; it does not move again while it reports a fault i
 it where it is.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -36,6 +37,7 @@ REST = np.array([0.0, 0.06, -0.06, 0.0, 0.35, 0.0, 0.0])
 _REACHED = 0.01  # rad from the rest pose that counts as arrived
 _APPROACH_TIME = 20.0  # s that the way to the first action may take
 _REST_TIME = 60.0  # s that the way to the rest pose may take
+_INSTANT = 1e-6  # control steps that rounding may take from a clock's time
 _LATE = 0.05  # s of delay after which ticks are skipped instead of made up for
 
 
@@ -70,8 +72,9 @@ class Settings:
         control_dt: duration of an action [s], as in the policy's training.
         execute: actions of each chunk that are executed.
         ahead: how many actions before the end of these the next chunk is asked for. At 0 the arm
-            waits for the answer. Otherwise the new chunk counts from when it was asked for: by the
-            time it arrives, its first actions are in the past.
+            waits for the answer. Otherwise the new chunk counts from when it was asked for, and
+            takes over when the action ends during which it arrives: its first actions are then in
+            the past. If it arrives after the end of the previous chunk, the arm has waited.
         patience: longest time to wait for an answer [s].
         hold: time to hold, after which the arm goes to rest [s].
         dry_run: print commands instead of sending them.
@@ -197,9 +200,11 @@ class Session:
         images = self._cameras.read()
         state = reading.pose.astype(np.float32)
         observation = {"image": images, "state": state, "prompt": self._settings.prompt}
-        if self._settings.ahead and self._path:  # the new chunk may continue the previous one
-            executed = round((now - self._start) / self._settings.control_dt)
-            observation |= {"executed": executed, "delay": self._settings.ahead}
+        if self._path:
+            self._executed = min(round(self._position(now)), self._path.steps)
+            if self._settings.ahead:  # the new chunk may continue the previous one
+                left = self._path.steps - self._executed
+                observation |= {"executed": self._executed, "delay": left}
         if self._log:
             self._log.observation(now, observation)
         self._asker.ask(observation)
@@ -210,18 +215,37 @@ class Session:
         if self._asked is None or (actions := self._asker.answer()) is None:
             return
         settings, chunk = self._settings, check_chunk(actions)
-        begin = self._governor.pose.copy() if self._path is None else self._path.end
-        self._path = Path(begin, chunk[: settings.execute + settings.ahead], settings.control_dt)
-        self._start = self._asked if settings.ahead and self.chunks else now
-        self._asked, self._recorded = None, -1
+        own = chunk[: settings.execute + settings.ahead]
+        if self._path is None:
+            self._path = Path(self._governor.pose.copy(), own, settings.control_dt)
+            self._start, self._recorded = now, -1
+        else:
+            self._switch(own, now)
+        self._asked = None
         self.chunks += 1
         self._write(now, chunk=chunk)
+
+    def _switch(self, chunk: np.ndarray, now: float) -> None:
+        """Let a new chunk take over where the present action ends, as in the simulation.
+
+        If the path has ended, the arm has waited, and no action is skipped for that time.
+        """
+        assert self._path is not None
+        step = min(math.ceil(self._position(now) - _INSTANT), self._path.steps)
+        skipped = step - self._executed
+        self._path = self._path.switching(self._executed, step, chunk)
+        self._recorded -= self._executed
+        dt = self._settings.control_dt
+        self._start = max(self._start + self._executed * dt, now - skipped * dt)
 
     def _wants_chunk(self, now: float) -> bool:
         if self._path is None:
             return True
-        left = self._path.steps - (now - self._start) / self._settings.control_dt
-        return left <= self._settings.ahead + 1e-6
+        return self._path.steps - self._position(now) <= self._settings.ahead + _INSTANT
+
+    def _position(self, now: float) -> float:
+        """Return the time on the path in control steps."""
+        return (now - self._start) / self._settings.control_dt
 
     def _hold(self, problem: str, reading: Reading, now: float) -> None:
         """Begin to hold, unless the arm holds already: where it is if it reports where that is."""
@@ -277,7 +301,7 @@ class Session:
         """Record the first tick of every action."""
         if self._recorder is None or self._path is None:
             return
-        step = int((now - self._start) / self._settings.control_dt + 1e-6)
+        step = int(self._position(now) + _INSTANT)
         if self._recorded < step < self._path.steps:
             action = self._path.action(step)
             self._recorder.step(self._cameras.read(), reading.pose, action)
@@ -286,7 +310,8 @@ class Session:
     def _forget(self) -> None:
         """Drop the path and the open question."""
         self._path: Path | None = None
-        self._start, self._asked, self._approached, self._recorded = 0.0, None, None, -1
+        self._start, self._asked, self._approached = 0.0, None, None
+        self._executed, self._recorded = 0, -1
         self._printed = -np.inf
 
     def _write(self, now: float, **values: Any) -> None:
