@@ -38,7 +38,7 @@ class Waiting:
         names = tuple(f"camera{i}" for i in range(cameras))
         self.spec, self._seconds = PolicySpec(names, image_size, 7, 50), seconds
 
-    def prepare(self, request: Request, index: int) -> np.ndarray:
+    def prepare(self, request: Request, index: tuple[int, int]) -> np.ndarray:
         """Return the state."""
         del index
         return request.state

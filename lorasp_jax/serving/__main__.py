@@ -2,6 +2,7 @@
 
 import argparse
 import asyncio
+import secrets
 import signal
 import socket
 import sys
@@ -52,7 +53,8 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--prompt", default="", help="instruction of requests that have none")
     add("--max-batch", type=int, help="largest batch (default: 8)")
     add("--num-steps", type=int, help="flow steps (default: 10)")
-    add("--seed", type=int, default=0, help="seed of the flow's noise (default: %(default)s)")
+    add("--seed", type=int, help="seed of the flow's noise, which repeats what a server answered "
+        "(default: a fresh one, which is printed)")  # fmt: skip
     add(
         "--execution",
         default="naive",
@@ -126,7 +128,9 @@ def _load(options: argparse.Namespace, console: Console) -> tuple[Any, dict[str,
     if len(named) < len(options.policy):
         raise ValueError("the policies must have different names: pass NAME=POLICY")
     cache.enable()
-    _say(console, f"loading {', '.join(options.policy)}")
+    if options.seed is None:
+        options.seed = secrets.randbelow(2**31)
+    _say(console, f"loading {', '.join(options.policy)} with --seed {options.seed}")
     load = _exported if all(map(is_exported, named.values())) else _compiled
     policy, metadata = load(options, named)
     pairs = [(name, size) for name in policy.adapters for size in policy.sizes]

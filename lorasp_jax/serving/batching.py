@@ -48,8 +48,12 @@ class BatchPolicy(Protocol):
         """Batch sizes, ascending."""
         ...
 
-    def prepare(self, request: Request, index: int) -> Any:
-        """Convert a request to a row of a batch; `index` counts requests of an episode.
+    def prepare(self, request: Request, index: tuple[int, int]) -> Any:
+        """Convert a request to a row of a batch.
+
+        Args:
+            request: a request.
+            index: numbers of the connection and of the request on it, for the flow's noise.
 
         Raises:
             ValueError: the request does not fit the policy.

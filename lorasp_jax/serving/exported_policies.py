@@ -1,6 +1,7 @@
 """Exported policies in the form that the server runs, one per adapter."""
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -9,6 +10,7 @@ import jax
 import numpy as np
 
 from lorasp_jax.serving.exported import ExportedPolicy
+from lorasp_jax.serving.noise import draw
 from lorasp_jax.serving.requests import PolicySpec, Request, choose_prompt, common_spec
 
 
@@ -43,10 +45,7 @@ class ExportedPolicies:
         self._prompt, key = prompt, jax.random.key(seed)
         sizes = [set(policy.description.batch_sizes) for policy in policies.values()]
         self.sizes = tuple(sorted(set.intersection(*sizes)))
-        self._noise = jax.jit(
-            lambda i, shape: jax.random.normal(jax.random.fold_in(key, i), shape),
-            static_argnames="shape",
-        )
+        self._noise = jax.jit(functools.partial(draw, key), static_argnames="shape")
 
     @property
     def adapters(self) -> tuple[str, ...]:
@@ -61,9 +60,9 @@ class ExportedPolicies:
             progress(adapter, size)
             prompt = self._specs[adapter].instructions[0]
             request = Request(images, state.astype(np.float32), prompt, adapter, False, 0)
-            self.run(adapter, [self.prepare(request, 0)] * size)
+            self.run(adapter, [self.prepare(request, (0, 0))] * size)
 
-    def prepare(self, request: Request, index: int) -> dict[str, Any]:
+    def prepare(self, request: Request, index: tuple[int, int]) -> dict[str, Any]:
         """Convert a request to a row of a batch.
 
         Raises:
@@ -72,7 +71,7 @@ class ExportedPolicies:
         adapter = request.adapter or self.adapters[0]
         policy = self._policies[adapter]
         prompt = choose_prompt(request, self._prompt, self._specs[adapter])
-        noise = np.asarray(self._noise(index, shape=policy.noise_shape))
+        noise = np.asarray(self._noise(np.array(index), shape=policy.noise_shape))
         previous = None
         if self.spec.execution == "trained":
             previous = np.zeros((0, self.spec.state_dim), np.float32)

@@ -13,6 +13,7 @@ from lorasp_jax.policies.policy import Observation, Policy
 from lorasp_jax.policies.processor import Processor
 from lorasp_jax.policies.prompt_table import Ids
 from lorasp_jax.policies.tokenizer import Tokenizer
+from lorasp_jax.serving.noise import draw
 from lorasp_jax.serving.requests import PolicySpec, Request, choose_prompt, common_spec
 
 EXECUTIONS = ("naive", "trained", "guided")
@@ -29,7 +30,7 @@ class Rows(NamedTuple):
         present: camera -> bool.
         state: f32 `[J+1]`.
         ids, mask: `[T]`, the instruction's tokens.
-        index: int32, number of the request on its connection; not for `sample`.
+        index: int32 `[2]`, numbers of the connection and of the request on it; not for `sample`.
         previous: f32 `[C, J+1]`, what remains of the previous chunk, then zeros.
         overlap: int32, number of actions that remain; 0: the new chunk does not continue any.
         delay: int32, number of these that the robot will execute.
@@ -106,13 +107,13 @@ class CompiledPolicies:
         for adapter in self.adapters:
             prompt = (self._prompt, *self._specs[adapter].instructions, "press the button")
             request = Request(images, state, next(filter(None, prompt)), adapter, False, 0)
-            row = self.prepare(request, 0)
+            row = self.prepare(request, (0, 0))
             for size in self.sizes:
                 progress(adapter, size)
                 self.run(adapter, [row] * size)
                 self.run(adapter, [row] * size)
 
-    def prepare(self, request: Request, index: int) -> Rows:
+    def prepare(self, request: Request, index: tuple[int, int]) -> Rows:
         """Convert a request to a row of a batch.
 
         Raises:
@@ -216,9 +217,8 @@ def _sample(
 ) -> jax.Array:
     """`sample` with noise that depends on the key and on the rows' indices."""
     config = policy.model.config
-    noise = jax.vmap(
-        lambda i: jax.random.normal(jax.random.fold_in(key, i), (config.chunk, config.action_dim))
-    )(rows.index)
+    shape = (config.chunk, config.action_dim)
+    noise = jax.vmap(lambda index: draw(key, index, shape))(rows.index)
     return sample(policy, rows, noise, guidance=guidance, **options)
 
 

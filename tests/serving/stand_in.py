@@ -17,19 +17,22 @@ SPEC = PolicySpec(("side", "wrist"), image_size=16, state_dim=7, chunk=10)
 class StandIn:
     """Returns the state, plus the number of the request, plus the mean of the first picture.
 
-    `gate` holds every batch back until it is set, `seconds` is the time a batch takes, and
-    `failure` is raised instead of an answer.
+    `indices` keeps the numbers of connections and of requests on them, `gate` holds every batch
+    back until it is set, `seconds` is the time a batch takes, and `failure` is raised instead of an
+    answer.
     """
 
     def __init__(self, spec=SPEC, *, sizes=(1, 2, 4, 8), seconds=0.0, adapters=("base",)):
         self.spec, self.sizes, self.seconds, self.adapters = spec, sizes, seconds, adapters
-        self.gate, self.failure, self.batches = threading.Event(), None, []
+        self.gate, self.failure = threading.Event(), None
+        self.batches, self.indices = [], []
         self.gate.set()
 
     def prepare(self, request, index):
         self.last_request = request
+        self.indices.append(index)
         first = request.images[self.spec.cameras[0]]
-        return request.state + index + first.mean(dtype=np.float32)
+        return request.state + index[1] + first.mean(dtype=np.float32)
 
     def run(self, adapter, rows):
         self.batches.append((adapter, len(rows)))

@@ -1,12 +1,15 @@
 """Test the command line and what it loads."""
 
+import re
 import signal
 import subprocess
 import sys
+import types
 
 import numpy as np
 import pytest
 from flax import nnx
+from rich.console import Console
 
 import lorasp_jax
 from lorasp_jax import models
@@ -116,6 +119,21 @@ def test_names_of_policies(tmp_path):
     assert command._named(str(tmp_path / "lr=0.1")) == ("lr=0.1", str(tmp_path / "lr=0.1"))
 
 
+def test_without_a_seed_every_server_draws_one(run, capsys, monkeypatch):
+    seeds, nothing = [], types.SimpleNamespace(adapters=(), sizes=(), warm_up=lambda report: None)
+
+    def compiled(options, named):
+        seeds.append(options.seed)
+        return nothing, {}
+
+    monkeypatch.setattr(command, "_compiled", compiled)
+    for words in (["--seed", "0"], [], []):
+        command._load(command.parser("serve").parse_args([str(run), *words]), Console())
+        assert f"with --seed {seeds[-1]}" in capsys.readouterr().out
+    assert seeds[0] == 0
+    assert len(set(seeds)) == 3
+
+
 def test_an_empty_token_is_refused(tmp_path, capsys):
     (tmp_path / "token").write_text("\n")
     error = refuse(capsys, "a", "--token-file", str(tmp_path / "token"))
@@ -144,6 +162,7 @@ def test_serving_a_run_until_an_interrupt(run):
             assert line, lines
             lines.append(line)
         assert [line.split()[0] for line in lines] == ["loading", "compiling", "ready", "listening"]
+        assert re.fullmatch(rf"loading {run} with --seed \d+\n", lines[0])
         with PolicyClient(lines[-1].split()[-1]) as client:
             assert client.metadata["adapters"] == ["trained"]
             assert client.metadata["robot"] == "piper"

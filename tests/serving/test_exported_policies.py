@@ -43,7 +43,7 @@ def test_actions_are_those_of_the_compiled_policies(policies):
     sent = request(served.spec, absent=["wrist"])
     for adapter in served.adapters:
         asked = dataclasses.replace(sent, adapter=adapter)
-        actions = [p.run(adapter, [p.prepare(asked, 5)]) for p in (served, expected)]
+        actions = [p.run(adapter, [p.prepare(asked, (2, 5))]) for p in (served, expected)]
         np.testing.assert_allclose(*actions, atol=1e-5)
 
 
@@ -51,10 +51,10 @@ def test_chunks_continue_as_those_of_the_compiled_policies(policies):
     served = ExportedPolicies({"other": policies["other"]}, execution="trained")
     expected = compiled({"other": make_policy(seed=1)}, execution="trained")
     first = request(served.spec)
-    previous = served.run("other", [served.prepare(first, 0)])[0]
+    previous = served.run("other", [served.prepare(first, (0, 0))])[0]
     second = dataclasses.replace(first, previous=previous, executed=1, delay=2)
     for index, asked in enumerate((first, second)):
-        actions = [p.run("other", [p.prepare(asked, index)]) for p in (served, expected)]
+        actions = [p.run("other", [p.prepare(asked, (0, index))]) for p in (served, expected)]
         np.testing.assert_allclose(*actions, atol=1e-5)
     np.testing.assert_allclose(actions[0][0, :2], previous[1:3], atol=1e-5)
 

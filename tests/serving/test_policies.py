@@ -50,7 +50,12 @@ def served():
     return compiled({"base": make_policy(), "other": make_policy(seed=1)})
 
 
-def actions(served, *requests, adapter="base", index=0):
+def noise_of(policy, spec, connection=0, request=0):
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), connection), request)
+    return jax.random.normal(key, (1, spec.chunk, policy.model.config.action_dim))
+
+
+def actions(served, *requests, adapter="base", index=(0, 0)):
     rows = [served.prepare(each, index) for each in requests]
     return served.run(adapter, rows)
 
@@ -58,16 +63,13 @@ def actions(served, *requests, adapter="base", index=0):
 def test_actions_are_those_of_the_policy(served):
     """With the noise of the server's key."""
     policy, sent = make_policy(), request(served.spec)
-    noise = jax.random.normal(
-        jax.random.fold_in(jax.random.key(0), 3),
-        (1, served.spec.chunk, policy.model.config.action_dim),
-    )
+    noise = noise_of(policy, served.spec, connection=2, request=3)
     raw = {"image": {k: v[None] for k, v in sent.images.items()}, "state": sent.state[None]}
     encoded = policy.processor.encode(raw, np.array([1]))
     slots = policy.processor.flow_slots
     chunk = policy.model.sample_actions(None, encoded, num_steps=2, noise=noise, slots=slots)
     expected = policy.processor.decode(chunk, raw["state"])
-    found = actions(served, sent, index=3)
+    found = actions(served, sent, index=(2, 3))
     assert found.shape == (1, 4, 7)
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
@@ -84,7 +86,8 @@ def test_everything_in_a_request_matters(served):
     first = actions(served, request(served.spec))
     changed = [
         actions(served, request(served.spec, prompt="lift the lid")),
-        actions(served, request(served.spec), index=1),
+        actions(served, request(served.spec), index=(0, 1)),
+        actions(served, request(served.spec), index=(1, 0)),
         actions(served, request(served.spec), adapter="other"),
         actions(served, request(served.spec, absent=["wrist"])),
     ]
@@ -110,10 +113,7 @@ def test_a_chunk_continues_what_remains_of_the_previous_one(continuing):
             "image": {k: v[None] for k, v in sent[i].images.items()},
             "state": sent[i].state[None],
         }
-        noise = jax.random.normal(
-            jax.random.fold_in(jax.random.key(0), 0),
-            (1, spec.chunk, policy.model.config.action_dim),
-        )
+        noise = noise_of(policy, spec)
         chunk = policy.model.sample_actions(
             None,
             policy.processor.encode(raw, np.array([1])),
@@ -142,20 +142,20 @@ def test_programs_are_shared_and_compiled_in_advance():
     fresh.warm_up(lambda *step: progress.append(step))
     assert progress == [("base", 1), ("base", 2), ("other", 1), ("other", 2)]
     assert fresh._sample._cache_size() == earlier + 2
-    actions(fresh, request(fresh.spec, prompt="open the pot"), adapter="other", index=7)
+    actions(fresh, request(fresh.spec, prompt="open the pot"), adapter="other", index=(7, 7))
     assert fresh._sample._cache_size() == earlier + 2
 
 
 def test_prompts(served):
     with pytest.raises(ValueError, match="the request must contain a prompt"):
-        served.prepare(request(served.spec, prompt=None), 0)
+        served.prepare(request(served.spec, prompt=None), (0, 0))
     with pytest.raises(ValueError, match="offline tokenizer supports only ASCII"):
-        served.prepare(request(served.spec, prompt="鼠"), 0)
+        served.prepare(request(served.spec, prompt="鼠"), (0, 0))
     single = compiled({"base": make_policy(instructions=("open the pot",))})
     default = compiled({"base": make_policy()}, prompt="open the pot")
-    expected = served.prepare(request(served.spec, prompt="open the pot"), 0).ids
+    expected = served.prepare(request(served.spec, prompt="open the pot"), (0, 0)).ids
     for policies in (single, default):
-        found = policies.prepare(request(served.spec, prompt=None), 0).ids
+        found = policies.prepare(request(served.spec, prompt=None), (0, 0)).ids
         np.testing.assert_array_equal(found, expected)
 
 
