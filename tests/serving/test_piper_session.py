@@ -268,6 +268,27 @@ def test_a_chunk_with_nan_is_refused_and_the_arm_goes_to_rest(bench):
     assert_holds(run, "actions must be finite")
 
 
+def test_chunks_too_short_for_the_settings_are_an_error_before_the_arm_moves(bench, tmp_path):
+    settings, start = {"execute": 5, "ahead": 3}, bench.world.pose
+    sentence = "execute 5 and ahead 3 need chunks of at least 8 actions, got 7"
+    with contextlib.closing(Log(tmp_path)) as log:
+        run = Run(bench, Turning(7), settings=settings, log=log, latency=0.2)
+        with pytest.raises(ValueError, match=f"^{sentence}$"):
+            run(1.0)
+    bench.wait(0.5)
+    np.testing.assert_allclose(bench.world.pose, start, atol=2e-3)
+    assert sentence in (tmp_path / "log.jsonl").read_text()
+    assert_safe(run)
+
+
+def test_a_later_chunk_that_is_too_short_is_refused_and_the_arm_goes_to_rest(bench):
+    run = Run(bench, ask := Turning(8), settings={"execute": 5, "ahead": 3})
+    run.at = {0.3: lambda: setattr(ask, "change", lambda actions: actions[:7])}
+    assert "need chunks of at least 8 actions, got 7" in run(30.0)
+    assert run.said[1:] == ["moving slowly to the rest pose"]
+    assert_holds(run, "at least 8 actions")
+
+
 def test_targets_beyond_the_limits_are_clamped(bench):
     ask = Turning()
     ask.change = lambda actions: actions + np.array([0, 0, 0, 0, 0, 0, 0.5])

@@ -135,6 +135,10 @@ class Session:
 
         Returns:
             The problem in a sentence, or None.
+
+        Raises:
+            ValueError: the first chunk has fewer actions than the settings need; the arm has not
+                moved.
         """
         self._governor.start(self._arm.read().pose)
         self._next = start = self._clock.now()
@@ -215,6 +219,7 @@ class Session:
         if self._asked is None or (actions := self._asker.answer()) is None:
             return
         settings, chunk = self._settings, check_chunk(actions)
+        self._check_length(chunk, now)
         own = chunk[: settings.execute + settings.ahead]
         if self._path is None:
             self._path = Path(self._governor.pose.copy(), own, settings.control_dt)
@@ -224,6 +229,18 @@ class Session:
         self._asked = None
         self.chunks += 1
         self._write(now, chunk=chunk)
+
+    def _check_length(self, chunk: np.ndarray, now: float) -> None:
+        """Refuse a chunk that is too short; ValueError if it is the first, as no arm moves yet."""
+        execute, ahead = self._settings.execute, self._settings.ahead
+        if len(chunk) >= execute + ahead:
+            return
+        needed = f"need chunks of at least {execute + ahead} actions, got {len(chunk)}"
+        problem = f"execute {execute} and ahead {ahead} {needed}"
+        if self.chunks:
+            raise Unsafe(problem)
+        self._write(now, problem=problem)
+        raise ValueError(problem)
 
     def _switch(self, chunk: np.ndarray, now: float) -> None:
         """Let a new chunk take over where the present action ends, as in the simulation.
