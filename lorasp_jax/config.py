@@ -55,8 +55,8 @@ class ModelConfig:
     """Storage dtype of the base parameters; adapters are always float32."""
     base_dtype: Literal["", "float8", "int8", "nf4"] = ""
     """Quantize the matrices of the three towers: 8 bits per weight (float8, int8) or 4.5 (nf4). On
-    NVIDIA GPUs since Ada and Hopper, large matrix products are then in float8 too, which is faster.
-    Empty: keep them in param_dtype."""
+    NVIDIA GPUs since Ada and Hopper, large matrix products are then in float8 too. Empty: keep
+    them in param_dtype."""
     relative_actions: bool = False
     """Learn joint targets relative to the state at the start of the chunk, as openpi does for
     pi0."""

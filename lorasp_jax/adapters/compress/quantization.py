@@ -6,7 +6,7 @@ Kernels of dense layers and einsums (flattened to matrices) are quantized to 8 o
 weight. Adapters, biases, norms, embeddings and convolutions are unchanged. Gradients still flow to
 x and the adapters, and adapters can still be attached, saved and combined. `merge` dequantizes the
 kernel of each adapted layer before adding the delta. With "float8", NVIDIA GPUs since Ada and
-Hopper also multiply large matrices in float8, which is faster; all other kinds only save memory.
+Hopper also multiply large matrices in float8; all other kinds only save memory.
 
 Adapters that split a kernel (PiSSA, OLoRA) must be attached before quantization, which then
 quantizes the residual.
