@@ -9,7 +9,7 @@ from jax.ad_checkpoint import checkpoint_name
 _EXPENSIVE_TO_RECOMPUTE = ("dot_product_attention_fwd_wrapper", "custom_vmap_call")
 """Primitives of cuDNN attention and of kernels on sharded rows (`row_sharding`), which are
 `short_attention` and the adapters' fused kernel."""
-_SAVED, _SAVED_IF_WIDE = "saved", "saved unless narrow"
+_SAVED, _SAVED_WIDE = "saved", "saved, wide"
 WIDE = 2
 """A product is wide if it has more than this many times the columns of its input."""
 
@@ -20,19 +20,19 @@ def save_for_backward(x: jax.Array, columns: int | None = None) -> jax.Array:
     `columns` are those of the input that x is a product of, if it is one.
     """
     is_wide = columns is not None and x.shape[-1] > WIDE * columns
-    return checkpoint_name(x, _SAVED_IF_WIDE if is_wide else _SAVED)
+    return checkpoint_name(x, _SAVED_WIDE if is_wide else _SAVED)
 
 
 def save_products(primitive: Any, *shapes: Any, **params: Any) -> Any:
     """Save matmuls without batch axes, expensive primitives and values marked for saving."""
-    if primitive.name in _EXPENSIVE_TO_RECOMPUTE or params.get("name") in (_SAVED, _SAVED_IF_WIDE):
+    if primitive.name in _EXPENSIVE_TO_RECOMPUTE or params.get("name") in (_SAVED, _SAVED_WIDE):
         return True
     return jax.checkpoint_policies.dots_with_no_batch_dims_saveable(primitive, *shapes, **params)
 
 
 def save_narrow_products(primitive: Any, *shapes: Any, **params: Any) -> Any:
     """Save what `save_products` saves, except wide products."""
-    if params.get("name") == _SAVED_IF_WIDE:
+    if params.get("name") == _SAVED_WIDE:
         return False
     if primitive is jax.lax.dot_general_p:
         x, kernel = shapes

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,14 @@ def map_threads(function: Callable, *arguments: Iterable[Any]) -> list[Any]:
         return list(pool.map(function, *arguments))
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
+
+
+def in_thread(function: Callable, *arguments: Any) -> Future[Any]:
+    """Call `function` in a new thread and return its future."""
+    pool = ThreadPoolExecutor(1)
+    future = pool.submit(function, *arguments)
+    pool.shutdown(wait=False)
+    return future
 
 
 def _load_or_collect(

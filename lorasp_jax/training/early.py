@@ -23,9 +23,17 @@ from lorasp_jax.training.step import init_state
 from lorasp_jax.training.windows import DrawnWindows
 
 
-def compile_training(run: Run, built: setup.RunSetup) -> Any:
-    """Compile the program that `loop.train` calls first; JAX's cache on disk keeps it."""
-    _, batches = data_shapes(run, built)
+def compile_training(run: Run, built: setup.RunSetup) -> None:
+    """Compile the program that `loop.train` calls first; JAX's cache on disk keeps it.
+
+    A dataset is left alone, because another thread may be reading it.
+    """
+    if built.source is None:
+        compile_steps(run, built, data_shapes(run, built)[1])
+
+
+def compile_steps(run: Run, built: setup.RunSetup, batches: Any) -> Any:
+    """Compile the training program for batches of these shapes, from `data_shapes`."""
     with messages.announce("the training step"):
         lowered = _lower(run, built, batches)
         return lowered.compile(compiler_options=fast_cpu.without_simulation())

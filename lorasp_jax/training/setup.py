@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -38,7 +37,7 @@ from lorasp_jax.storage import hub
 from lorasp_jax.training.base import base_model, quantized, with_config
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.dataset import as_cache, is_simulated, open_dataset, outline
-from lorasp_jax.training.demonstrations import Progress, demonstrations
+from lorasp_jax.training.demonstrations import Progress, demonstrations, in_thread
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.random_streams import RandomStream
@@ -181,9 +180,7 @@ def prepare(
 @contextlib.contextmanager
 def _in_threads(functions: Sequence[Meanwhile], run: Run, built: RunSetup) -> Iterator[None]:
     """Run functions during this block and wait for them, unless it raises."""
-    pool = ThreadPoolExecutor()
-    futures = [pool.submit(function, run, built) for function in functions]
-    pool.shutdown(wait=False)
+    futures = [in_thread(function, run, built) for function in functions]
     yield
     for future in futures:
         future.result()

@@ -5,7 +5,7 @@ The data is on the device, streamed from disk, or replaced by newly collected de
 
 import functools
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from typing import Any
 
 import jax
@@ -19,6 +19,7 @@ from lorasp_jax.data.checked_images import load_images
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.training.cost import flops, preflight
 from lorasp_jax.training.cost.speed import Speed
+from lorasp_jax.training.demonstrations import in_thread
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.run import Run
@@ -52,7 +53,7 @@ class Stepper:
         """Start compiling the calls that run `count` steps in a background thread, once."""
         size = self._windows.call_size(count)
         if size not in self._compiled:
-            self._compiled[size] = _in_thread(self._compile, state, size)
+            self._compiled[size] = in_thread(self._compile, state, size)
         return self._compiled[size]
 
     def _compile(self, state: TrainState, size: int) -> Any:
@@ -137,7 +138,7 @@ class RefreshingStepper(Stepper):
     def _collect_next(self) -> None:
         """Start collecting the next generation in a thread, if a step will use it."""
         if self._generation_of(self._last) > self._generation:
-            self._next = _in_thread(self._collect, self._generation + 1)
+            self._next = in_thread(self._collect, self._generation + 1)
 
 
 def make_stepper(
@@ -172,14 +173,6 @@ def make_stepper(
     if run.config.data.fresh_every:
         return RefreshingStepper(jitted, frozen, windows, speed, run.config, generation, start)
     return Stepper(jitted, frozen, windows(generation(0)), speed)
-
-
-def _in_thread(function: Callable, *arguments: Any) -> Future[Any]:
-    """Call `function` in a new thread and return its future."""
-    pool = ThreadPoolExecutor(1)
-    future = pool.submit(function, *arguments)
-    pool.shutdown(wait=False)
-    return future
 
 
 def _batches(run: Run, mesh: jax.sharding.Mesh, start: int) -> Iterator[Raw]:

@@ -38,7 +38,7 @@ def dry_run(
     console.print(_parameter_table(built.model))
     run = Run(config, folder, console, built.base_hash)
     held, batches = early.data_shapes(run, built)
-    compiled = early.compile_training(run, built)
+    compiled = early.compile_steps(run, built, batches)
     console.print(_memory_table(built, held, batches, compiled.memory_analysis()))
     step_flops = preflight.step_flops(config, built.base.config)
     console.print(
