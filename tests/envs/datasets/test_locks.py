@@ -51,12 +51,17 @@ def test_one_process_at_a_time(path):
 
 def test_never_two_at_a_time(path):
     """Some wait for a lock file that is deleted meanwhile, others create a new one."""
-    inside, turns, calls = [], [], []
+    inside, turns, calls, waited = [], [], [], threading.Event()
+
+    def wait(number, turn):
+        calls.append((number, turn))
+        waited.set()
 
     def work(number):
         for turn in range(20):
-            with locks.locked(path, lambda: calls.append((number, turn))):  # noqa: B023
+            with locks.locked(path, lambda: wait(number, turn)):  # noqa: B023
                 inside.append(number)
+                assert waited.wait(60)  # the first holder keeps the lock until another waits
                 time.sleep(0.0005)
                 assert inside == [number]
                 turns.append((number, turn))
@@ -66,7 +71,7 @@ def test_never_two_at_a_time(path):
         for one in [pool.submit(work, number) for number in range(8)]:
             one.result()
     assert len(turns) == 8 * 20
-    assert len(calls) == len(set(calls)) > 0  # called once each, however often it must wait
+    assert len(calls) == len(set(calls))  # called once each, however often it must wait
     assert not os.listdir(path.parent)
 
 
