@@ -59,7 +59,7 @@ def serving(policy, **options):
 
     thread = threading.Thread(target=lambda: loop.run_until_complete(run()), daemon=True)
     thread.start()
-    assert started.wait(10)
+    assert started.wait(60)
     server.port = port.getsockname()[1]
     scheme = "wss" if "tls" in listen else "ws"
     server.address = f"{scheme}://127.0.0.1:{server.port}"
@@ -67,7 +67,7 @@ def serving(policy, **options):
         yield server
     finally:
         loop.call_soon_threadsafe(stop.set)
-        thread.join(10)
+        thread.join(60)
         getattr(policy, "gate", threading.Event()).set()
         server.close()
         loop.run_until_complete(loop.shutdown_default_executor())

@@ -79,9 +79,13 @@ def test_an_interrupted_call_closes_the_connection():
     policy = StandIn()
     with serving(policy) as server, connect(server) as client:
         policy.gate.clear()
-        main = threading.main_thread().ident
-        timer = threading.Timer(0.2, signal.pthread_kill, [main, signal.SIGINT])
-        timer.start()
+
+        def interrupt():
+            while not policy.batches:  # the call waits for its reply
+                time.sleep(0.001)
+            signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+
+        threading.Thread(target=interrupt, daemon=True).start()
         with pytest.raises(KeyboardInterrupt):
             client.infer(observation())
         policy.gate.set()

@@ -176,5 +176,5 @@ def test_serving_a_run_until_an_interrupt(run):
             )
             assert reply["actions"].shape == (4, 7)
         process.send_signal(signal.SIGINT)
-        assert process.wait(20) == 0
+        assert process.wait(60) == 0
         assert process.stdout.read() == "closing connections\n"

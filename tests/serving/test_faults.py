@@ -50,7 +50,7 @@ def exchange(server, frame):
     with raw_connect(server.address, compression=None) as connection:
         connection.recv()
         connection.send(frame)
-        return connection.recv(timeout=10)
+        return connection.recv(timeout=60)
 
 
 def check_malformed(number):
@@ -105,25 +105,31 @@ def test_bytes_that_are_no_websocket():
 def test_a_slow_client_does_not_delay_others():
     """One has sent half a request, another does not read its replies."""
     lazily = {"max_queue": 1, "close_timeout": 0.1}
-    with serving(StandIn()) as server, raw_connect(server.address, **lazily) as lazy:
-        fragments = iter([wire.pack(observation())[:100]])
-        with raw_connect(server.address) as half:
+    begun, over = threading.Event(), threading.Event()
 
-            def send():
-                yield next(fragments)
-                time.sleep(1.5)
-                yield b"more"
+    def send():
+        yield wire.pack(observation())[:100]
+        begun.set()
+        over.wait(60)
+        yield b"more"
 
-            thread = threading.Thread(target=half.send, args=[send()])
-            thread.start()
+    with (
+        serving(StandIn()) as server,
+        raw_connect(server.address, **lazily) as lazy,
+        raw_connect(server.address) as half,
+    ):
+        thread = threading.Thread(target=half.send, args=[send()])
+        thread.start()
+        for _ in range(20):
+            lazy.send(wire.pack(observation()))
+        assert begun.wait(60)
+        with connect(server) as client:
+            start = time.perf_counter()
             for _ in range(20):
-                lazy.send(wire.pack(observation()))
-            with connect(server) as client:
-                start = time.perf_counter()
-                for _ in range(20):
-                    client.infer(observation())
-                assert time.perf_counter() - start < 1
-            thread.join()
+                client.infer(observation())
+            assert time.perf_counter() - start < 10  # s, on the slowest machine
+        over.set()
+        thread.join()
 
 
 def test_a_client_that_dies_during_inference():
@@ -138,7 +144,7 @@ def test_a_client_that_dies_during_inference():
             dying.socket.shutdown(socket.SHUT_RDWR)
         policy.gate.set()
         np.testing.assert_array_equal(survivor.infer(observation())["actions"][0], np.arange(7))
-        deadline = time.monotonic() + 5
+        deadline = time.monotonic() + 60
         while server.metrics["open_connections"] > 1 and time.monotonic() < deadline:
             time.sleep(0.01)
         assert server.metrics["open_connections"] == 1
@@ -181,10 +187,9 @@ def test_a_server_killed_in_mid_chunk():
         with PolicyClient(f"ws://127.0.0.1:{port}") as client:
             timer = threading.Timer(0.3, process.send_signal, [signal.SIGKILL])
             timer.start()
-            start = time.perf_counter()
+            # At once, as another sentence would tell of a reply that does not come in time.
             with pytest.raises(ServerGone, match=r"^ws://127.0.0.1:\d+ closed the connection$"):
                 client.infer(observation())
-            assert time.perf_counter() - start < 2
             timer.join()
 
 

@@ -21,7 +21,8 @@ def film(tmp_path):
 def test_the_newest_picture_counts(film, monkeypatch):
     monkeypatch.setattr(cameras, "MAX_AGE", 60.0)
     opened = OpenCameras({"side": film, "wrist": film})
-    time.sleep(0.3)
+    for camera in opened._cameras.values():
+        camera._thread.join(60)  # until the last picture
     images = opened.read()
     assert {name: (x.shape, x.dtype) for name, x in images.items()} == {
         "side": ((48, 64, 3), np.uint8),
@@ -34,7 +35,8 @@ def test_the_newest_picture_counts(film, monkeypatch):
 def test_a_source_that_stops_is_stale(film, monkeypatch):
     monkeypatch.setattr(cameras, "MAX_AGE", 0.1)
     camera = Camera("wrist", film)
-    time.sleep(0.3)
+    camera._thread.join(60)  # until the last picture
+    time.sleep(0.2)
     with pytest.raises(NoPicture, match="camera wrist shows nothing new"):
         camera.read()
     camera.close()

@@ -14,7 +14,7 @@ from lorasp_jax.serving.fake_piper.__main__ import main as fake
 from lorasp_jax.serving.fake_piper.firmware import FakePiper
 from lorasp_jax.serving.fake_piper.timing import RealTime
 from lorasp_jax.serving.fake_piper.world import World
-from lorasp_jax.serving.piper import options
+from lorasp_jax.serving.piper import options, safety
 from lorasp_jax.serving.piper.__main__ import HELD
 from lorasp_jax.serving.piper.__main__ import main as real
 from lorasp_jax.serving.piper.arm import PiperArm
@@ -65,6 +65,7 @@ def test_the_expert_on_the_fake_arm(tmp_path, capsys):
 def test_a_served_policy_on_the_fake_arm(server, tmp_path, capsys, monkeypatch, more):
     short = dataclasses.replace(press.TASK, time_limit=1.0)
     monkeypatch.setattr(press, "TASK", short)
+    monkeypatch.setattr(safety, "MAX_AGE", 60.0)  # a busy machine pauses the arm's thread
     words = ["--server", server.address, "--log", str(tmp_path / "log"), *more]
     assert fake([*words, "--latency", "0.1", "--thinking", "0.1"]) == 0
     assert "episode 0: failure\n" in capsys.readouterr().out
@@ -145,12 +146,13 @@ class LinkedArm(PiperArm):
 def linked(monkeypatch, film):
     monkeypatch.setattr("lorasp_jax.serving.piper.__main__.PiperArm", LinkedArm)
     monkeypatch.setattr("lorasp_jax.serving.piper.cameras.MAX_AGE", 60.0)
+    monkeypatch.setattr(safety, "MAX_AGE", 60.0)  # a busy machine pauses the arm's thread
     return ["--camera", f"side={film}", "--camera", f"wrist={film}", "--task", "press"]
 
 
 def test_the_real_command_with_an_arm_on_the_bus(server, linked, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("builtins.input", lambda question: "y")
-    words = ["--server", server.address, *linked, "--seconds", "1"]
+    words = ["--server", server.address, *linked, "--seconds", "3"]
     words += ["--log", str(tmp_path / "log"), "--record", str(tmp_path / "data")]
     assert real([*words, "--image-size", "16"]) == 0, capsys.readouterr()
     assert "1 episodes recorded" in capsys.readouterr().out
