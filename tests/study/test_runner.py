@@ -90,12 +90,13 @@ def test_several_workers_run_every_cell_once(folder):
 
 
 def test_workers_share_a_group_that_others_wait_for(folder):
-    both = threading.Barrier(2, timeout=20)
+    both = threading.Barrier(2, timeout=60)
 
     def meet(job):
+        result = run(job)
         if job.cell.name.startswith("sp/"):
-            both.wait()
-        return run(job)
+            both.wait()  # afterwards, as a worker could go on before the other has noted its run
+        return result
 
     threads = [
         threading.Thread(target=work, args=(folder,), kwargs={"run_cell": meet}) for _ in range(2)

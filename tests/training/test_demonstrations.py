@@ -56,7 +56,7 @@ def test_a_cache_with_another_control_period_is_rejected(tmp_path):
 
 
 def test_map_threads_keeps_order_and_does_not_wait_after_an_error():
-    barrier = threading.Barrier(2, timeout=20)
+    barrier = threading.Barrier(2, timeout=60)
 
     def meet(number):
         barrier.wait()  # passes only if both run at the same time

@@ -59,7 +59,8 @@ def saved_digest(folder, step):
 
 def kill(folder, steps, rng):
     """Start or resume, then kill -9 during startup, restoring, training or saving."""
-    with start_worker(folder, steps=steps, mesh=1) as process:
+    # A fast machine could otherwise finish before the kill.
+    with start_worker(folder, steps=steps, mesh=1, hangs=STEPS - 1) as process:
         wait_for(process, "started")
         for _ in range(rng.choice((0, 3, 4, 5))):
             wait_for(process, "step")

@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import itertools
 import os
 import signal
 from pathlib import Path
@@ -15,6 +16,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--steps", type=int, default=12)
     parser.add_argument("--until", type=int, help="step at which to raise a signal")
     parser.add_argument("--fails", type=int, help="step at which to raise an uncaught error")
+    parser.add_argument("--hangs", type=int, help="number of steps until it waits to be killed")
     parser.add_argument("--devices", type=int, default=8, help="number of devices")
     parser.add_argument("--mesh", type=int, help="number of devices to use; default: all")
     return parser.parse_args()
@@ -36,7 +38,7 @@ def main(args: argparse.Namespace) -> None:
     if "JAX_PROCESS_ID" in os.environ:
         processes.initialize(Console(), "add --resume")
 
-    work(args.folder, args.steps, args.until, args.fails, args.mesh)
+    work(args.folder, args.steps, args.until, args.fails, args.mesh, args.hangs)
 
 
 def prepare(folder: Path, steps: int, devices: int | None = None):
@@ -60,17 +62,22 @@ def work(
     until: int | None = None,
     fails: int | None = None,
     devices: int | None = None,
+    hangs: int | None = None,
 ):
     """Start or resume the run; return it if it finishes."""
     from lorasp_jax.training.interrupt import sigterm_as_interrupt
     from lorasp_jax.training.loop import train
     from lorasp_jax.training.run import Callback
 
+    count = itertools.count(1)
+
     class PrintStep(Callback):
         def on_log(self, run, step, metrics):
             print("step", step, flush=True)
             if step == fails:
                 raise RuntimeError("nobody catches this")
+            if next(count) == hangs:
+                signal.pause()
             if step == until:
                 signal.raise_signal(signal.SIGTERM)
 

@@ -65,7 +65,7 @@ def test_an_entry_is_waited_for(cache):
         waiting = another.submit(cache.get, "key")
         cache.put("key", b"value")
         turns.end()
-        assert waiting.result(10) == b"value"
+        assert waiting.result(60) == b"value"
 
 
 def test_the_next_program_ends_the_wait_for_one_that_is_not_kept(cache):
@@ -73,7 +73,7 @@ def test_the_next_program_ends_the_wait_for_one_that_is_not_kept(cache):
     with ThreadPoolExecutor(1) as another:
         waiting = another.submit(cache.get, "key")
         assert cache.get("next") is None
-        assert waiting.result(10) is None
+        assert waiting.result(60) is None
     turns.end()
 
 

@@ -3,7 +3,6 @@
 import subprocess
 import sys
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import filelock
@@ -34,22 +33,38 @@ def another():
         executor.submit(turns.end)
 
 
-def test_others_wait_for_the_end_of_a_claim(file, another):
+@pytest.fixture
+def found_claimed(monkeypatch):
+    """An event: a thread has found a program claimed, and waits."""
+    event, acquire = threading.Event(), turns.acquire
+
+    def noticed(file):
+        try:
+            return acquire(file)
+        except filelock.Timeout:
+            event.set()
+            raise
+
+    monkeypatch.setattr(turns, "acquire", noticed)
+    return event
+
+
+def test_others_wait_for_the_end_of_a_claim(file, another, found_claimed):
     turns.take(file)
     waiting = another.submit(turns.take, file)
-    time.sleep(0.5)
+    assert found_claimed.wait(60)
     assert not waiting.done()
     turns.end()
-    waiting.result(10)
+    waiting.result(60)
     assert not file.exists()
 
 
-def test_whoever_has_waited_keeps_nobody_waiting(file, another):
+def test_whoever_has_waited_keeps_nobody_waiting(file, another, found_claimed):
     turns.take(file)
     waiting = another.submit(turns.take, file)
-    time.sleep(0.5)
+    assert found_claimed.wait(60)
     turns.end()
-    waiting.result(10)
+    waiting.result(60)
     with filelock.FileLock(file, timeout=0):
         pass
 
@@ -57,7 +72,7 @@ def test_whoever_has_waited_keeps_nobody_waiting(file, another):
 def test_a_thread_has_one_claim(file, another):
     turns.take(file)
     turns.take(file.with_name("next-lock"))
-    another.submit(turns.take, file).result(10)
+    another.submit(turns.take, file).result(60)
     assert file.exists()
     turns.end()
     assert not file.with_name("next-lock").exists()
@@ -76,26 +91,26 @@ def test_opposite_orders_do_not_block(tmp_path):
 
     with ThreadPoolExecutor(2) as pool:
         for future in [pool.submit(compile_all, order) for order in (files, files[::-1])]:
-            future.result(30)
+            future.result(60)
 
 
-def test_a_killed_process_keeps_nobody_waiting(file, another):
+def test_a_killed_process_keeps_nobody_waiting(file, another, found_claimed):
     arguments = [sys.executable, "-c", CLAIM, file]
     child = subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     with child:
         assert child.stdout
         assert child.stdout.readline() == b"claimed\n"
         waiting = another.submit(turns.take, file)
-        time.sleep(0.5)
+        assert found_claimed.wait(60)
         assert not waiting.done()
         child.kill()
-        waiting.result(10)
+        waiting.result(60)
 
 
 def test_patience_has_an_end(file, another, monkeypatch):
     monkeypatch.setattr(turns, "PATIENCE", 0.1)
     turns.take(file)
-    another.submit(turns.take, file).result(10)
+    another.submit(turns.take, file).result(60)
     assert file.exists()  # still claimed
     turns.end()
 

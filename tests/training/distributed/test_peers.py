@@ -5,7 +5,6 @@ import queue
 import re
 import socket
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import ClassVar
 
@@ -40,12 +39,11 @@ class Process(peers.Peers):
 
     def exited(self):
         """The exit code and the printed reason."""
-        return self.exits.get(timeout=10)
+        return self.exits.get(timeout=60)
 
 
 @pytest.fixture(autouse=True)
-def _short_timeouts(monkeypatch):
-    monkeypatch.setattr(rendezvous, "JOIN_TIMEOUT", 1.0)
+def _short_grace(monkeypatch):
     monkeypatch.setattr(rendezvous, "EXIT_GRACE", 0.2)
     yield
     while Process.created:
@@ -87,7 +85,13 @@ def test_long_lists_of_differences_are_truncated():
     assert " and 4 more): use" in agree(connect(), *facts)[0]
 
 
-def test_missing_processes_are_listed():
+@pytest.fixture
+def impatient(monkeypatch):
+    """Give up after two seconds; where all processes join, they have as long as they need."""
+    monkeypatch.setattr(rendezvous, "JOIN_TIMEOUT", 2.0)
+
+
+def test_missing_processes_are_listed(impatient):
     first, third = connect((0, 2), count=4)
     reasons = agree([first, third], {}, {})
     assert "2 of 4 processes joined at 127.0.0.1:" in reasons[0]
@@ -165,9 +169,16 @@ def test_the_first_process_reports_the_error_of_another():
 
 def test_the_first_process_reports_its_own_error(monkeypatch):
     monkeypatch.setattr(rendezvous, "EXIT_GRACE", 2.0)
+    receive, received = Rendezvous._receive, threading.Event()
+
+    def noticed(*arguments):
+        receive(*arguments)
+        received.set()
+
+    monkeypatch.setattr(Rendezvous, "_receive", noticed)
     first, second, third = connect((0, 1, 2))
     announce_exit(first, 2, "error: the folder holds a run")
-    time.sleep(0.3)  # the first reason received counts
+    assert received.wait(60)  # the first reason received counts
     announce_exit(third, 130, "stopped")
     assert [one.exited() for one in (second, third, first)] == [(2, ""), (130, ""), (2, "")]
 
@@ -198,7 +209,7 @@ def test_a_port_in_use_is_reported():
         peers.listen(address)
 
 
-def test_an_unreachable_address_is_reported():
+def test_an_unreachable_address_is_reported(impatient):
     printed = []
     with pytest.raises(
         ValueError, match=r"process 1 could not reach the first process at .*refused\)"

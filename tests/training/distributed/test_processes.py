@@ -59,8 +59,8 @@ def test_when_one_is_killed_the_last_line_of_the_other_mentions_resume(number, t
     killed, other = children[number], children[1 - number]
     killed.kill()
     start_time = time.monotonic()
-    last = other.communicate(timeout=60)[0].splitlines()[-1]
-    assert time.monotonic() - start_time < 20
+    last = other.communicate(timeout=120)[0].splitlines()[-1]
+    assert time.monotonic() - start_time < 60  # JAX would need 100 s
     assert other.returncode == 1
     assert "disconnected unexpectedly: it was killed" in last
     assert last.endswith("add --resume")
@@ -77,8 +77,8 @@ def test_an_error_in_one_ends_the_other_in_seconds(number, tmp_path):
     failed, other = children[number], children[1 - number]
     failed_errors = failed.communicate(timeout=400)[1]
     start_time = time.monotonic()
-    other_errors = other.communicate(timeout=60)[1]
-    assert time.monotonic() - start_time < 30  # 8 s on an idle machine
+    other_errors = other.communicate(timeout=120)[1]
+    assert time.monotonic() - start_time < 60  # 8 s on an idle machine; JAX would need 100 s
     assert [child.returncode for child in children] == [1, 1]
     assert failed_errors.endswith("RuntimeError: nobody catches this\n")
     lines = [line for line in other_errors.splitlines() if not line.startswith("compil")]
