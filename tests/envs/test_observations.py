@@ -52,12 +52,12 @@ def test_poses_and_speeds(scene):
     data = expert_in_c.world(scene)
     data.qvel[:] = np.random.default_rng(0).normal(0, 0.5, scene.model.nv)
     before, tcp = seen(scene, data), data.site("tcp").xpos.copy()
-    np.testing.assert_allclose(before["tool"][:3], tcp, atol=1e-6)
-    np.testing.assert_allclose(axes(before["tool"]).ravel(), data.site("tcp").xmat, atol=1e-6)
+    np.testing.assert_allclose(before["tool"][:3], tcp, atol=5e-6)
+    np.testing.assert_allclose(axes(before["tool"]).ravel(), data.site("tcp").xmat, atol=5e-6)
     poses = {n: data.body(n).xpos - tcp for n in scene.task.place(jax.random.key(0))}
     for name, position in poses.items():
-        np.testing.assert_allclose(before[name][:3], position, atol=1e-6)
-        np.testing.assert_allclose(axes(before[name]).ravel(), data.body(name).xmat, atol=1e-6)
+        np.testing.assert_allclose(before[name][:3], position, atol=5e-6)
+        np.testing.assert_allclose(axes(before[name]).ravel(), data.body(name).xmat, atol=5e-6)
     old = {name: (data.body(name).xpos.copy(), data.body(name).xmat.copy()) for name in poses}
     joints = data.qpos[: scene.num_joints].copy()
     mujoco.mj_integratePos(scene.model, data.qpos, data.qvel, _DT)

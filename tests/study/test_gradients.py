@@ -55,11 +55,11 @@ def test_cosines_by_tower_and_in_total(model):
     ]
     for (a, b), towers in found.items():
         x, y = np.array(TASKS[a]), np.array(TASKS[b])
-        assert towers["vision"] == pytest.approx(cosine(x, y), abs=1e-6)
-        assert towers["action"] == pytest.approx(cosine(x**2, y**2), abs=1e-6)
+        assert towers["vision"] == pytest.approx(cosine(x, y), abs=1e-5)
+        assert towers["action"] == pytest.approx(cosine(x**2, y**2), abs=1e-5)
         both = cosine(np.concatenate([x, x**2]), np.concatenate([y, y**2]))
-        assert towers["all"] == pytest.approx(both, abs=1e-6)
-    assert found["one", "three"]["vision"] == pytest.approx(-1)
+        assert towers["all"] == pytest.approx(both, abs=1e-5)
+    assert found["one", "three"]["vision"] == pytest.approx(-1, abs=1e-5)
 
 
 def test_batches_of_a_pair_are_independent_and_the_key_decides(model):
@@ -81,7 +81,7 @@ def test_the_mean_over_batches(model):
 
     found = gradients.gradient_cosines(model, {"one": record}, jax.random.key(0), 3)
     expected = np.mean([cosine(*seen[i : i + 2]) for i in (0, 2, 4)])
-    assert found["one", "one"]["vision"] == pytest.approx(expected, abs=1e-6)
+    assert found["one", "one"]["vision"] == pytest.approx(expected, abs=1e-5)
 
 
 def test_a_gradient_of_zero_has_no_direction(model):

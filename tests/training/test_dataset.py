@@ -78,8 +78,10 @@ def test_every_step_has_the_next_batch(tmp_path):
 
     batches = _batches(run, mesh, 0)
     each = [float(next(batches).state.sum() + 1) for _ in range(9)]
-    np.testing.assert_allclose(sums(0, 2, 4, 3), [sum(each[:2]), sum(each[2:6]), sum(each[6:])])
-    np.testing.assert_allclose(sums(5, 1, 3), [each[5], sum(each[6:])])
+    near = {"rtol": 1e-5, "atol": 1e-5}  # another program sums in another order
+    expected = [sum(each[:2]), sum(each[2:6]), sum(each[6:])]
+    np.testing.assert_allclose(sums(0, 2, 4, 3), expected, **near)
+    np.testing.assert_allclose(sums(5, 1, 3), [each[5], sum(each[6:])], **near)
     shards = next(batches).image["side"].addressable_shards
     assert [shard.data.shape[:2] for shard in shards] == [(1, 1)] * 8
 

@@ -36,9 +36,10 @@ def test_active_ranks_by_tower_and_by_layer():
         "active_rank/action/out",
     }
     first, second = (0 + 1 + 3) / 3, (6 + 7 + 9) / 3
-    np.testing.assert_allclose(found["active_rank/vision/fc1"], [first, second])
+    np.testing.assert_allclose(found["active_rank/vision/fc1"], [first, second], rtol=1e-6)
     np.testing.assert_allclose(found["active_rank/vision/fc2"], [3.5, 9.5])
-    np.testing.assert_allclose(found["active_rank/vision"], ((first + second) / 2 + 6.5) / 2)
+    mean = ((first + second) / 2 + 6.5) / 2
+    np.testing.assert_allclose(found["active_rank/vision"], mean, rtol=1e-6)
     np.testing.assert_allclose(found["active_rank/action/out"], [5.0])
 
 
@@ -136,7 +137,7 @@ def test_the_moving_average_is_updated_and_evaluated(small):
     updated = leaves(after.adapters)
     for name, old in leaves(adapters).items():
         expected = 0.75 * old + 0.25 * updated[name]
-        np.testing.assert_allclose(leaves(after.average)[name], expected, atol=1e-6)
+        np.testing.assert_allclose(leaves(after.average)[name], expected, atol=1e-5)
         assert (updated[name] != old).any()
     assert after.eval_adapters is after.average
     assert init_state(adapters, optimizer).eval_adapters is not None

@@ -67,7 +67,7 @@ def test_paper_router_repeats_a_softmax(x):
     """Each of four softmax values scores 32 directions. Scores are non-negative for any W2."""
     router = initial(LoRASP.paper())["router"]
     scores, logits = scores_of(router, x, "softmax")
-    np.testing.assert_allclose(scores, np.repeat(jax.nn.softmax(logits), 32, -1), rtol=1e-6)
+    np.testing.assert_allclose(scores, np.repeat(jax.nn.softmax(logits), 32, -1), rtol=1e-5)
     shifted, _ = scores_of(router | {"w2": router["w2"] - 0.3}, x, "softmax")
     assert shifted.min() == 0
 

@@ -50,7 +50,8 @@ def test_progress_needs_no_recompilation(granularity):
         constant = LoRASP(rank=8, hidden_width=4, energy_target=target, granularity=granularity)
         _, expected = constant.delta({k: params[k] for k in ("bank", "router")}, x)
         np.testing.assert_array_equal(aux.active_rank, expected.active_rank)
-        np.testing.assert_allclose(aux.losses["spectral"], expected.losses["spectral"], rtol=1e-5)
+        # It is a difference of two numbers close to 1.
+        np.testing.assert_allclose(aux.losses["spectral"], expected.losses["spectral"], atol=1e-5)
     assert run._cache_size() == 1
 
 

@@ -119,7 +119,8 @@ def test_foreign_connections_are_ignored():
     address = free_address()
     Rendezvous(peers.listen(address), address, 2, HINT)
     for content in (b"GET / HTTP/1.1\r\n\r\n", b"[1, 2]\n", b'{"process": "x"}\n', b"x" * 2**21):
-        with socket.create_connection(peers.split_address(address)) as foreign:
+        foreign = socket.create_connection(peers.split_address(address))
+        with foreign, contextlib.suppress(OSError):  # the server need not read all of it
             foreign.sendall(content)
     assert agree([Process(address, 0), Process(address, 1)], {}, {}) == [None, None]
 
