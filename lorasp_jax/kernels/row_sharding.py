@@ -35,6 +35,7 @@ def by_rows(kernel: Kernel, shared: Arrays, arrays: Arrays) -> tuple[Arrays, Arr
     """
     num_shared = len(shared)
 
+    @jax.jit  # traced once for both uses
     def flat(*operands: jax.Array) -> tuple[Arrays, Arrays]:
         return kernel(operands[:num_shared], operands[num_shared:])
 

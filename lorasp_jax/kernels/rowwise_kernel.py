@@ -125,6 +125,8 @@ def _forward(static: tuple, packed: PackedTree, rows: jax.Array, valid: jax.Arra
     return results, (packed, rows, valid, *mask)
 
 
+# jit traces and lowers a kernel once for all layers that need the same one.
+@functools.partial(jax.jit, static_argnums=0, static_argnames="keep_mask")
 def _run(
     static: tuple, packed: PackedTree, rows: jax.Array, valid: jax.Array, *, keep_mask: bool
 ) -> tuple[tuple, Sequence[jax.Array]]:
@@ -142,6 +144,7 @@ def _run(
     return (output, sums.tree(), others[:end]), others[end:]
 
 
+@functools.partial(jax.jit, static_argnums=0)
 def _backward(static: tuple, residuals: tuple, cotangents: tuple) -> tuple:
     function, widths, start, (_, launch), interpret = static
     packed, rows, valid, mask = residuals

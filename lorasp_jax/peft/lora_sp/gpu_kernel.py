@@ -5,6 +5,7 @@ Layers with a shared input run in one launch.
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -50,7 +51,7 @@ class FusedBottleneck(BatchedBottleneck):
         tokens, n = projected.shape[:-1], len(columns)
         valid = jnp.ones(tokens, bool) if token_mask is None else token_mask
         z, sums, statistics = rowwise_kernel(
-            functools.partial(bottleneck_block, energy_target=self.energy_target, scale=self.scale),
+            _block(self.energy_target, self.scale),
             params,
             projected.reshape(-1, projected.shape[-1]),
             (self.rank, self.hidden_width),
@@ -61,6 +62,12 @@ class FusedBottleneck(BatchedBottleneck):
         active_rank, energy = (column.T.reshape(n, *tokens) for column in statistics)
         aux = Aux(active_rank, energy, Losses(sums), usage=sums.kept)
         return z.reshape(*tokens, z.shape[-1]), aux
+
+
+@functools.cache
+def _block(energy_target: float, scale: float) -> Callable[..., tuple]:
+    """Return the same object for the same values, so that layers share traced kernels."""
+    return functools.partial(bottleneck_block, energy_target=energy_target, scale=scale)
 
 
 def bottleneck_block(

@@ -12,7 +12,7 @@ from lorasp_jax.kernels import rowwise_kernel
 from lorasp_jax.kernels.energy_gate import energy_gate
 from lorasp_jax.peft import EnergySchedule, LoRA, LoRASP
 from lorasp_jax.peft._shared_input import apply_shared_input
-from lorasp_jax.peft.lora_sp import bank, losses
+from lorasp_jax.peft.lora_sp import bank, gpu_kernel, losses
 from lorasp_jax.peft.lora_sp.gpu_kernel import FusedBottleneck
 from lorasp_jax.peft.lora_sp.router import router_scores
 from tests.jaxprs import primitives
@@ -165,6 +165,24 @@ def test_fused_kernel_equals_the_method(x, monkeypatch, masked, few, num_scores)
     for a, e in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
         error = np.asarray(a, float) - np.asarray(e, float)
         assert np.linalg.norm(error) <= 1e-5 * np.linalg.norm(e)
+
+
+def test_layers_trace_the_same_kernel_once(x, monkeypatch):
+    calls, block = [], gpu_kernel.bottleneck_block
+
+    def counted(*arguments, **options):
+        calls.append(None)
+        return block(*arguments, **options)
+
+    monkeypatch.setattr(gpu_kernel, "bottleneck_block", counted)
+
+    def traces(layers, energy_target):
+        method = WithFusedKernel(rank=32, hidden_width=16, energy_target=energy_target)
+        params, before = [initial(method, i) for i in range(layers)], len(calls)
+        jax.make_jaxpr(lambda x: [method.delta(p, x)[0] for p in params])(x)
+        return len(calls) - before
+
+    assert traces(3, 0.61) == traces(1, 0.62) > 0
 
 
 def test_layers_with_a_shared_input_share_a_kernel(x):
