@@ -104,13 +104,21 @@ def low_rank_matmul(
     params, widths = [layer.params for layer in layers], _widths(layers)
     if isinstance(methods, tuple):
         calls = zip(methods, params, _split(widths, projected), strict=True)
-        z_aux = [method.bottleneck(p, rows, token_mask) for method, p, rows in calls]
+        z_aux = [_bottleneck(method, p, rows, token_mask) for method, p, rows in calls]
     else:
         z_aux = methods.bottleneck_each(params, projected, widths, token_mask)
     return [
         (base_plus_low_rank(x, z, layer.kernel, layer.up), aux)
         for layer, (z, aux) in zip(layers, z_aux, strict=True)
     ]
+
+
+@functools.partial(jax.jit, static_argnums=0, inline=True)
+def _bottleneck(
+    method: Bottleneck, params: Any, rows: jax.Array, token_mask: jax.Array | None
+) -> tuple[jax.Array, Any]:
+    """Call f, traced once for all layers whose f has equal shapes."""
+    return method.bottleneck(params, rows, token_mask)
 
 
 def _forward(
@@ -126,7 +134,7 @@ def _forward(
     def inner(params: list[Any], projected: jax.Array) -> list[tuple[jax.Array, Any]]:
         if isinstance(methods, tuple):
             calls = zip(methods, params, _split(widths, projected), strict=True)
-            z_aux = [method.bottleneck(p, rows, token_mask) for method, p, rows in calls]
+            z_aux = [_bottleneck(method, p, rows, token_mask) for method, p, rows in calls]
         else:
             z_aux = methods.bottleneck_each(params, projected, widths, token_mask)
         return [(z.astype(x.dtype), aux) for z, aux in z_aux]

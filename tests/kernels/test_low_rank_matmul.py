@@ -209,3 +209,31 @@ def test_equal_layers_are_traced_once():
         jax.jit(jax.grad(loss), static_argnums=2).lower(params, x, depth)
         num_traces.append(len(calls))
     assert num_traces[0] == num_traces[1]
+
+
+def test_layers_of_other_shapes_share_the_traced_bottleneck():
+    calls = []
+
+    def counting(params, rows, token_mask):
+        calls.append(rows.shape)
+        return inner(params, rows, token_mask)
+
+    methods = (Method(counting),)
+
+    def loss(params, shapes):
+        total = 0.0
+        for shape in shapes:
+            _, x, *rest = inputs(*shape)
+            ((y, aux),) = low_rank_matmul(methods, x.dtype, [LowRankLayer(params, *rest)], x, MASK)
+            total += y.sum() + aux["loss"]
+        return total
+
+    num_traces = []
+    for shapes in (SHAPES[:1], SHAPES):
+        jax.clear_caches()
+        calls.clear()
+        jax.make_jaxpr(lambda params, shapes=shapes: jax.grad(loss)(params, shapes))(
+            inputs(1, 1)[0]
+        )
+        num_traces.append(len(calls))
+    assert num_traces[0] == num_traces[1] > 0
