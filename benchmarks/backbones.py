@@ -96,12 +96,20 @@ class Step:
         config: the backbone's config.
         run: the run's config; its batch is spread over the mesh.
         mesh: device mesh; by default only the first device.
+        model: the model's shapes; by default those of the run.
     """
 
-    def __init__(self, config: BackboneConfig, run: Config, mesh: Mesh | None = None) -> None:
+    def __init__(
+        self,
+        config: BackboneConfig,
+        run: Config,
+        mesh: Mesh | None = None,
+        model: Backbone | None = None,
+    ) -> None:
         mesh = mesh or meshes.make_mesh(devices=jax.devices()[:1])
         optimizer = make_optimizer(run.optim, {run.peft})
-        graphdef, adapters, frozen = adaptation.split(preflight.abstract_model(run, config))
+        model = model or preflight.abstract_model(run, config)
+        graphdef, adapters, frozen = adaptation.split(model)
         self._initial = functools.partial(init_state, optimizer=optimizer)
         self._batch = abstract_batch(config, run.optim.batch_size)
         key = jax.eval_shape(jax.random.key, 1)
@@ -119,9 +127,10 @@ class Step:
         jitted = jax.jit(step, donate_argnums=0, in_shardings=self._shardings, out_shardings=out)
         self.compiled = jitted.lower(*shapes).compile()
 
-    def load(self, adapters: Any, frozen: Any) -> "Step":
-        """Place the arrays on the devices and return self."""
-        arrays = self._initial(adapters), frozen, noise(self._batch), jax.random.key(1)
+    def load(self, adapters: Any, frozen: Any, batch: Any = None) -> "Step":
+        """Place the arrays on the devices and return self; the default batch is noise."""
+        batch = batch or noise(self._batch)
+        arrays = self._initial(adapters), frozen, batch, jax.random.key(1)
         self.state, *self.others = jax.device_put(arrays, self._shardings)
         return self
 

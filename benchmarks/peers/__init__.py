@@ -1,0 +1,1 @@
+"""Time openpi, LeRobot, qwix and Hugging Face PEFT beside this project; see `peers.md`."""
