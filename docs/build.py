@@ -38,6 +38,7 @@ OUTSIDE = (
     "assets/**/*.gif",
     "assets/*.png",
     "notebooks/*.ipynb",
+    "benchmarks/*.md",
     "CONTRIBUTING.md",
     "LICENSE",
     "CITATION.cff",

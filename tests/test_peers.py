@@ -1,4 +1,4 @@
-"""Test the comparison with other programs: what runs, what is compared, what is written."""
+"""Test the command that compares this project with other programs, with stand-ins for them."""
 
 import argparse
 import json
@@ -9,14 +9,11 @@ import sys
 import time
 
 import jax
-import numpy as np
 import pytest
-from flax import nnx
 
 from benchmarks.peers import __main__ as peers
-from benchmarks.peers import cases, ours, report, worker, workloads
+from benchmarks.peers import cases, report, worker
 from benchmarks.peers.worker import Job
-from lorasp_jax.adapters import adaptation
 from tests import ROOT
 
 FAKE = """#!{python}
@@ -165,63 +162,6 @@ def test_the_guide_names_every_table_and_the_pinned_versions():
             assert pin.partition("==")[2] in text
 
 
-def test_all_programs_get_the_same_numbers():
-    one, two = (workloads.policy_batch(workloads.PI0["tiny"], 2) for _ in range(2))
-    jax.tree.map(np.testing.assert_array_equal, one, two)
-    batch = ours.batch(job("pi0-sample"), 2)
-    images = batch.observation.images
-    np.testing.assert_array_equal(images["left_wrist_0_rgb"], one["images"][1])
-    np.testing.assert_array_equal(batch.actions, one["actions"])
-    assert len(images) == workloads.PI0["tiny"].cameras
-    assert np.abs(one["images"][0]).max() <= 1
-
-
-@pytest.mark.parametrize("table", ["pi0-train", "smolvla-train"])
-def test_published_sizes_are_the_defaults(table):
-    config = ours.model_config(job(table, size="base"))
-    shape = ours.workload(job(table, size="base"))[1]
-    published = type(config).base()
-    assert (config.vision, config.language, config.action) == (
-        published.vision,
-        published.language,
-        published.action,
-    )
-    assert (shape.batch, shape.chunk, shape.tokens) == (32, published.chunk, published.max_tokens)
-    assert (shape.image, shape.dim) == (published.image_size, published.action_dim)
-
-
-TRAINED = {
-    # All that openpi trains but its LoRA (models/pi0_config.py), and LoRA without pairs per head.
-    ("pi0-train", ours.OPENPI): 468_039_440 - 49_987_584 + 1_225_728 * 16 + 433_152 * 32,
-    # What LeRobot trains by default.
-    ("smolvla-expert", "expert only"): 99_880_992,
-}
-
-
-@pytest.mark.parametrize(("case", "expected"), TRAINED.items(), ids=str)
-def test_the_same_parameters_are_trained_as_elsewhere(case, expected):
-    chosen = job(*case, size="base")
-    config = ours.model_config(chosen)
-
-    def model():
-        return adaptation.adapt(config.create(nnx.Rngs(0)), ours.rules(chosen)[0], rngs=nnx.Rngs(1))
-
-    trained = adaptation.split(nnx.eval_shape(model))[1]
-    assert sum(leaf.size for leaf in jax.tree.leaves(trained)) == expected
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "case",
-    [(t, v) for t, entries in cases.TABLES.items() for p, v in entries if p == cases.OURS],
-    ids="-".join,
-)
-def test_every_variant_of_ours_runs(case):
-    rows = list(ours.measure(job(*case)))
-    assert rows
-    assert all(row["median_s"] > 0 for row in rows)
-
-
 def test_ratios_use_the_mean_of_both_reference_runs():
     def result(program, seconds):
         rows = [{"item": "batch 1", "median_s": seconds}]
@@ -231,3 +171,40 @@ def test_ratios_use_the_mean_of_both_reference_runs():
         [result("ours", 1.0), result("openpi", 4.0), result("ours", 3.0)], "pi0-sample"
     )
     assert [line["ratio"] for line in lines] == [0.5, 2.0, 1.5]
+
+
+@pytest.mark.parametrize(
+    ("stderr", "expected"),
+    [
+        ("Traceback\n  File\nValueError: no\n--------\nJAX has removed frames", "ValueError: no"),
+        ("killed", "killed"),
+        ("", "exit status 9"),
+        ("warning: x\nModuleNotFoundError: No module named 'a'\n", "ModuleNotFoundError: No mo"),
+    ],
+)
+def test_the_cause_is_the_line_with_the_error(stderr, expected):
+    assert peers.cause(stderr, 9).startswith(expected)
+
+
+def test_versions_name_the_commit_of_a_repository(tmp_path, monkeypatch):
+    folder = tmp_path / "someone-1.0.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: someone\nVersion: 1.0\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert worker.version("someone") == "1.0"
+    origin = {"url": "https://host/x", "vcs_info": {"vcs": "git", "commit_id": "15a9616a00943a"}}
+    (folder / "direct_url.json").write_text(json.dumps(origin))
+    assert worker.version("someone") == "1.0 (15a9616a)"
+    assert worker.version("not-installed") == "unknown"
+
+
+@pytest.mark.parametrize("program", ["openpi", "lerobot", "qwix", "peft"])
+def test_installed_programs_run(program, tmp_path, capsys):
+    """Each program that happens to be installed beside this one."""
+    pytest.importorskip(program)
+    tables = [t for t, entries in cases.TABLES.items() if program in dict(entries)]
+    out = tmp_path / "out.json"
+    options = ["--out", str(out), "--size", "tiny", "--steps", "2", "--once", "--tables"]
+    assert peers.main([*options, tables[-1]]) == 0
+    results = json.loads(out.read_text())["results"]
+    assert any(r["program"] == program and r["rows"] for r in results)

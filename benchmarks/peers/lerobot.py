@@ -24,53 +24,16 @@ from benchmarks.peers.worker import Job, Row
 PACKAGES = ("lerobot", "torch", "transformers", "peft")
 AUTOCAST = ", autocast"
 """End of the name of variants whose matrix products all run in bf16."""
-SIZES: dict[str, dict[str, dict[str, int]]] = {
-    "base": {
-        "text": {
-            "hidden_size": 960,
-            "intermediate_size": 2560,
-            "num_hidden_layers": 16,
-            "num_attention_heads": 15,
-            "num_key_value_heads": 5,
-            "head_dim": 64,
-            "vocab_size": 49_280,
-        },
-        "vision": {
-            "hidden_size": 768,
-            "intermediate_size": 3072,
-            "num_hidden_layers": 12,
-            "num_attention_heads": 12,
-            "patch_size": 16,
-        },
-        "model": {"scale_factor": 4},
-    },
-    "tiny": {
-        "text": {
-            "hidden_size": 64,
-            "intermediate_size": 128,
-            "num_hidden_layers": 4,
-            "num_attention_heads": 4,
-            "num_key_value_heads": 2,
-            "head_dim": 16,
-            "vocab_size": 320,
-        },
-        "vision": {
-            "hidden_size": 32,
-            "intermediate_size": 48,
-            "num_hidden_layers": 2,
-            "num_attention_heads": 2,
-            "patch_size": 8,
-        },
-        "model": {"scale_factor": 2},
-    },
-}
 
 
 def language_model_config(job: Job) -> Any:
     """Return transformers' config of the vision-language model; token ids lie in the vocabulary."""
     from transformers import LlamaConfig, SmolVLMConfig  # pyright: ignore[reportMissingImports]
 
-    sizes, ids = SIZES[job.size], {"bos_token_id": 1, "eos_token_id": 2, "pad_token_id": 2}
+    sizes, ids = (
+        workloads.SMOLVLA_TOWERS[job.size],
+        {"bos_token_id": 1, "eos_token_id": 2, "pad_token_id": 2},
+    )
     return SmolVLMConfig(
         text_config=LlamaConfig(**sizes["text"], **ids),
         vision_config={**sizes["vision"], "image_size": workloads.SMOLVLA[job.size].image},
@@ -99,7 +62,7 @@ def policy_config(job: Job, folder: str) -> Any:
         },
         output_features={"action": PolicyFeature(FeatureType.ACTION, (shape.dim,))},
         vlm_model_name=folder,
-        num_vlm_layers=SIZES[job.size]["text"]["num_hidden_layers"],
+        num_vlm_layers=workloads.SMOLVLA_TOWERS[job.size]["text"]["num_hidden_layers"],
         chunk_size=shape.chunk,
         n_action_steps=shape.chunk,
         max_state_dim=shape.dim,

@@ -122,8 +122,9 @@ def train(job: Job) -> Iterator[Row]:
 
     run = backbones.run_config(method, (), size)
     shapes = nnx.eval_shape(lambda: model(jax.random.key(0)))
+    step = backbones.Step(config, run, model=shapes)  # compiles, while the memory is free
     trained, frozen = drawn(model)[1:]
-    step = backbones.Step(config, run, model=shapes).load(trained, frozen, batch(job, size))
+    step.load(trained, frozen, batch(job, size))
     count = sum(leaf.size for leaf in jax.tree.leaves(trained))
     del trained, frozen
     row = worker.timed(f"batch {size}", step, jax.block_until_ready, job)

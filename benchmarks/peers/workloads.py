@@ -61,6 +61,47 @@ SMOLVLA: dict[Size, Policy] = {
     "base": Policy(32, 2, 512, 48, 50, 32, 128, (1, 8)),
     "tiny": Policy(2, 2, 32, 8, 4, 8, 4, (1, 2)),
 }
+SMOLVLA_TOWERS: dict[Size, dict[str, dict[str, int]]] = {
+    "base": {
+        "text": {
+            "hidden_size": 960,
+            "intermediate_size": 2560,
+            "num_hidden_layers": 16,
+            "num_attention_heads": 15,
+            "num_key_value_heads": 5,
+            "head_dim": 64,
+            "vocab_size": 49_280,
+        },
+        "vision": {
+            "hidden_size": 768,
+            "intermediate_size": 3072,
+            "num_hidden_layers": 12,
+            "num_attention_heads": 12,
+            "patch_size": 16,
+        },
+        "model": {"scale_factor": 4},
+    },
+    "tiny": {
+        "text": {
+            "hidden_size": 64,
+            "intermediate_size": 128,
+            "num_hidden_layers": 4,
+            "num_attention_heads": 4,
+            "num_key_value_heads": 2,
+            "head_dim": 16,
+            "vocab_size": 320,
+        },
+        "vision": {
+            "hidden_size": 32,
+            "intermediate_size": 48,
+            "num_hidden_layers": 2,
+            "num_attention_heads": 2,
+            "patch_size": 8,
+        },
+        "model": {"scale_factor": 2},
+    },
+}
+"""Sizes of SmolVLA's language model and vision tower, as transformers names them."""
 LAYERS: dict[Size, Layers] = {
     "base": Layers(((2048, 16384), (16384, 2048), (2048, 2048), (1152, 4304)), 26112, 128),
     "tiny": Layers(((64, 128),), 32, 4),
