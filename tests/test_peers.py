@@ -7,6 +7,7 @@ import re
 import stat
 import sys
 import time
+import types
 
 import jax
 import pytest
@@ -196,6 +197,8 @@ def test_versions_name_the_commit_of_a_repository(tmp_path, monkeypatch):
     (folder / "direct_url.json").write_text(json.dumps(origin))
     assert worker.version("someone") == "1.0 (15a9616a)"
     assert worker.version("not-installed") == "unknown"
+    monkeypatch.setitem(sys.modules, "checkout", types.SimpleNamespace(__version__="0.2"))
+    assert worker.version("checkout") == "0.2"
 
 
 @pytest.mark.parametrize("program", ["openpi", "lerobot", "qwix", "peft"])

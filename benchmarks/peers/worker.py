@@ -13,6 +13,7 @@ import importlib.metadata
 import json
 import platform
 import statistics
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -66,7 +67,7 @@ def version(name: str) -> str:
     try:
         package = importlib.metadata.distribution(name)
     except importlib.metadata.PackageNotFoundError:
-        return "unknown"
+        return getattr(sys.modules.get(name), "__version__", "unknown")
     origin = json.loads(package.read_text("direct_url.json") or "{}")
     commit = origin.get("vcs_info", {}).get("commit_id", "")[:8]
     return f"{package.version} ({commit})" if commit else package.version
