@@ -54,8 +54,8 @@ TABLES: dict[str, tuple[tuple[str, str], ...]] = {
 }
 INSTALL = {
     OURS: "pip install -e .",
-    "openpi": "pip install --no-deps git+https://github.com/Physical-Intelligence/openpi && "
-    "pip install jax flax optax orbax-checkpoint safetensors torch augmax einops "
+    "openpi": "pip install --no-deps git+https://github.com/Physical-Intelligence/openpi@15a9616a "
+    "&& pip install jax flax optax orbax-checkpoint safetensors torch augmax einops "
     "beartype==0.19.0 jaxtyping==0.2.36",
     "lerobot": 'pip install "lerobot[smolvla,peft]==0.6.1"',
     "qwix": "pip install qwix==0.1.8",

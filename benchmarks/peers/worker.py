@@ -2,7 +2,7 @@
 
 Every program has a module with a function `measure`, which yields a row per measurement:
 
-    python -m benchmarks.peers.qwix --table qlora --variant "LoRA on nf4" --result result.json
+    python -m benchmarks.peers.qwix --table stack-nf4 --variant "LoRA on nf4" --result result.json
 
 This module needs only the standard library.
 """
