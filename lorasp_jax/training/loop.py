@@ -136,7 +136,8 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
     """Return the jitted scan over steps: (frozen, batches, state, key) -> state, metrics.
 
     `frozen` is a `Frozen`, `batches` a `Raw`; the batches and the metrics have a leading axis over
-    steps. `shardings` are those of the state, from `meshes.shardings`.
+    steps. `shardings` are those of the state, from `meshes.shardings`. If a run calls this
+    again with equal inputs, it gets the same program, which JAX has traced already.
     """
     optim, mesh = run.config.optim, shardings.step.mesh
     step = functools.partial(
@@ -166,7 +167,8 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
     def scan(frozen: Frozen, batches: Raw, state: TrainState, key: jax.Array) -> Any:
         return jax.lax.scan(lambda state, raw: body(state, raw, frozen, key), state, batches)
 
-    return scan
+    inputs = optim, run.config.auxiliary, graphdef, *jax.tree.leaves(shardings)
+    return run.programs.setdefault(inputs, scan)
 
 
 def _log_interval(config: Config, done: int) -> int:

@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ class Run:
         streams: whether batches are read from disk because the dataset does not fit on the device.
         devices: devices to train on; None: all.
         simulated: whether the tasks can be evaluated in simulation.
+        programs: jitted training programs by their inputs; see `loop.jit_steps`.
         policy: the current policy; read it in callbacks or after training, since each step donates
             its buffers.
         started: `time.perf_counter()` when this process started.
@@ -44,6 +45,7 @@ class Run:
     streams: bool = False
     devices: Sequence[Any] | None = None
     simulated: bool = True
+    programs: dict[Any, Callable] = field(default_factory=dict)
     policy: Policy = field(init=False)
     seconds: dict[str, float] = field(init=False)
 

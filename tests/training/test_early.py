@@ -87,6 +87,20 @@ def test_the_run_compiles_nothing_else(prepare, monkeypatch):
     assert used == [early_text]  # so that JAX finds the program in its cache on disk
 
 
+def test_the_run_traces_nothing_again(prepare, monkeypatch):
+    calls, train_step = [], loop.train_step
+
+    def counted(*arguments, **options):
+        calls.append(None)
+        return train_step(*arguments, **options)
+
+    monkeypatch.setattr(loop, "train_step", counted)
+    run = prepare(early.compile_training)
+    traced = len(calls)
+    loop.train(run)
+    assert len(calls) == traced > 0
+
+
 def test_errors_reach_the_caller(prepare):
     """Those of `meanwhile` after the demonstrations; those of the demonstrations at once."""
 
