@@ -16,6 +16,7 @@ and there are many tokens. Elsewhere, and on other devices, W is dequantized to 
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any, TypeGuard
 
 import jax
@@ -24,6 +25,7 @@ import jax.numpy as jnp
 from lorasp_jax.kernels.platform import multiplies_float8
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.kernels.rematerialization import save_for_backward
+from lorasp_jax.kernels.row_sharding import by_rows
 
 Kernel = jax.Array | QuantizedKernel
 
@@ -66,12 +68,21 @@ def encode(x: jax.Array, dtype: Any) -> tuple[jax.Array, jax.Array]:
 
 
 def _float8_product(x: jax.Array, dtype: Any, kernel: QuantizedKernel, axis: int) -> jax.Array:
-    """Encode x and sum its products with W [I, O] over this axis of W, in the dtype of x."""
-    codes, scale = encode(x, dtype)
-    axes = ((x.ndim - 1,), (axis,)), ((), ())
-    sums = jax.lax.dot_general(codes, kernel.codes[0], axes, preferred_element_type=x.dtype)
-    product = sums * (scale * kernel.scale.reshape(())).astype(x.dtype)
-    return save_for_backward(product, x.shape[-1])
+    """Encode x and sum its products with W [I, O] over this axis of W, in the dtype of x.
+
+    Each device scales its own rows: one scale for all would be a collective before each product.
+    """
+
+    def product(shared: Sequence[jax.Array], arrays: Sequence[jax.Array]) -> tuple:
+        (w, w_scale), (rows,) = shared, arrays
+        codes, scale = encode(rows, dtype)
+        axes = ((1,), (axis,)), ((), ())
+        sums = jax.lax.dot_general(codes, w, axes, preferred_element_type=x.dtype)
+        return [sums * (scale * w_scale.reshape(())).astype(x.dtype)], []
+
+    rows = x.reshape(-1, x.shape[-1])
+    (y,), _ = by_rows(product, [kernel.codes[0], kernel.scale], [rows])
+    return save_for_backward(y.reshape(*x.shape[:-1], -1), x.shape[-1])
 
 
 def _forward(x: jax.Array, kernel: Kernel) -> tuple[jax.Array, Kernel]:

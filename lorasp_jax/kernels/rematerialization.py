@@ -6,16 +6,14 @@ from typing import Any
 import jax
 from jax.ad_checkpoint import checkpoint_name
 
-_EXPENSIVE_TO_RECOMPUTE = ("dot_product_attention_fwd_wrapper", "custom_vmap_call")
-"""Primitives of cuDNN attention and of kernels on sharded rows (`row_sharding`), which are
-`short_attention` and the adapters' fused kernel."""
+_CUDNN_ATTENTION = "dot_product_attention_fwd_wrapper"
 _SAVED, _SAVED_WIDE = "saved", "saved, wide"
 WIDE = 2
 """A product is wide if it has more than this many times the columns of its input."""
 
 
 def save_for_backward(x: jax.Array, columns: int | None = None) -> jax.Array:
-    """Mark x to be saved for the backward pass, in place of the matmul results it comes from.
+    """Mark x to be saved for the backward pass: the result of a kernel, or of several matmuls.
 
     `columns` are those of the input that x is a product of, if it is one.
     """
@@ -24,8 +22,8 @@ def save_for_backward(x: jax.Array, columns: int | None = None) -> jax.Array:
 
 
 def save_products(primitive: Any, *shapes: Any, **params: Any) -> Any:
-    """Save matmuls without batch axes, expensive primitives and values marked for saving."""
-    if primitive.name in _EXPENSIVE_TO_RECOMPUTE or params.get("name") in (_SAVED, _SAVED_WIDE):
+    """Save matmuls without batch axes, cuDNN attention and values marked for saving."""
+    if primitive.name == _CUDNN_ATTENTION or params.get("name") in (_SAVED, _SAVED_WIDE):
         return True
     return jax.checkpoint_policies.dots_with_no_batch_dims_saveable(primitive, *shapes, **params)
 

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 
 from lorasp_jax.kernels.packing import PackedTree, spans
+from lorasp_jax.kernels.rematerialization import save_for_backward
 from lorasp_jax.kernels.row_sharding import by_rows
 
 
@@ -202,7 +203,8 @@ def _map_blocks(
     dtypes = [operand._replace(array=operand.array.dtype) for operand in inputs]
     blocks = _Blocks(body, launch, shared.tree, dtypes, outputs, sums)
     call = functools.partial(_call, blocks, interpret)
-    results, (totals,) = by_rows(call, [shared.values], [operand.array for operand in inputs])
+    found = by_rows(call, [shared.values], [operand.array for operand in inputs])
+    results, (totals,) = jax.tree.map(save_for_backward, found)
     leaves, structure = jax.tree.flatten(sums)
     return results, PackedTree(totals, structure, tuple(leaf.shape for leaf in leaves))
 

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jax.experimental import pallas as pl
 
+from lorasp_jax.kernels.rematerialization import save_for_backward
 from lorasp_jax.kernels.row_sharding import by_rows
 
 MAX_KEYS = 256
@@ -165,7 +166,7 @@ def _call(
         )(*arrays)
         return outputs, []
 
-    return by_rows(run, [], arrays)[0]
+    return jax.tree.map(save_for_backward, by_rows(run, [], arrays)[0])
 
 
 class _Block(NamedTuple):

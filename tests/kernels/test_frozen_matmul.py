@@ -11,6 +11,7 @@ from lorasp_jax.dense import dense
 from lorasp_jax.kernels import frozen_matmul as fm
 from lorasp_jax.kernels.quantized_weights import quantize_kernel
 from lorasp_jax.peft import LoRASP
+from lorasp_jax.training.distributed import mesh as meshes
 
 METHOD = LoRASP(rank=8)
 
@@ -103,3 +104,22 @@ def test_used_where_it_pays():
     assert formats(26112, 2048, 16384, kind="int8") == []
     assert formats(26112, 2048, 16384, platform="cpu") == []
     assert formats(26112, 2048, 16384, platform="rocm") == []
+
+
+def test_each_device_scales_its_own_rows(on_hopper):
+    """One scale for all rows would be a collective before each product."""
+    kernel = quantize_kernel(normal(0, 16, 24), "float8")
+    x = normal(1, 8, 4, 16) * 10.0 ** jnp.arange(8)[:, None, None]  # very different from each other
+    mesh = meshes.make_mesh()
+    rows = meshes.batch_sharding(mesh)
+
+    def forward_and_backward(x):
+        y, vjp = jax.vjp(lambda x: fm.frozen_matmul(x, kernel), x)
+        return y, *vjp(y)
+
+    run = jax.jit(forward_and_backward, in_shardings=rows, out_shardings=rows).lower(x).compile()
+    assert "all-" not in (run.as_text() or "")
+    found = run(jax.device_put(x, rows))
+    expected = jax.vmap(forward_and_backward)(x)
+    for ours, theirs in zip(found, expected, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-5)
