@@ -21,7 +21,7 @@ pass, so quantized weights are only briefly dequantized.
 import functools
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -104,7 +104,7 @@ def low_rank_matmul(
     params, widths = [layer.params for layer in layers], _widths(layers)
     if isinstance(methods, tuple):
         calls = zip(methods, params, _split(widths, projected), strict=True)
-        z_aux = [_bottleneck(method, p, rows, token_mask) for method, p, rows in calls]
+        z_aux = [_traced_once(method)(p, rows, token_mask) for method, p, rows in calls]
     else:
         z_aux = methods.bottleneck_each(params, projected, widths, token_mask)
     return [
@@ -113,12 +113,10 @@ def low_rank_matmul(
     ]
 
 
-@functools.partial(jax.jit, static_argnums=0, inline=True)
-def _bottleneck(
-    method: Bottleneck, params: Any, rows: jax.Array, token_mask: jax.Array | None
-) -> tuple[jax.Array, Any]:
-    """Call f, traced once for all layers whose f has equal shapes."""
-    return method.bottleneck(params, rows, token_mask)
+@functools.cache
+def _traced_once(method: Bottleneck) -> Callable[..., tuple[jax.Array, Any]]:
+    """Return f, traced once for all layers for which it has equal shapes."""
+    return jax.jit(method.bottleneck, inline=True)
 
 
 def _forward(
@@ -134,7 +132,7 @@ def _forward(
     def inner(params: list[Any], projected: jax.Array) -> list[tuple[jax.Array, Any]]:
         if isinstance(methods, tuple):
             calls = zip(methods, params, _split(widths, projected), strict=True)
-            z_aux = [_bottleneck(method, p, rows, token_mask) for method, p, rows in calls]
+            z_aux = [_traced_once(method)(p, rows, token_mask) for method, p, rows in calls]
         else:
             z_aux = methods.bottleneck_each(params, projected, widths, token_mask)
         return [(z.astype(x.dtype), aux) for z, aux in z_aux]
