@@ -94,6 +94,8 @@ def test_overlapping_kernels_count_once(spans, length):
     assert kernels.covered(spans) == length
 
 
+# A type of JAX's has no module; as an error, this warning aborts the process.
+@pytest.mark.filterwarnings("ignore:builtin type event_stats:DeprecationWarning")
 def test_profile():
     """On a CPU, the profiler records the operations of a program with their names."""
     x = jnp.ones((256, 256))
