@@ -86,7 +86,7 @@ def formats(tokens, d_in, d_out, kind="float8", platform="cuda"):
     def loss(params, x, kernel):
         return METHOD.apply(params, x, kernel)[0].astype(jnp.float32).sum()
 
-    device = jax.sharding.AbstractDevice("", num_cores=None, platform=platform)
+    device = jax.sharding.AbstractDevice("NVIDIA H200", num_cores=None, platform=platform)
     mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
     with jax.sharding.use_abstract_mesh(mesh):
         traced = jax.jit(jax.value_and_grad(loss, (0, 1))).trace(params, x, kernel)
@@ -94,6 +94,7 @@ def formats(tokens, d_in, d_out, kind="float8", platform="cuda"):
     return sorted(re.findall(r"convert .*-> tensor<[^>]*x(f8\w+)>", text))
 
 
+@pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
 def test_used_where_it_pays():
     """On NVIDIA GPUs, for many tokens and a wide result; each pass decides for itself."""
     both = ["f8E4M3FN", "f8E5M2"]
