@@ -17,7 +17,7 @@ import argparse
 import dataclasses
 import functools
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -73,6 +73,11 @@ def arrays(config: BackboneConfig, run: Config | None) -> tuple[Any, Any, Any]:
     def model(key: jax.Array) -> Backbone:
         return preflight.adapted_model(run, config, key) if run else config.create(nnx.Rngs(key))
 
+    return drawn(model)
+
+
+def drawn(model: Callable[[jax.Array], Backbone]) -> tuple[Any, Any, Any]:
+    """Return the graph, adapters and frozen arrays of a model drawn from a random key."""
     graphdef = adaptation.split(nnx.eval_shape(lambda: model(jax.random.key(0))))[0]
     draw = jax.jit(lambda key: adaptation.split(model(key))[1:])
     return graphdef, *draw(jax.random.key(0, impl="rbg"))

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -100,13 +100,6 @@ def batch(job: Job, size: int) -> Batch:
     return Batch(observation, actions, jnp.ones(actions.shape, bool))
 
 
-def drawn(model: Callable[[jax.Array], Backbone]) -> tuple[Any, Any, Any]:
-    """Return graph, adapters and frozen arrays of a random model."""
-    graph = adaptation.split(nnx.eval_shape(lambda: model(jax.random.key(0))))[0]
-    draw = jax.jit(lambda key: adaptation.split(model(key))[1:])
-    return graph, *draw(jax.random.key(0, impl="rbg"))
-
-
 def train(job: Job) -> Iterator[Row]:
     """Time training steps as `lorasp_jax.training` takes them, without data loading and logging.
 
@@ -123,7 +116,7 @@ def train(job: Job) -> Iterator[Row]:
     run = backbones.run_config(method, (), size)
     shapes = nnx.eval_shape(lambda: model(jax.random.key(0)))
     step = backbones.Step(config, run, model=shapes)  # compiles, while the memory is free
-    trained, frozen = drawn(model)[1:]
+    trained, frozen = backbones.drawn(model)[1:]
     step.load(trained, frozen, batch(job, size))
     count = sum(leaf.size for leaf in jax.tree.leaves(trained))
     del trained, frozen
@@ -134,7 +127,7 @@ def train(job: Job) -> Iterator[Row]:
 def sample(job: Job) -> Iterator[Row]:
     """Time sampling with a prepared sampler, from images to actions."""
     config = model_config(job)
-    sampler = nnx.merge(*drawn(lambda key: config.create(nnx.Rngs(key)))).sampler()
+    sampler = nnx.merge(*backbones.drawn(lambda key: config.create(nnx.Rngs(key)))).sampler()
     run = jax.jit(
         lambda sampler, observation: sampler.sample_actions(
             jax.random.key(1), observation, num_steps=workloads.FLOW_STEPS
