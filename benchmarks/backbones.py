@@ -36,6 +36,7 @@ from lorasp_jax.models import backbone
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.sampling import Sampler
+from lorasp_jax.training import compilation
 from lorasp_jax.training.cost import flops, preflight
 from lorasp_jax.training.cost.preflight import GIB, REMATS, abstract_batch, estimate_memory
 from lorasp_jax.training.distributed import mesh as meshes
@@ -130,7 +131,7 @@ class Step:
         )
         out = state, replicated
         jitted = jax.jit(step, donate_argnums=0, in_shardings=self._shardings, out_shardings=out)
-        self.compiled = jitted.lower(*shapes).compile()
+        self.compiled = jitted.lower(*shapes).compile(compilation.step_options())
 
     def load(self, adapters: Any, frozen: Any, batch: Any = None) -> "Step":
         """Place the arrays on the devices and return self; the default batch is noise."""

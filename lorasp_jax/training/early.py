@@ -7,14 +7,14 @@ import jax
 import numpy as np
 from flax import nnx
 
-from envs.compilation import fast_cpu, messages
+from envs.compilation import messages
 from envs.datasets.episodes import Episodes
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import flatten
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor
-from lorasp_jax.training import loop, setup
+from lorasp_jax.training import compilation, loop, setup
 from lorasp_jax.training.cost.preflight import nbytes
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.optim import make_optimizer
@@ -36,7 +36,7 @@ def compile_steps(run: Run, built: setup.RunSetup, batches: Any) -> Any:
     """Compile the training program for batches of these shapes, from `data_shapes`."""
     with messages.announce("the training step"):
         lowered = _lower(run, built, batches)
-        return lowered.compile(compiler_options=fast_cpu.without_simulation())
+        return lowered.compile(compiler_options=compilation.step_options())
 
 
 def blank_policy(run: Run, built: setup.RunSetup) -> Policy:
