@@ -103,6 +103,7 @@ class Step:
         run: the run's config; its batch is spread over the mesh.
         mesh: device mesh; by default only the first device.
         model: the model's shapes; by default those of the run.
+        options: compiler options besides those of training.
     """
 
     def __init__(
@@ -111,6 +112,7 @@ class Step:
         run: Config,
         mesh: Mesh | None = None,
         model: Backbone | None = None,
+        options: dict[str, str | bool] | None = None,
     ) -> None:
         mesh = mesh or meshes.make_mesh(devices=jax.devices()[:1])
         optimizer = make_optimizer(run.optim, {run.peft})
@@ -131,7 +133,8 @@ class Step:
         )
         out = state, replicated
         jitted = jax.jit(step, donate_argnums=0, in_shardings=self._shardings, out_shardings=out)
-        self.compiled = jitted.lower(*shapes).compile(compilation.step_options())
+        options = {**(compilation.step_options() or {}), **(options or {})}
+        self.compiled = jitted.lower(*shapes).compile(options)
 
     def load(self, adapters: Any, frozen: Any, batch: Any = None) -> "Step":
         """Place the arrays on the devices and return self; the default batch is noise."""

@@ -4,7 +4,8 @@
     python -m benchmarks.kernels --size nano --batch 4 --rank 8 --dtype float32    # on a CPU
 
 JAX's profiler records the kernels of a few steps (the step of `benchmarks.backbones`). The compiled
-program tells what each kernel computes. `idle` is the time of a step in which no kernel runs.
+program tells what each kernel computes. `idle` is the time of a step in which no kernel runs. On a
+GPU, the step is compiled without CUDA graphs, whose kernels the profiler cannot name.
 """
 
 import argparse
@@ -27,6 +28,9 @@ from lorasp_jax import peft
 
 SLOWEST = 40
 """Number of kernels in the JSON file's second table."""
+
+WITHOUT_GRAPHS: dict[str, str | bool] = {"xla_gpu_graph_min_graph_size": "1000000000"}
+"""Compiler options: no sequence of kernels is long enough for a graph."""
 
 _COMPUTATION = re.compile(r"(?:ENTRY )?%?([\w.\-]+) .*\{$")
 _INSTRUCTION = re.compile(r"\s*(?:ROOT )?%?([\w.\-]+) = (.*?) ([a-z][\w\-]*)\((.*)$")
@@ -114,7 +118,10 @@ def covered(spans: Iterable[tuple[int, int]]) -> int:
 
 
 def profile(step: Step, steps: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Trace steps; return the time by kind, and by kernel for the slowest ones."""
+    """Trace steps; return the time by kind, and by kernel for the slowest ones.
+
+    Kernels of kind "other" are not in the compiled program.
+    """
     jax.block_until_ready([step() for _ in range(2)])
     with tempfile.TemporaryDirectory() as folder:
         with jax.profiler.trace(folder):
@@ -154,7 +161,7 @@ def main() -> None:
     run = run_config(method, ("all-linear",), options.batch, options.base_dtype)
     for name in options.backbones:
         config = sized(name, options, options.remat)
-        step = Step(config, run).load(*arrays(config, run)[1:])
+        step = Step(config, run, options=WITHOUT_GRAPHS).load(*arrays(config, run)[1:])
         by_kind, slowest = profile(step, options.calls)
         print_table(console, by_kind, f"{name}: {100 * by_kind[0]['ms'] / by_kind[0]['%']:.4g} ms")
         results[name] = {"kinds": by_kind, "slowest": slowest}

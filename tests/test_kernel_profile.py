@@ -122,10 +122,14 @@ def test_profile():
     )
 
 
+def test_xla_knows_the_options():
+    jax.jit(jnp.sin).lower(1.0).compile(kernels.WITHOUT_GRAPHS)
+
+
 def test_command(monkeypatch, tmp_path, capsys):
     rows = [{"kind": "matmuls", "kernels": 2, "ms": 3.0, "%": 75.0}]
     step = types.SimpleNamespace(load=lambda *_: step)
-    monkeypatch.setattr(kernels, "Step", lambda *_: step)
+    monkeypatch.setattr(kernels, "Step", lambda *_, options: step)
     monkeypatch.setattr(kernels, "arrays", lambda *_: (None, None, None))
     monkeypatch.setattr(kernels, "profile", lambda *_: (rows, []))
     file = tmp_path / "kernels.json"
