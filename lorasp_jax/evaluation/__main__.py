@@ -2,15 +2,17 @@
 
 import argparse
 import contextlib
+import functools
 import importlib.util
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from lorasp_jax.evaluation.gymnasium.actors import Actor, RunActor, ServerActor
 from lorasp_jax.evaluation.gymnasium.judge import judge
+from lorasp_jax.evaluation.gymnasium.parallel import judge_in_processes
 from lorasp_jax.evaluation.gymnasium.task import Task, load_tasks
 
 # As in `envs.cli.errors`, which imports JAX: this command runs without it.
@@ -36,16 +38,16 @@ def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.evaluati
 
 def _run(options: argparse.Namespace) -> None:
     _check(options)
-    tasks = load_tasks(options.env, options.tasks)
-    with _actor(options, tasks) as actor:
-        results = judge(
-            tasks,
-            actor,
-            options.episodes,
-            seed=options.seed,
-            films=options.films,
-            progress=_print_progress if sys.stderr.isatty() else None,
-        )
+    settings: dict[str, Any] = {"seed": options.seed, "films": options.films}
+    if sys.stderr.isatty():
+        settings["progress"] = _print_progress
+    if options.processes > 1:
+        where = options.env, options.tasks, _server(options), options.episodes, options.processes
+        results = judge_in_processes(*where, **settings)
+    else:
+        tasks = load_tasks(options.env, options.tasks)
+        with _actor(options, tasks) as actor:
+            results = judge(tasks, actor, options.episodes, **settings)
     if sys.stderr.isatty():
         print(file=sys.stderr)
     print(table(results))
@@ -61,6 +63,10 @@ def _check(options: argparse.Namespace) -> None:
     """Raise ValueError for options that cannot work, before anything is loaded."""
     if (options.run is None) == (not options.server):
         raise ValueError("give either the folder of a run or --server, and not both")
+    if options.processes < 1:
+        raise ValueError(f"--processes must be at least 1, got {options.processes}")
+    if options.processes > 1 and not options.server:
+        raise ValueError("--processes needs --server, whose policy all processes share")
     if options.out and options.out.exists():
         raise ValueError(f"{options.out} exists: choose another --out")
     if options.films and options.films.exists():
@@ -74,9 +80,13 @@ def _actor(options: argparse.Namespace, tasks: Sequence[Task]) -> Iterator[Actor
     if not options.server:
         yield RunActor(options.run, [task.instruction for task in tasks])
         return
-    server = ServerActor(options.server, token=options.token, wait=options.wait)
-    with contextlib.closing(server):
+    with contextlib.closing(_server(options)()) as server:
         yield server
+
+
+def _server(options: argparse.Namespace) -> Callable[[], ServerActor]:
+    """Return what connects to the server; processes can import it, unlike this module."""
+    return functools.partial(ServerActor, options.server, token=options.token, wait=options.wait)
 
 
 def _print_progress(task: str, done: int, successes: int) -> None:
@@ -117,6 +127,8 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--tasks", nargs="+", default=(), metavar="TASK", help="tasks (default: all)")
     text = "episodes per task (default: %(default)s)"
     add("--episodes", type=int, default=10, metavar="N", help=text)
+    text = "tasks judged at once, each in a process; needs --server (default: %(default)s)"
+    add("--processes", type=int, default=1, metavar="N", help=text)
     text = "seed of the first episode; the next has the next seed (default: %(default)s)"
     add("--seed", type=int, default=0, help=text)
     add("--out", type=Path, metavar="FILE", help="JSON file to write")

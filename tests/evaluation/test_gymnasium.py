@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -19,6 +20,7 @@ from lorasp_jax.evaluation.__main__ import main
 from lorasp_jax.evaluation.gymnasium import Task
 from lorasp_jax.evaluation.gymnasium.actors import RunActor, ServerActor
 from lorasp_jax.evaluation.gymnasium.judge import judge
+from lorasp_jax.evaluation.gymnasium.parallel import judge_in_processes
 from lorasp_jax.evaluation.gymnasium.task import load_tasks
 from lorasp_jax.evaluation.intervals import wilson_interval
 from lorasp_jax.models.pi0 import Pi0Config
@@ -196,6 +198,54 @@ def test_command_judges_a_server(tmp_path, capsys):
     assert "exists: choose another --out" in errors
     results = json.loads(out.read_text())
     assert results["tasks"]["other"]["outcomes"] == [True] * 3
+
+
+def test_processes_judge_as_one_does(tmp_path):
+    command = [sys.executable, "-m", "lorasp_jax.evaluation", "--env", f"{HERE}:tasks"]
+    found = {}
+    with policy_server(act) as url:
+        for count in ("1", "2"):
+            out, films = tmp_path / f"{count}.json", tmp_path / f"films{count}"
+            options = ["--server", url, "--processes", count, "--out", str(out)]
+            options += ["--episodes", "3", "--seed", "4", "--films", str(films)]
+            subprocess.run([*command, *options], cwd=ROOT, timeout=120, check=True)
+            found[count] = json.loads(out.read_text())
+            assert sorted(path.name for path in films.iterdir()) == ["line.webp", "other.webp"]
+    for key in ("tasks", "groups", "steps"):
+        assert found["1"][key] == found["2"][key]
+
+
+def die():
+    os._exit(1)
+
+
+def test_a_killed_process_is_named():
+    with pytest.raises(ValueError, match="a process that judged a task was killed"):
+        judge_in_processes(f"{HERE}:tasks", (), die, 1, 2)
+
+
+def test_an_error_in_a_process_is_one_sentence(tmp_path, capsys):
+    def refuse(request):
+        raise ValueError("no such prompt")
+
+    options = ["--env", f"{HERE}:tasks", "--processes", "2"]
+    with policy_server(refuse) as url:
+        assert main(["--server", url, *options]) == 2
+    assert capsys.readouterr().err == "error: the policy server refused: no such prompt\n"
+    assert main(["--server", url, *options]) == 2
+    assert capsys.readouterr().err.startswith("error: no policy server at")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--server", "ws://127.0.0.1:9", "--processes", "0"], "must be at least 1, got 0"),
+        (["runs/x", "--processes", "2"], "--processes needs --server"),
+    ],
+)
+def test_bad_numbers_of_processes_are_refused(arguments, message, capsys):
+    assert main([*arguments, "--env", f"{HERE}:tasks"]) == 2
+    assert message in capsys.readouterr().err
 
 
 def test_server_refusals_are_one_sentence():

@@ -1,7 +1,7 @@
 """Run episodes of tasks and count successes."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,8 @@ from lorasp_jax.evaluation.gymnasium.actors import Actor
 from lorasp_jax.evaluation.gymnasium.task import Task
 from lorasp_jax.evaluation.intervals import wilson_interval
 
+Progress = Callable[[str, int, int], None]
+"""Called with a task, its finished episodes and their successes."""
 FILM_FPS = 10.0
 """Frames per second of films of environments that do not name their rate."""
 
@@ -89,7 +91,7 @@ def judge(
     *,
     seed: int = 0,
     films: Path | None = None,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Measure success on every task.
 
@@ -99,7 +101,7 @@ def judge(
         episodes: episodes per task; they reset with `seed`, `seed` + 1 and so on.
         seed: first seed.
         films: folder for a film of each task's first episode; None: no films.
-        progress: called with task, finished episodes and successes.
+        progress: called after each episode.
 
     Returns:
         success rate, 95 % Wilson interval, number of episodes and mean environment steps of all
@@ -109,30 +111,49 @@ def judge(
     Raises:
         ValueError: `episodes` is less than 1, or task, environment and policy do not fit together.
     """
+    check_episodes(episodes)
+    started = time.perf_counter()
+    runs = {
+        task.name: judge_task(task, actor, episodes, seed=seed, films=films, progress=progress)
+        for task in tasks
+    }
+    return summarize(tasks, runs, time.perf_counter() - started)
+
+
+def check_episodes(episodes: int) -> None:
+    """Raise ValueError unless there is at least one episode."""
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
-    started, runs = time.perf_counter(), {}
-    for task in tasks:
-        env = task.make()
-        try:
-            done: list[Episode] = []
-            for number in range(episodes):
-                film = films is not None and number == 0
-                done.append(run_episode(task, env, actor, seed + number, film=film))
-                if progress:
-                    progress(task.name, len(done), sum(bool(each.success) for each in done))
-            if films is not None:
-                write_film(films / f"{task.name}.webp", done[0].frames, _fps(task, env))
-        finally:
-            env.close()
-        runs[task.name] = done
-    seconds = time.perf_counter() - started
-    return _results(tasks, runs, seconds)
 
 
-def _results(
-    tasks: Sequence[Task], runs: dict[str, list[Episode]], seconds: float
+def judge_task(
+    task: Task,
+    actor: Actor,
+    episodes: int,
+    *,
+    seed: int = 0,
+    films: Path | None = None,
+    progress: Progress | None = None,
+) -> list[Episode]:
+    """Run the episodes of one task; arguments and errors are those of `judge`."""
+    env, done = task.make(), list[Episode]()
+    try:
+        for number in range(episodes):
+            film = films is not None and number == 0
+            done.append(run_episode(task, env, actor, seed + number, film=film))
+            if progress:
+                progress(task.name, len(done), sum(bool(each.success) for each in done))
+        if films is not None:
+            write_film(films / f"{task.name}.webp", done[0].frames, _fps(task, env))
+    finally:
+        env.close()
+    return done
+
+
+def summarize(
+    tasks: Sequence[Task], runs: Mapping[str, Sequence[Episode]], seconds: float
 ) -> dict[str, Any]:
+    """Return what `judge` returns, from the episodes of each task and the time they took."""
     names = dict.fromkeys(task.group for task in tasks if task.group)
     groups = {name: [task.name for task in tasks if task.group == name] for name in names}
     everything = [each for done in runs.values() for each in done]
