@@ -16,7 +16,7 @@ from pathlib import Path
 
 from examples.metaworld import dataset
 from examples.metaworld.expert import demonstrate
-from examples.metaworld.tasks import INSTRUCTIONS
+from examples.metaworld.tasks import INSTRUCTIONS, SETS
 from examples.metaworld.world import IMAGE_SIZE, World
 
 FIRST_SEED = 1_000_000
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str]) -> int:
     context = multiprocessing.get_context("spawn")
     with context.Pool(options.processes) as pool:
         work = functools.partial(record, episodes=options.episodes)
-        for name, recorded, attempts, steps in pool.imap(work, options.tasks):
+        for name, recorded, attempts, steps in pool.imap(work, options.tasks or SETS[options.set]):
             writer.add_task(INSTRUCTIONS[name], recorded)
             frames = sum(len(pictures) for pictures, *_ in recorded)
             print(
@@ -68,7 +68,10 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m examples.metaworld.collect")
     add = parser.add_argument
     add("out", type=Path, help="folder to create")
-    add("--tasks", nargs="+", choices=INSTRUCTIONS, default=[*INSTRUCTIONS], metavar="TASK")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--tasks", nargs="+", choices=INSTRUCTIONS, metavar="TASK")
+    text = "all fifty tasks, the 45 or the 5 of ML45 (default: %(default)s)"
+    which.add_argument("--set", choices=SETS, default="mt50", help=text)
     add("--episodes", type=int, default=50, metavar="N", help="successful episodes per task")
     add("--processes", type=int, default=2, metavar="N")
     return parser

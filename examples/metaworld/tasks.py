@@ -66,3 +66,11 @@ GROUPS = {
 """Group -> task -> instruction."""
 INSTRUCTIONS = {task: text for tasks in GROUPS.values() for task, text in tasks.items()}
 """Task -> instruction."""
+HELD_OUT = ("bin-picking", "box-close", "door-lock", "door-unlock", "hand-insert")
+"""The five tasks of ML45's test set: `metaworld.env_dict.ML45_V3["test"]`."""
+SETS = {
+    "mt50": tuple(INSTRUCTIONS),
+    "ml45": tuple(task for task in INSTRUCTIONS if task not in HELD_OUT),
+    "ml5": HELD_OUT,
+}
+"""Name of a set of tasks -> its tasks; ml45 is what a policy learns before ml5."""
