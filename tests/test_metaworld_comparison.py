@@ -129,13 +129,14 @@ def test_a_server_that_dies_ends_the_judgment(stand_ins, monkeypatch, capsys):
 
 
 def test_jobs_share_the_gpus(stand_ins, monkeypatch):
-    code = "import os; open('gpus.txt', 'a').write(os.environ['CUDA_VISIBLE_DEVICES'] + ' ' + "
-    code += "os.environ['XLA_PYTHON_CLIENT_MEM_FRACTION'] + '\\n')\n"
+    names = "CUDA_VISIBLE_DEVICES", "MUJOCO_EGL_DEVICE_ID", "XLA_PYTHON_CLIENT_MEM_FRACTION"
+    code = f"import os; values = ' '.join(os.environ[name] for name in {names})\n"
+    code += "with open('gpus.txt', 'a') as file: file.write(values + '\\n')\n"
     monkeypatch.setattr(Cell, "train", lambda self, *_: python(code + TRAIN, self.run))
     pattern = ["--backbones", "pi0", "--only", "*_mt50_*", "--jobs", "4", "--gpus", "2"]
     assert compare.main(options(stand_ins, *pattern)) == 0
     lines = set((stand_ins / "gpus.txt").read_text().splitlines())
-    assert lines == {"0 0.450", "1 0.450"}
+    assert lines == {"0 0 0.450", "1 1 0.450"}
 
 
 def policy(right, ranks=None):

@@ -103,11 +103,13 @@ class Runner:
         """Return the environment of a job's processes, which share the GPUs."""
         if not self._options.gpus:
             return os.environ
+        gpu = str(place % self._options.gpus)
         share = 0.9 * self._options.gpus / max(self._options.jobs, self._options.gpus)
         return {
             "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{share:.3f}",
             **os.environ,
-            "CUDA_VISIBLE_DEVICES": str(place % self._options.gpus),
+            "CUDA_VISIBLE_DEVICES": gpu,
+            "MUJOCO_EGL_DEVICE_ID": gpu,
         }
 
 
