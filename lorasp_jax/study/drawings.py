@@ -51,7 +51,8 @@ DRAWINGS = {
         lambda book, b: [*_lora(book, b, "multi"), f"{b}/multi/full", *_lora_sp(book, b)],
         "Figure 1. Multi-task success relative to full fine-tuning, against rank",
         "The further left a point reaches the dotted line, the less rank the method needs; bands "
-        "and bars are 95 % intervals, and the paper's ranks are scaled from R = 128 to {rank}.",
+        "and bars are 95 % intervals, and the paper's ranks are scaled from R = 128 to {rank}. "
+        "LoRA-SP's point is at the number of directions that a token uses; it stores all {rank}.",
         alt="LoRA's success as a line over ranks, LoRA-SP's as a point at its mean active rank, "
         "and a horizontal line at 100 %.",
     ),
@@ -87,8 +88,8 @@ DRAWINGS = {
         task_figures.shared_directions,
         _lora_sp,
         "Figure A. Which directions tasks share in LoRA-SP",
-        "The further right of its ring a dot lies, the more two tasks share; dots are means over "
-        "seeds, thick lines span the seeds.",
+        "The further right of its ring a dot lies, the more two tasks share; dots and rings are "
+        "means over seeds, thick lines span the seeds.",
         alt="For each pair of tasks and each module, a dot for the overlap of directions, and a "
         "ring for what chance gives.",
     ),
@@ -96,8 +97,8 @@ DRAWINGS = {
         task_figures.gradients,
         task_figures.gradient_methods,
         "Figure B. Cosines of gradients after multi-task training",
-        "The closer a dot is to its ring, the less two tasks differ; dots are means over pairs of "
-        "tasks and seeds, thick lines span the seeds.",
+        "The closer a dot is to its ring, the less two tasks differ; dots and rings are means over "
+        "pairs and seeds, thick lines span the seeds.",
         alt="For each method, a dot for the cosine between two tasks, and a ring for that between "
         "two batches of one task.",
     ),

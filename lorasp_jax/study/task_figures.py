@@ -27,7 +27,7 @@ def shared_directions(book: Book) -> Figure:
             for row, pair in enumerate(pairs):
                 values = [cell[pair][tower] for cell in cells]
                 measured, chance = zip(*values, strict=True)
-                _dots(axes, row + offset, measured, float(np.mean(chance)), COLORS[tower])
+                _dots(axes, row + offset, measured, chance, COLORS[tower])
             axes.plot([], [], "o", color=COLORS[tower], label=tower)
         rows(axes, [_title(pair) for pair in pairs])
         axes.plot([], [], "o", mfc="none", color=FULL, label="by chance")
@@ -46,7 +46,7 @@ def gradients(book: Book) -> Figure:
         for row, method in enumerate(methods[backbone]):
             two, one = book.cosines(f"{backbone}/multi/{method}")
             color = LORA_SP if method == "lora_sp" else mpl.rcParams["text.color"]
-            _dots(axes, row, two, float(np.mean(one)), color)
+            _dots(axes, row, two, one, color)
         rows(axes, [naming.label(method, book.rank) for method in methods[backbone]])
         axes.axvline(0, color="gray", lw=1)
         axes.set_title(BACKBONES[backbone], loc="left")
@@ -65,12 +65,16 @@ def gradient_methods(book: Book, backbone: str) -> list[str]:
     return [f"{backbone}/multi/{method}" for method in methods if method != "lora_cut"]
 
 
-def _dots(axes: Axes, row: float, measured: Sequence[float], reference: float, color: str) -> None:
-    """Draw the mean over seeds, their range, and a gray ring to compare it with."""
-    axes.plot([float(np.mean(measured)), reference], [row, row], color=FULL, lw=0.5)
+def _dots(
+    axes: Axes, row: float, measured: Sequence[float], reference: Sequence[float], color: str
+) -> None:
+    """Draw means and ranges over seeds: a dot, and a gray ring to compare it with."""
+    dot, ring = float(np.mean(measured)), float(np.mean(reference))
+    axes.plot([dot, ring], [row, row], color=FULL, lw=0.5)
+    axes.plot([min(reference), max(reference)], [row, row], color=FULL, lw=1.5)
     axes.plot([min(measured), max(measured)], [row, row], color=color, lw=1.5)
-    axes.plot([np.mean(measured)], [row], "o", color=color, ms=5)
-    axes.plot([reference], [row], "o", color=FULL, ms=5, mfc="none")
+    axes.plot([dot], [row], "o", color=color, ms=5)
+    axes.plot([ring], [row], "o", color=FULL, ms=5, mfc="none")
 
 
 def _in_order(pairs: Iterable[str]) -> list[str]:

@@ -35,7 +35,8 @@ def test_missing_backbones_are_named():
 
 def test_a_finished_figure_lacks_nothing():
     text = drawings.markdown(Book(NAMES, synthetic.results()), "1")
-    assert "scaled from R = 128 to 64.*\n" in text
+    assert "scaled from R = 128 to 64. " in text
+    assert "it stores all 64.*\n" in text
     assert "so far" not in text
 
 

@@ -27,6 +27,15 @@ def test_shared_directions():
     assert dots(axes, 1) == pytest.approx(values.mean(0))
 
 
+def test_lines_span_the_seeds_of_dots_and_rings():
+    axes = task_figures.shared_directions(BOOK).axes[1]
+    cells = BOOK.measures("smolvla/multi/lora_sp", "direction_overlap")
+    values = np.array([cell["open_pot|press"]["language"] for cell in cells])
+    on_row = [x for x in axes.lines if np.asarray(x.get_ydata()).tolist() == [1, 1]]
+    ranges = [np.asarray(x.get_xdata()).tolist() for x in on_row if x.get_linewidth() > 1]
+    assert sorted(ranges) == sorted([v.min(), v.max()] for v in values.T)
+
+
 def test_rings_have_the_color_of_the_legend():
     for draw in (task_figures.shared_directions, task_figures.gradients):
         figure = draw(BOOK)
