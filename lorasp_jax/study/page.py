@@ -141,4 +141,7 @@ def _films(book: Book, names: Collection[str]) -> str:
 
 def _hours(book: Book) -> str:
     seconds = sum(cell["seconds"]["total"] for cell in book.results.values())
-    return f"The times of the {len(book.results)} finished runs sum to {seconds / 3600:.1f} hours."
+    return (
+        f"The {len(book.results)} finished runs took {seconds / 3600:.1f} hours in all, many of "
+        "them on shared GPUs."
+    )

@@ -148,7 +148,7 @@ def table_4(book: Book, backbone: str) -> str:
 
 def pruning(book: Book, backbone: str) -> str:
     """Return what pruning after training saves and costs."""
-    headers = ["method", "adapters [MB]", "action chunk [ms]", "success", "after pruning"]
+    headers = ["method", "adapters [MB]", "success", "after pruning"]
     rows = []
     methods = [m for m in book.methods(backbone, "multi") if m.endswith("_pruned")]
     for method in methods:
@@ -156,14 +156,10 @@ def pruning(book: Book, backbone: str) -> str:
         source = prefix.removesuffix("_pruned")
         name = naming.label(method.removesuffix("_pruned"), book.rank)
         if missing := book.missing(prefix, source):
-            rows.append([name, NONE, NONE, NONE, missing])
+            rows.append([name, NONE, NONE, missing])
             continue
-        smaller = book.measures(prefix, "smaller")
-        sizes = np.mean([s["bytes"] for s in smaller], axis=0) / 1e6
-        times = np.mean([s["milliseconds"] for s in smaller], axis=0)
-        rows.append(
-            [name, _arrow(sizes), _arrow(times), _success(book, source), _success(book, prefix)]
-        )
+        sizes = np.mean([s["bytes"] for s in book.measures(prefix, "smaller")], axis=0) / 1e6
+        rows.append([name, _arrow(sizes), _success(book, source), _success(book, prefix)])
     return markdown(headers, rows) if rows else ""
 
 
@@ -179,17 +175,12 @@ def robots(book: Book) -> str:
 
 
 def costs(book: Book, backbone: str) -> str:
-    """Return what each method of Table I costs."""
-    headers = [
-        *("method", "trainable", "GFLOP per sample", "memory [GiB]"),
-        *("samples/s", "seconds per run"),
-    ]
+    """Return what each method of Table I costs, without times: runs shared GPUs."""
+    headers = ["method", "trainable", "GFLOP per sample", "memory [GiB]"]
     fields = (
         (("trainable_parameters",), 1e-6, " M"),
         (("speed", "flops_per_sample"), 1e-9, ""),
         (("speed", "peak_bytes"), 2**-30, ""),
-        (("speed", "samples_per_second"), 1.0, ""),
-        (("seconds", "total"), 1.0, ""),
     )
     rows = []
     for method in book.table_1_methods(backbone):

@@ -84,6 +84,14 @@ def test_claims_come_first(complete):
     assert "{" not in complete.replace("{rank}", "?")
 
 
+def test_the_page_has_no_times_of_runs_that_shared_gpus(complete):
+    costs = section(complete, "Costs")
+    assert "samples/s" not in costs
+    assert "seconds" not in costs
+    assert "[ms]" not in complete
+    assert "takes 108 s" in costs
+
+
 def test_rank_maps_are_shown_if_there_are_any(tmp_path):
     (tmp_path / "figures").mkdir()
     page.write(synthetic.study("smoke"), {}, tmp_path)

@@ -60,7 +60,10 @@ def test_energy_targets_are_in_order():
 
 def test_pruning():
     cells = row(tables.pruning(BOOK, "smolvla"), "LoRA-SP, η = 0.7")
-    assert cells[1:3] == ["40.0 → 25.0", "5.00 → 4.20"]
+    assert cells[1] == "40.0 → 25.0"
+    rates = [BOOK.outcomes(f"smolvla/multi/lora_sp_eta_0.7{x}").mean() for x in ("", "_pruned")]
+    for text, rate in zip(cells[2:], rates, strict=True):  # and no time
+        assert text.startswith(f"{100 * rate:.1f} [")
     assert tables.pruning(BOOK, "pi0") == ""
 
 
@@ -99,7 +102,7 @@ def test_ranks_of_both_backbones():
 
 def test_costs():
     cells = row(tables.costs(BOOK, "pi0"), "LoRA, r = 64")
-    assert cells[1:] == ["5.76 M", "2.1", "5.59", "14,000", "110"]
+    assert cells[1:] == ["5.76 M", "2.1", "5.59"]
     assert "cut" not in tables.costs(BOOK, "pi0")
 
 
