@@ -157,3 +157,19 @@ def percent(estimate: Estimate) -> str:
     """Return a rate with its interval, such as "91.2 [89.0, 93.1]"."""
     value, low, high = (f"{100 * x:.1f}" for x in estimate)
     return f"{value} [{low}, {high}]"
+
+
+def points(estimate: Estimate) -> str:
+    """Return a difference of rates with its interval, such as "+1.2 points [−0.4, +2.9]"."""
+    value, low, high = (signed(100 * x) for x in estimate)
+    return f"{value} points [{low}, {high}]"
+
+
+def signed(value: float, digits: int = 1) -> str:
+    """Return a number with its sign, such as "−0.8"; zero has a plus."""
+    return f"{round(value, digits) + 0.0:+.{digits}f}".replace("-", "−")
+
+
+def on_each(texts: Mapping[str, str]) -> str:
+    """Join texts by backbone, such as "1.2 on π0 and 3.4 on SmolVLA"."""
+    return " and ".join(f"{text} on {BACKBONES[b]}" for b, text in texts.items())

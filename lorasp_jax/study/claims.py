@@ -6,7 +6,8 @@ the other side; otherwise the study cannot tell. A claim holds if all its tests 
 hold if one of them does not.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,6 +15,8 @@ from lorasp_jax.study.statistics import Estimate
 from lorasp_jax.study.study import Results
 
 Verdict = Literal["holds", "does not hold", "cannot be told", "not yet run"]
+MARGIN = 0.005
+"""By what share of a number's maximum a bound is moved to see whether a verdict is weak."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,7 @@ class Criterion:
         unit: "points" (the number is a difference of rates, shown times 100), "%" (a ratio, shown
             times 100) or "" (shown as it is).
         paper: the same number from the paper's tables; None: the paper does not report it.
+        maximum: the largest size that the number can have, in its own unit.
     """
 
     measure: str
@@ -40,6 +44,7 @@ class Criterion:
     reason: str
     unit: Literal["points", "%", ""] = "points"
     paper: float | None = None
+    maximum: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -95,10 +100,16 @@ def judge(test: Criterion, results: Results) -> Outcome:
     if missing:
         return Outcome("not yet run", None, missing, len(test.cells))
     estimate = test.estimate(results)
-    above, below = estimate.low > test.bound, estimate.high < test.bound
+    return Outcome(_compare(test, estimate), estimate, 0, len(test.cells))
+
+
+def _compare(test: Criterion, estimate: Estimate, easier: float = 0.0) -> Verdict:
+    """Compare an interval with a bound that is easier to meet by a share of the maximum."""
+    sign = 1 if test.side == "below" else -1
+    bound = test.bound + sign * easier * test.maximum
+    above, below = estimate.low > bound, estimate.high < bound
     right, wrong = (above, below) if test.side == "above" else (below, above)
-    found: Verdict = "holds" if right else "does not hold" if wrong else "cannot be told"
-    return Outcome(found, estimate, 0, len(test.cells))
+    return "holds" if right else "does not hold" if wrong else "cannot be told"
 
 
 def verdict(outcomes: Iterable[Outcome]) -> Verdict:
@@ -109,3 +120,16 @@ def verdict(outcomes: Iterable[Outcome]) -> Verdict:
     found = [outcome.verdict for outcome in outcomes]
     order: tuple[Verdict, ...] = ("does not hold", "not yet run", "cannot be told", "holds")
     return next(name for name in order if name in found)
+
+
+def is_weak(tests: Iterable[Criterion], outcomes: Sequence[Outcome]) -> bool:
+    """Return whether bounds that are easier or harder to meet by `MARGIN` change a verdict."""
+    pairs = [*zip(tests, outcomes, strict=True)]
+    moved = [
+        [
+            dataclasses.replace(o, verdict=_compare(t, o.estimate, easier)) if o.estimate else o
+            for t, o in pairs
+        ]
+        for easier in (MARGIN, -MARGIN)
+    ]
+    return any(verdict(found) != verdict(outcomes) for found in moved)

@@ -6,7 +6,7 @@ from typing import Any
 
 from envs.datasets.writing import write_text
 from lorasp_jax.config import Config
-from lorasp_jax.study import drawings, findings, tables, verdicts
+from lorasp_jax.study import drawings, findings, notes, tables, verdicts
 from lorasp_jax.study.book import BACKBONES, NONE, Book, markdown
 from lorasp_jax.study.claims import judge_all
 from lorasp_jax.study.rank_text import where_rank_goes
@@ -54,7 +54,9 @@ def page(study: Study, results: Mapping[str, Any], films: Collection[str] = ()) 
             summary=verdicts.summary(study.claims, book, judged),
             verdicts=verdicts.table(study.claims, book, judged),
             numbers=verdicts.numbers(study.claims, book, judged),
-            highest_rank=verdicts.highest_rank(book),
+            highest_rank=notes.highest_rank(book),
+            without_state=notes.without_state(book),
+            cost_of_cut=notes.cost_of_cut(book),
             reasons=verdicts.reasons(study.claims),
             experts=findings.experts(book),
             edges=findings.edges(book),

@@ -2,9 +2,8 @@
 
 from collections.abc import Iterable
 
-from lorasp_jax.study import published, statistics
-from lorasp_jax.study.book import BACKBONES, NONE, Book, markdown, percent
-from lorasp_jax.study.claims import Claim, Criterion, Judged, Outcome, verdict
+from lorasp_jax.study.book import BACKBONES, NONE, Book, markdown, signed
+from lorasp_jax.study.claims import Claim, Criterion, Judged, Outcome, is_weak, verdict
 
 _WORDS = {
     "holds": ("holds", "hold"),
@@ -16,17 +15,19 @@ _WORDS = {
 
 
 def summary(claims: tuple[Claim, ...], book: Book, judged: Judged) -> str:
-    """Count the claims with each verdict, by backbone."""
+    """Count the claims with each verdict and name the weak ones, by backbone."""
     lines = []
     for backbone in book.backbones:
         verdicts = {c.number: _verdict(judged, c, backbone) for c in claims}
+        weak = [str(c.number) for c in claims if _weak(judged, c, backbone)]
         parts = []
         for name, words in _WORDS.items():
             if numbers := [number for number, found in verdicts.items() if found == name]:
                 text = f"**{len(numbers)} {words[len(numbers) > 1]}**"
                 parts.append(f"{text} ({', '.join(map(str, numbers))})")
         tested = len(claims) - [*verdicts.values()].count(NONE)
-        lines.append(f"- {BACKBONES[backbone]}: of {tested} claims, {', '.join(parts)}")
+        line = f"- {BACKBONES[backbone]}: of {tested} claims, {', '.join(parts)}"
+        lines.append(line + (f"; [weak](#claims): {', '.join(weak)}" if weak else ""))
     return "\n".join(lines)
 
 
@@ -41,11 +42,20 @@ def table(claims: tuple[Claim, ...], book: Book, judged: Judged) -> str:
 
 
 def _shown(claim: Claim, book: Book, judged: Judged, backbone: str) -> str:
-    """Return a claim's verdict, or how many of its runs there are."""
+    """Return a claim's verdict and whether it is weak, or how many of its runs there are."""
     found = _verdict(judged, claim, backbone)
     if found == "not yet run":
         return book.missing_cells({n for test in claim.tests[backbone] for n in test.cells})
-    return found if found == NONE else f"**{found}**"
+    if found == NONE:
+        return found
+    return f"**{found}**{' (weak)' * _weak(judged, claim, backbone)}"
+
+
+def _weak(judged: Judged, claim: Claim, backbone: str) -> bool:
+    """Return whether a claim has a verdict on a backbone, but a weak one."""
+    if _verdict(judged, claim, backbone) in (NONE, "not yet run"):
+        return False
+    return is_weak(claim.tests[backbone], judged[claim.number, backbone])
 
 
 def _verdict(judged: Judged, claim: Claim, backbone: str) -> str:
@@ -71,24 +81,6 @@ def numbers(claims: tuple[Claim, ...], book: Book, judged: Judged) -> str:
     return markdown(["claim", "number", "must be", *titles], rows)
 
 
-def highest_rank(book: Book) -> str:
-    """Return how near LoRA with r = R comes to full fine-tuning, which claim 3 does not test."""
-    parts = []
-    methods = f"multi/lora_r{book.rank}", "multi/full"
-    for backbone in book.complete(*methods):
-        prefixes = [f"{backbone}/{method}" for method in methods]
-        ratio = statistics.bootstrap(statistics.ratio, *map(book.outcomes, prefixes))
-        rates = [r for p in prefixes if (r := published.rates(p, book.rank)) is not None]
-        paper = f" ({100 * statistics.ratio(*rates):.1f})" if len(rates) == 2 else ""
-        parts.append(f"{percent(ratio)}{paper} on {BACKBONES[backbone]}")
-    if not parts:
-        return ""
-    return (
-        "Claim 3 would also hold if no rank reached 95 % of full fine-tuning's success. LoRA with "
-        f"r = {book.rank} reaches, in %, {' and '.join(parts)}.\n"
-    )
-
-
 def reasons(claims: Iterable[Claim]) -> str:
     """Return a list of the reasons for all bounds."""
     found = dict[str, list[int]]()
@@ -107,8 +99,15 @@ def _measured(test: Criterion, outcome: Outcome) -> str:
     paper = "" if test.paper is None else f" ({_number(test.paper, test)})"
     if outcome.estimate is None:
         return f"{outcome.cells - outcome.missing} of {outcome.cells} runs so far{paper}"
-    value, low, high = (_number(x, test) for x in outcome.estimate)
-    return f"{value} [{low}, {high}]{paper}: {outcome.verdict}"
+    value, low, high = outcome.estimate
+    ends = f"[{_end(low, test)}, {_end(high, test)}]"
+    return f"{_number(value, test)} {ends}{paper}: {outcome.verdict}"
+
+
+def _end(value: float, test: Criterion) -> str:
+    """Return the end of an interval, with one more digit if it would look like the bound."""
+    text = _number(value, test)
+    return _number(value, test, 1) if text == _number(test.bound, test) else text
 
 
 def _bound(test: Criterion) -> str:
@@ -117,10 +116,10 @@ def _bound(test: Criterion) -> str:
     return f"{test.side} {test.bound * scale:g}{unit}".replace("-", "−")
 
 
-def _number(value: float, test: Criterion) -> str:
-    """Return a number in a criterion's unit, differences with a sign."""
+def _number(value: float, test: Criterion, more: int = 0) -> str:
+    """Return a number in a criterion's unit, differences with a sign; `more` digits than usual."""
     if test.unit == "%":
-        return f"{100 * value:.1f}"
-    points = round(100 * value, 1) + 0.0  # no minus zero
-    text = f"{points:+.1f}" if test.unit else f"{value + 0.0:+#.3g}"
-    return text.replace("-", "−")
+        return f"{100 * value:.{1 + more}f}"
+    if test.unit:
+        return signed(100 * value, 1 + more)
+    return f"{value + 0.0:+#.{3 + more}g}".replace("-", "−")

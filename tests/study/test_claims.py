@@ -1,5 +1,7 @@
 """Verdicts follow from the interval's place relative to the bound; missing cells are counted."""
 
+import dataclasses
+
 import pytest
 
 from lorasp_jax.study import claims
@@ -51,6 +53,34 @@ def test_verdict_of_a_test(side, interval, expected):
 )
 def test_verdict_of_a_claim(verdicts, expected):
     assert verdict([Outcome(v, None, 0, 1) for v in verdicts]) == expected
+
+
+@pytest.mark.parametrize(
+    ("intervals", "expected"),
+    [
+        ([(0.004, 0.3)], True),  # holds, but not with a bound of 0.005
+        ([(0.006, 0.3)], False),
+        ([(-0.3, -0.004)], True),
+        ([(-0.3, -0.006)], False),
+        ([(-0.004, 0.3)], True),
+        ([(-0.3, 0.004)], True),
+        ([(-0.3, 0.3)], False),
+        ([(-0.3, -0.004), (-0.3, -0.1)], False),  # the other one decides
+        ([(-0.3, 0.3), (0.004, 0.3)], False),
+        ([(0.1, 0.3), (0.004, 0.3)], True),
+        ([(-0.3, -0.1), None], False),
+    ],
+)
+@pytest.mark.parametrize(("scale", "side"), [(1.0, "above"), (64.0, "above"), (1.0, "below")])
+def test_weak_verdicts_change_with_the_bound(intervals, expected, scale, side):
+    tests, outcomes = [], []
+    for ends in intervals:
+        sign = 1 if side == "above" else -1
+        interval = sorted(sign * scale * end for end in ends) if ends else ()
+        test = dataclasses.replace(criterion(side, 0.0), maximum=scale)
+        tests.append(test)
+        outcomes.append(judge(test, {"cell": (0.0, *interval)} if ends else {}))
+    assert claims.is_weak(tests, outcomes) is expected
 
 
 def test_all_ten_claims():

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from lorasp_jax.evaluation.metrics import position_bias
-from lorasp_jax.study import page, results
+from lorasp_jax.study import claims, page, results
 from lorasp_jax.study.__main__ import main
 from tests import ROOT
 from tests.study import synthetic
@@ -82,6 +82,12 @@ def test_claims_come_first(complete):
     assert rows == [str(number) for number in range(1, 11)]
     assert "| training, all tasks | 5,000 steps of 128 samples, AdamW |" in complete
     assert "{" not in complete.replace("{rank}", "?")
+
+
+def test_fixed_numbers_in_the_text(complete):
+    """Those of the rule for weak verdicts."""
+    assert f"bounds that are {100 * claims.MARGIN:g} points easier or harder" in complete
+    assert f"for ranks and shares, {100 * claims.MARGIN:g} % of the largest" in complete
 
 
 def test_the_page_has_no_times_of_runs_that_shared_gpus(complete):

@@ -200,6 +200,23 @@ def test_claim_on_embodiments_compares_every_module():
         assert outcome.estimate.value == pytest.approx(0.2, abs=0.05)
 
 
+def test_claim_on_ranks_names_those_that_it_averages():
+    losses, spreads = (test.measure for test in STUDY.claims[3].tests["smolvla"])
+    assert "averaged over r = 4, 8, 16, 32: multi" in losses
+    assert "averaged over r = 4, 8, 16, 32, 64: multi" in spreads
+    cells = STUDY.claims[3].tests["smolvla"][0].cells
+    assert {name.split("/")[2] for name in cells} == {
+        "full",
+        *(f"lora_r{2**n}" for n in range(2, 6)),
+    }
+
+
+def test_numbers_know_how_large_they_can_be():
+    largest = {t.maximum for claim in STUDY.claims for t in claim.tests["smolvla"]}
+    assert largest == {1.0, 64.0}
+    assert {test.maximum for test in STUDY.claims[7].tests["pi0"]} == {64.0}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["open_pot", "pour", "press", "pick_place"])
 def test_the_side_camera_sees_all_objects_in_the_new_scene(task):

@@ -6,7 +6,8 @@ import pytest
 
 from lorasp_jax.study import verdicts
 from lorasp_jax.study.book import Book
-from lorasp_jax.study.claims import judge_all
+from lorasp_jax.study.claims import Claim, Criterion, judge_all
+from lorasp_jax.study.statistics import Estimate
 from tests.study import synthetic
 
 CLAIMS = synthetic.study().claims
@@ -62,11 +63,32 @@ def test_numbers_of_both_backbones(some):
     ]
 
 
-def test_the_highest_rank_is_beside_claim_3(some):
-    assert shown(lambda _, book, __: verdicts.highest_rank(book), some) == ""
-    text = shown(lambda _, book, __: verdicts.highest_rank(book), synthetic.results())
-    assert re.search(
-        r"reaches, in %, \d+\.\d \[.*\] \(72\.0\) on π0 and .*\(69\.2\) on SmolVLA", text
+def claim_on(*interval, unit="points"):
+    """A claim on π0 with one test, whose number must lie above 0.95."""
+    estimate = lambda results: Estimate(*interval)  # noqa: E731
+    test = Criterion("number", ("pi0/x",), estimate, "above", 0.95, "reason", unit)
+    return Claim(1, "claim", "paper", {"pi0": (test,)})
+
+
+@pytest.mark.parametrize(("low", "weak"), [(0.953, True), (0.956, False), (0.0, False)])
+def test_weak_verdicts_are_marked(low, weak):
+    claims, results = (claim_on(0.97, low, 0.98),), {"pi0/x": {}}
+    book, judged = Book(("pi0/x",), results), judge_all(claims, results)
+    cell = rows(verdicts.table(claims, book, judged))[0][2]
+    assert cell.endswith("** (weak)") == weak
+    assert verdicts.summary(claims, book, judged).endswith("; [weak](#claims): 1") == weak
+    assert "weak" not in verdicts.summary(claims, Book(("pi0/x",), {}), judge_all(claims, {}))
+
+
+@pytest.mark.parametrize(
+    ("low", "unit", "shown"),
+    [(0.9498, "%", "94.98"), (0.9502, "points", "+95.02"), (0.9494, "%", "94.9")],
+)
+def test_an_interval_that_ends_near_the_bound_does_not_seem_to_end_on_it(low, unit, shown):
+    claims, results = (claim_on(0.97, low, 0.98, unit=unit),), {"pi0/x": {}}
+    book, judged = Book(("pi0/x",), results), judge_all(claims, results)
+    assert f" [{shown}, " in rows(verdicts.numbers(claims, book, judged))[0][3].replace(
+        "\u00a0", " "
     )
 
 
