@@ -4,8 +4,13 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from lorasp_jax.study import naming, statistics
-from lorasp_jax.study.book import BACKBONES, TASKS, Book
+from lorasp_jax.study import naming, published, statistics
+from lorasp_jax.study.book import BACKBONES, TASKS, Book, on_each, points
+
+_FEW = 0.1
+"""Share of the adapters below which pruning removes little."""
+_EASY = 0.975
+"""Rate above which a task is easy; it prints as 98 %."""
 
 
 def experts(book: Book) -> str:
@@ -48,12 +53,15 @@ def pruned(book: Book) -> str:
 def _pruned(book: Book, backbone: str) -> str:
     source = f"{backbone}/multi/lora_sp"
     sizes = np.mean([s["bytes"] for s in book.measures(f"{source}_pruned", "smaller")], axis=0)
-    both = book.outcomes(f"{source}_pruned"), book.outcomes(source)
-    change, low, high = (100 * x + 0.0 for x in statistics.difference(*both))
-    points = f"{change:+.1f} points [{low:+.1f}, {high:+.1f}]".replace("-", "−")
+    share, rank = 1 - sizes[1] / sizes[0], book.mean(source, "active_rank", "mean")
+    change = statistics.difference(book.outcomes(f"{source}_pruned"), book.outcomes(source))
+    few = share < _FEW
+    why = ", because nearly every direction serves some token" if few else ""
     return (
-        f"On {BACKBONES[backbone]}, it shrinks LoRA-SP's adapters by "
-        f"{100 * (1 - sizes[1] / sizes[0]):.0f} % and changes success by {points}."
+        f"On {BACKBONES[backbone]}, pruning removes {'only ' if few else ''}{100 * share:.0f} % of "
+        f"LoRA-SP's adapters although a token uses {rank:.0f} of {book.rank} directions{why}. "
+        f"Success changes by {points(change)}."
+        f"{' A low active rank is not a small adapter.' if few else ''}"
     )
 
 
@@ -74,16 +82,79 @@ def _shared_directions(book: Book, backbone: str) -> str:
 
 
 def gradients(book: Book) -> str:
-    """Say how far tasks pull LoRA-SP in the same direction; "" before the runs."""
-    return _paragraph(_gradients(book, b) for b in book.complete("multi/lora_sp"))
-
-
-def _gradients(book: Book, backbone: str) -> str:
-    cosines = map(np.mean, book.cosines(f"{backbone}/multi/lora_sp"))
-    two, one = (f"{cosine:.2f}".replace("-", "−") for cosine in cosines)
+    """Give the mean cosines of LoRA-SP and full fine-tuning; "" before the runs."""
+    texts = []
+    for method in ("lora_sp", "full"):
+        done = book.complete(f"multi/{method}")
+        found = {b: _cosines(book, f"{b}/multi/{method}") for b in done}
+        texts += [f"{naming.label(method, book.rank)} {on_each(found)}"] if found else []
+    if not texts:
+        return ""
     return (
-        f"For LoRA-SP on {BACKBONES[backbone]}, the cosine is {two} between tasks and {one} "
-        "between two batches of one task."
+        "Mean cosine between two tasks against that between two batches of one: "
+        f"{'; '.join(texts)}.\n\n"
+    )
+
+
+def _cosines(book: Book, prefix: str) -> str:
+    two, one = (f"{np.mean(c) + 0.0:.2f}".replace("-", "−") for c in book.cosines(prefix))
+    return f"{two} against {one}"
+
+
+def easy_tasks(book: Book) -> str:
+    """Name the tasks that all trained methods of Table I solve; "" if these are none or all."""
+    found: dict[str, list[float]] = {}
+    for backbone in book.backbones:
+        methods = (m for m in book.table_1_methods(backbone) if m != "lora_cut")
+        for prefix in (f"{backbone}/multi/{method}" for method in methods):
+            if not book.missing(prefix):
+                means = book.outcomes(prefix).mean((0, 2))
+                for task, rate in zip(book.tasks(prefix), means, strict=True):
+                    found.setdefault(task, []).append(float(rate))
+    easy = [TASKS[task] for task in TASKS if min(found.get(task, [0])) > _EASY]
+    if not 0 < len(easy) < len(found):
+        return ""
+    names = " and ".join(f"“{name}”" for name in easy)
+    halved = ", so the mean over all tasks about halves them" if 2 * len(easy) == len(found) else ""
+    lowest = min(min(found[task]) for task in TASKS if TASKS[task] in easy)
+    return (
+        f"- In {names}, every trained method of Table I has {100 * lowest:.0f} to 100 % success. "
+        f"Differences come from the other tasks{halved}.\n"
+    )
+
+
+def harder_scene(book: Book) -> str:
+    """Say that the seen robot has the harder scene; "" if it has not on every backbone."""
+    found = {}
+    for backbone in book.complete("panda/full", "multi/full"):
+        kinds = "panda", "multi"
+        seen, unseen = (book.outcomes(f"{backbone}/{kind}/full").mean() for kind in kinds)
+        if seen >= unseen:
+            return ""
+        found[backbone] = f"{100 * seen:.1f} % against {100 * unseen:.1f} %"
+    if not found:
+        return ""
+    return (
+        f"The Panda's new scene is harder than PiPER's: after training, {on_each(found)}. A "
+        "failure of claim 5 in one scene and with one pretraining does not refute it in general."
+        "\n\n"
+    )
+
+
+def adapter_sizes(book: Book) -> str:
+    """Compare the size of LoRA's adapters with that of the base; "" before the runs."""
+    found = {}
+    for backbone in book.complete(f"multi/lora_r{book.rank}"):
+        prefix = f"{backbone}/multi/lora_r{book.rank}"
+        own, total = (book.mean(prefix, f"{k}_parameters") or 0.0 for k in ("trainable", "total"))
+        paper = published.cell(prefix, book.rank).get("trainable")
+        theirs = f" ({100 * paper / (100 - paper):.0f} in the paper)" if paper else ""
+        found[backbone] = f"{100 * own / (total - own):.0f}{theirs}"
+    if not found:
+        return ""
+    return (
+        "At this size, adapters are not small: in % of the base's parameters, LoRA with r = R has "
+        f"{on_each(found)}."
     )
 
 

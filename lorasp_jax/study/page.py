@@ -38,44 +38,56 @@ def write(study: Study, results: Mapping[str, Any], folder: Path) -> None:
 
 def page(study: Study, results: Mapping[str, Any], films: Collection[str] = ()) -> str:
     """Return the page in Markdown; `films` are the names of the rank maps in figures/."""
-    book = _book(study, results)
-    judged = judge_all(study.claims, results)
-    by_backbone = tables.table_1, tables.table_3, tables.table_4, tables.pruning, tables.costs
-    return (
-        Path(__file__)
-        .with_name("page.md")
-        .read_text()
-        .format(
-            rank=book.rank,
-            missing=_missing(book),
-            progress=_progress(book),
-            size=_size(book),
-            setup=setup_table(book, _config(study)),
-            summary=verdicts.summary(study.claims, book, judged),
-            verdicts=verdicts.table(study.claims, book, judged),
-            numbers=verdicts.numbers(study.claims, book, judged),
-            highest_rank=notes.highest_rank(book),
-            without_state=notes.without_state(book),
-            cost_of_cut=notes.cost_of_cut(book),
-            reasons=verdicts.reasons(study.claims),
-            experts=findings.experts(book),
-            edges=findings.edges(book),
-            table_2=tables.table_2(book) or _NO_CELLS,
-            table_2_by_task="\n".join(tables.table_2_by_task(book, b) for b in book.backbones),
-            pruned=findings.pruned(book),
-            shared_directions=findings.shared_directions(book),
-            gradients=findings.gradients(book),
-            robots=tables.robots(book) or _NO_CELLS,
-            rates=tables.rates(book),
-            where_rank_goes=where_rank_goes(book),
-            films=_films(book, films),
-            **{f"figure_{name}": drawings.markdown(book, name) for name in drawings.DRAWINGS},
-            **{table.__name__: _by_backbone(book, table) for table in by_backbone},
-        )
+    book, config = _book(study, results), _config(study)
+    template = Path(__file__).with_name("page.md").read_text()
+    return template.format(
+        rank=book.rank,
+        setup=setup_table(book, config),
+        image_size=config.image_size,
+        demonstrations=config.data.episodes,
+        films=_films(book, films),
+        **_judged(study, book),
+        **{sentences.__name__: sentences(book) for sentences in _SENTENCES},
+        **_tables(book),
+        **{f"figure_{name}": drawings.markdown(book, name) for name in drawings.DRAWINGS},
     )
 
 
+def _judged(study: Study, book: Book) -> dict[str, str]:
+    """Return what the page says about the claims, by its place in page.md."""
+    claims, judged = study.claims, judge_all(study.claims, book.results)
+    return {
+        "missing": _missing(book),
+        "progress": _progress(book),
+        "size": _size(book),
+        "summary": verdicts.summary(claims, book, judged),
+        "verdicts": verdicts.table(claims, book, judged),
+        "numbers": verdicts.numbers(claims, book, judged),
+        "reasons": verdicts.reasons(claims),
+        "tests": str(sum(map(len, judged.values()))),
+    }
+
+
+def _tables(book: Book) -> dict[str, str]:
+    """Return the tables of results, by their places in page.md."""
+    by_backbone = tables.table_1, tables.table_3, tables.table_4, tables.pruning, tables.costs
+    return {
+        "table_2": tables.table_2(book) or _NO_CELLS,
+        "table_2_by_task": "\n".join(tables.table_2_by_task(book, b) for b in book.backbones),
+        "robots": tables.robots(book) or _NO_CELLS,
+        "rates": tables.rates(book),
+        **{table.__name__: _by_backbone(book, table) for table in by_backbone},
+    }
+
+
 _NO_CELLS = "The study has no runs for this.\n"
+_SENTENCES = (
+    where_rank_goes,
+    *(notes.highest_rank, notes.without_state, notes.cost_of_cut),
+    *(findings.experts, findings.edges, findings.pruned, findings.shared_directions),
+    *(findings.gradients, findings.easy_tasks, findings.harder_scene, findings.adapter_sizes),
+)
+"""Each is named as its place in page.md."""
 
 
 def _book(study: Study, results: Mapping[str, Any]) -> Book:

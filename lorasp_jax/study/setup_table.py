@@ -4,6 +4,7 @@ import importlib
 from collections.abc import Iterable
 
 from lorasp_jax.config import Config
+from lorasp_jax.peft import LoRASP
 from lorasp_jax.study import naming, published
 from lorasp_jax.study.book import BACKBONES, NONE, Book, markdown
 
@@ -33,6 +34,12 @@ def setup_table(book: Book, config: Config) -> str:
         ["training, all tasks", training, NONE],
         ["adapted layers", layers, "not stated; the parameter counts fit all linear layers"],
         ["R, size of LoRA-SP's bank", str(book.rank), str(published.RANK)],
+        [
+            "LoRA-SP's router",
+            f"two layers, {LoRASP().hidden_width} hidden units, softplus; our choice",
+            "two layers, width not stated; the parameter counts fit "
+            f"{LoRASP.paper().hidden_width} hidden units and a softmax",
+        ],
         ["evaluation", episodes, "probably 15 episodes per task"],
         ["success", f"state of the simulation, within {_time_limits(config.tasks)} s", NONE],
     ]

@@ -10,9 +10,24 @@ NAMES = tuple(synthetic.cells())
 BOOK = Book(NAMES, synthetic.cells())
 
 
-@pytest.mark.parametrize("name", ["experts", "edges", "pruned", "shared_directions", "gradients"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("experts", "edges", "pruned", "shared_directions", "gradients"),
+        *("easy_tasks", "harder_scene", "adapter_sizes"),
+    ],
+)
 def test_nothing_is_said_before_the_runs(name):
     assert getattr(findings, name)(Book(NAMES, {})) == ""
+
+
+def changed(prefix, **fields):
+    """Results in which all cells of some methods have other content."""
+    results = dict(synthetic.results())
+    for name in NAMES:
+        if name.startswith(prefix):
+            results[name] = results[name] | fields
+    return Book(NAMES, results)
 
 
 def test_experts():
@@ -34,9 +49,15 @@ def test_methods_whose_best_rate_is_at_the_edge_are_named():
 def test_pruning():
     text = findings.pruned(BOOK)
     assert text.startswith(
-        "On SmolVLA, it shrinks LoRA-SP's adapters by 38 % and changes success by"
+        "On SmolVLA, pruning removes 38 % of LoRA-SP's adapters although a token uses 20 of 64 "
+        "directions. Success changes by "
     )
     assert text.endswith("].")
+    measures = {"smaller": {"bytes": [100, 97]}}
+    text = findings.pruned(changed("smolvla/multi/lora_sp_pruned", measures=measures))
+    assert "removes only 3 % of" in text
+    assert "64 directions, because nearly every direction serves some token. Success" in text
+    assert text.endswith("A low active rank is not a small adapter.")
 
 
 def test_pairs_of_tasks():
@@ -52,7 +73,46 @@ def test_pairs_of_tasks():
         "On π0, “pour” and “press” share the most directions (overlap 0.90, by chance 0.40), "
         "“open the pot” and “press” the fewest (0.50, by chance 0.30).\n\n"
     )
-    assert findings.gradients(book) == (
-        "For LoRA-SP on π0, the cosine is −0.25 between tasks and 0.50 between two batches of one "
-        "task.\n\n"
+    assert findings.gradients(book).startswith(
+        "Mean cosine between two tasks against that between two batches of one: LoRA-SP −0.25 "
+        "against 0.50 on π0; full fine-tuning "
+    )
+
+
+def test_easy_tasks():
+    assert findings.easy_tasks(BOOK) == ""
+    results = dict(synthetic.results())
+    for name in NAMES:
+        if "/multi/" in name and "lora_cut" not in name:
+            outcomes = {"open_pot": "1" * 99 + "0", "pour": "1" * 100, "press": "1" * 50 + "0" * 50}
+            results[name] = results[name] | {"outcomes": outcomes | {"pick_place": "0" * 100}}
+    assert findings.easy_tasks(Book(NAMES, results)) == (
+        "- In “open the pot” and “pour”, every trained method of Table I has 99 to 100 % success. "
+        "Differences come from the other tasks, so the mean over all tasks about halves them.\n"
+    )
+    name = "smolvla/multi/dora/s0"
+    results[name] = results[name] | {
+        "outcomes": results[name]["outcomes"] | {"pour": "1" * 90 + "0" * 10}
+    }
+    text = findings.easy_tasks(Book(NAMES, results))
+    assert text.startswith("- In “open the pot”, ")
+    assert text.endswith("the other tasks.\n")
+
+
+def test_the_harder_scene():
+    tasks = ("open_pot", "pour", "press", "pick_place")
+    book = changed(("pi0/panda", "smolvla/panda"), outcomes=dict.fromkeys(tasks, "1000" * 8))
+    rates = [100 * book.outcomes(f"{b}/multi/full").mean() for b in ("pi0", "smolvla")]
+    assert findings.harder_scene(book).startswith(
+        "The Panda's new scene is harder than PiPER's: after training, "
+        f"25.0 % against {rates[0]:.1f} % on π0 and 25.0 % against {rates[1]:.1f} % on SmolVLA. A "
+    )
+    easier = changed("smolvla/panda", outcomes=dict.fromkeys(tasks, "1111" * 8))
+    assert findings.harder_scene(easier) == ""
+
+
+def test_adapters_are_not_small():
+    assert findings.adapter_sizes(BOOK) == (
+        "At this size, adapters are not small: in % of the base's parameters, LoRA with r = R has "
+        "58 (10 in the paper) on π0 and 58 (20 in the paper) on SmolVLA."
     )

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from lorasp_jax.evaluation.metrics import position_bias
-from lorasp_jax.study import claims, page, results
+from lorasp_jax.study import claims, page, published, results
 from lorasp_jax.study.__main__ import main
 from tests import ROOT
 from tests.study import synthetic
@@ -84,10 +84,23 @@ def test_claims_come_first(complete):
     assert "{" not in complete.replace("{rank}", "?")
 
 
+def test_limits_come_before_the_claims(complete):
+    assert complete.index("## What this study cannot say") < complete.index("## Claims")
+    limits = section(complete, "What this study cannot say")
+    assert "pictures have 64 x 64 pixels" in limits
+    assert "scripts, 512 per task;" in limits
+    count = sum(len(tests) for claim in synthetic.study().claims for tests in claim.tests.values())
+    assert f"- The {count} tests behind the verdicts are not corrected" in limits
+
+
 def test_fixed_numbers_in_the_text(complete):
-    """Those of the rule for weak verdicts."""
+    """Those of the paper and of the rule for weak verdicts."""
+    towers = published.cell("smolvla/multi/lora_sp", 64)["towers"]
+    assert towers == [84, 35, 34]
+    assert f"exceeds {sum(towers) / 3:.0f}, the plain mean of" in complete
     assert f"bounds that are {100 * claims.MARGIN:g} points easier or harder" in complete
     assert f"for ranks and shares, {100 * claims.MARGIN:g} % of the largest" in complete
+    assert "for LoRA of rank r, that of the paper's rank 2r, since R is 64 here" in complete
 
 
 def test_the_page_has_no_times_of_runs_that_shared_gpus(complete):

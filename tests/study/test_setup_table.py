@@ -16,6 +16,8 @@ def test_numbers():
     assert "| 512, by a scripted expert | 120, teleoperated |" in text
     assert "| all linear layers |" in text
     assert "| 64 | 128 |" in text
+    assert "two layers, 32 hidden units, softplus; our choice | two layers, width" in text
+    assert "the parameter counts fit 4 hidden units and a softmax |" in text
     assert "| 256 episodes per task and seed, 3 seeds |" in text
     assert "within 8 to 20 s" in text
 
