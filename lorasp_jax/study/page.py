@@ -9,6 +9,8 @@ from lorasp_jax.config import Config
 from lorasp_jax.study import drawings, findings, notes, tables, verdicts
 from lorasp_jax.study.book import BACKBONES, NONE, Book, markdown
 from lorasp_jax.study.claims import judge_all
+from lorasp_jax.study.main_result import main_result
+from lorasp_jax.study.no_gain import no_gain
 from lorasp_jax.study.rank_text import where_rank_goes
 from lorasp_jax.study.setup_table import setup_table
 from lorasp_jax.study.study import Cell, Study
@@ -82,7 +84,7 @@ def _tables(book: Book) -> dict[str, str]:
 
 _NO_CELLS = "The study has no runs for this.\n"
 _SENTENCES = (
-    where_rank_goes,
+    *(main_result, no_gain, where_rank_goes),
     *(notes.highest_rank, notes.without_state, notes.cost_of_cut),
     *(findings.experts, findings.edges, findings.pruned, findings.shared_directions),
     *(findings.gradients, findings.easy_tasks, findings.harder_scene, findings.adapter_sizes),

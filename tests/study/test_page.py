@@ -93,6 +93,18 @@ def test_limits_come_before_the_claims(complete):
     assert f"- The {count} tests behind the verdicts are not corrected" in limits
 
 
+def test_results_speak_before_limits_and_after_table_1():
+    """If LoRA-SP does not gain, the page says so at the top, and why below Table I."""
+    found = dict(synthetic.cells())
+    for name, cell in synthetic.cells().items():
+        if "/multi/lora_sp/" in name:
+            found[name] = cell | {"outcomes": found[name.replace("_sp", "_r64")]["outcomes"]}
+    text = page.page(synthetic.study(), found)
+    assert "**Main result: LoRA-SP shows no gain" in text.partition("## What this study")[0]
+    assert "### Why LoRA-SP does not gain here" in text.partition("### Table I:")[2]
+    assert text.index("### Why LoRA-SP") < text.index("### Table II")
+
+
 def test_fixed_numbers_in_the_text(complete):
     """Those of the paper and of the rule for weak verdicts."""
     towers = published.cell("smolvla/multi/lora_sp", 64)["towers"]
