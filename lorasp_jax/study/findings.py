@@ -115,11 +115,11 @@ def easy_tasks(book: Book) -> str:
     if not 0 < len(easy) < len(found):
         return ""
     names = " and ".join(f"“{name}”" for name in easy)
-    halved = ", so the mean over all tasks about halves them" if 2 * len(easy) == len(found) else ""
+    halved = ", so the mean over tasks about halves them" if 2 * len(easy) == len(found) else ""
     lowest = min(min(found[task]) for task in TASKS if TASKS[task] in easy)
     return (
         f"- In {names}, every trained method of Table I has {100 * lowest:.0f} to 100 % success. "
-        f"Differences come from the other tasks{halved}.\n"
+        f"Differences come mostly from the others{halved}.\n"
     )
 
 
