@@ -1,20 +1,36 @@
 """Test the comparison on Meta-World: its commands, its jobs and its tables."""
 
 import json
+import os
+import signal
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
 
 from examples.metaworld import compare, page
-from examples.metaworld.cells import METHODS, RATES, SEEDS, Cell, cells
+from examples.metaworld.cells import SEEDS, STAGES, Cell, cells
 from examples.metaworld.tasks import GROUPS, HELD_OUT, SETS
 from lorasp_jax import peft
+from lorasp_jax.evaluation import __main__ as evaluation
+from lorasp_jax.serving import __main__ as serving
 from lorasp_jax.training import overrides
 from tests import ROOT
+from tests.metaworld_files import write_judged
 
 ALL = [*cells(("pi0", "smolvla"))]
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """Work in a folder with the project's files and without runs."""
+    for name in ("configs", "assets", "train.py"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
 
 
 def test_sets_split_the_fifty_tasks():
@@ -23,126 +39,206 @@ def test_sets_split_the_fifty_tasks():
 
 
 def test_every_method_has_three_seeds_on_both_sets():
-    assert len(ALL) == len({cell.name for cell in ALL}) == 2 * 2 * len(METHODS) * len(SEEDS)
+    names = [cell.name for cell in ALL]
+    assert len(names) == len(set(names))
+    for backbone in ("pi0", "smolvla"):
+        for stage in ("mt50", "ml5"):
+            of_stage = [n for n in names if n.startswith(f"metaworld_{backbone}_{stage}_")]
+            assert len(of_stage) == 5 * 3
 
 
-@pytest.mark.parametrize("cell", ALL[::3], ids=lambda cell: cell.name)
-def test_train_command_sets_the_run(cell, monkeypatch):
-    monkeypatch.chdir(ROOT)
-    python, script, *arguments = cell.train(Path("data"), ["--optim.batch-size", "64"])
+def test_cells_come_after_those_that_they_need():
+    seen = set()
+    for cell in ALL:
+        assert seen.issuperset(cell.needs)
+        seen.add(cell)
+
+
+def test_rate_is_that_of_the_best_pilot(place):
+    cell = Cell("pi0", "mt50", "lora_r16", 1)
+    for pilot, right in zip(cell.pilots, (2, 4, 3), strict=True):
+        assert pilot.method == "lora_r64"
+        write_judged(pilot, right)
+    assert cell.rate() == cell.pilots[1].pilot_rate == 1e-3
+    assert cell.pilots[2].rate() == 3e-3
+
+
+CHECKED = [cell for cell in ALL if cell.seed in (1, 1000)]
+
+
+@pytest.mark.parametrize("cell", CHECKED, ids=lambda cell: cell.name)
+def test_train_command_sets_the_run(cell, place):
+    for pilot in cell.pilots:
+        write_judged(pilot, int(pilot.pilot_rate == 3e-3))
+    python, script, *arguments = cell.train(Path("data"))
     assert (python, script) == (sys.executable, "train.py")
-    config = overrides.parse([*arguments, "--scale", "accelerator"]).config
-    kinds = {
-        "lora_sp": peft.LoRASP,
-        "ada_lora": peft.AdaLoRA,
-        "full": peft.FullFineTuning,
-    }
+    config = overrides.parse(arguments).config
+    kinds = {"lora_sp": peft.LoRASP, "ada_lora": peft.AdaLoRA, "full": peft.FullFineTuning}
     assert type(config.peft) is kinds.get(cell.method, peft.LoRA)
     rank = {"full": None, "lora_r16": 16}.get(cell.method, 64)
     assert getattr(config.peft, "rank", None) == rank
     assert (config.name, config.seed) == (cell.name, cell.seed)
-    assert config.model.backbone == cell.backbone
-    assert config.data.source == f"data/{cell.tasks}"
-    assert config.optim.learning_rate == RATES[cell.backbone].get(cell.method, 1e-3)
-    assert config.optim.batch_size == 64
+    assert (config.model.backbone, config.model.size) == (cell.backbone, "small")
+    assert config.data.source == f"data/{STAGES[cell.stage].tasks}"
+    assert config.optim.steps == STAGES[cell.stage].steps
+    assert config.optim.learning_rate == (cell.pilot_rate or 3e-3)
     base = f"runs/metaworld_{cell.backbone}_ml45_full_s0/base"
     bundled = f"assets/{cell.backbone}_small"
-    assert config.model.source == (base if cell.tasks == "ml5" else bundled)
+    assert config.model.source == (base if cell.stage == "ml5" else bundled)
 
 
-def test_judge_command_names_the_tasks():
-    command = Cell("pi0", "ml5", "full", 0).judge("python", 8101, 7, 3)
-    text = " ".join(command)
-    assert "--server ws://127.0.0.1:8101" in text
-    assert f"--tasks {' '.join(HELD_OUT)} --episodes 7 --processes 3" in text
+def test_serve_and_judge_commands_fit_their_parsers():
+    cell = Cell("pi0", "ml5", "full", 0)
+    *_, module = cell.serve(8101)[:3]
+    served = serving.parser("").parse_args(cell.serve(8101)[3:])
+    judged = evaluation.parser("").parse_args(cell.judge("python", 8101, 3)[3:])
+    assert module == "lorasp_jax.serving"
+    assert served.policy == [str(cell.run)]
+    assert judged.server == f"ws://{served.host}:{served.port}"
+    assert (judged.tasks, judged.episodes, judged.processes) == ([*HELD_OUT], 10, 3)
+    assert judged.out == cell.judged
 
 
-def options(tmp_path, *more):
-    (tmp_path / "page.md").write_text(f"Before.\n\n{page.BEGIN}old{page.END}\nAfter.\n")
-    files = ["--results", str(tmp_path / "r.json"), "--page", str(tmp_path / "page.md")]
-    return [*files, "--judge", "python", *more]
+@pytest.mark.parametrize("wrong", [{"episodes": 3}, {"seed": 7}])
+def test_other_episodes_are_refused(wrong, place):
+    cell = Cell("pi0", "ml5", "full", 0)
+    write_judged(cell, 1, **wrong)
+    with pytest.raises(ValueError, match=r"judged.json has other tasks or episodes: delete it"):
+        cell.outcomes()
+
+
+def options(folder, *more):
+    (folder / "page.md").write_text(f"Before.\n\n{page.BEGIN}old{page.END}\nAfter.\n")
+    files = ["--results", str(folder / "r.json"), "--page", str(folder / "page.md")]
+    return [*files, "--judge", sys.executable, *more]
 
 
 def python(code, *arguments):
     return [sys.executable, "-c", code, *map(str, arguments)]
 
 
-TRAIN = """
-import json, pathlib, sys
-run = pathlib.Path(sys.argv[1])
-(run / "base").mkdir(parents=True)
-ranks = {"active_rank/vision": 3.25, "active_rank/vision/q_proj": 9.0, "loss": 1.0}
-(run / "metrics.jsonl").write_text("{}\\n" + json.dumps(ranks) + "\\n")
-with open("order.txt", "a") as order: order.write(f"{run.name}\\n")
-"""
-JUDGE = """
-import json, pathlib, sys
-outcomes = {task: {"outcomes": [True, False]} for task in sys.argv[2:]}
-pathlib.Path(sys.argv[1]).write_text(json.dumps({"tasks": outcomes}))
-"""
+HEAD = f"import os, sys, time; sys.path.insert(0, {str(ROOT)!r})\n"
+TRAIN = "with open('order.txt', 'a') as file: file.write(sys.argv[1] + '\\n')\n"
+JUDGE = "from examples.metaworld.cells import cells; from tests.metaworld_files import *\n"
+JUDGE += "every = cells(('pi0', 'smolvla'))\n"
+JUDGE += "write_judged(next(cell for cell in every if cell.name == sys.argv[1]), 1)\n"
+SLEEP = "time.sleep(60)\n"
 
 
 @pytest.fixture
-def stand_ins(tmp_path, monkeypatch):
-    """Replace the commands of cells by ones that write the same files at once."""
-    monkeypatch.chdir(tmp_path)
+def stand_ins(place, monkeypatch):
+    """Replace the commands of cells by ones that leave the same files at once."""
     monkeypatch.setattr(compare, "POLL", 0.05)
-    monkeypatch.setattr(Cell, "train", lambda self, *_: python(TRAIN, self.run))
-    monkeypatch.setattr(Cell, "serve", lambda *_: python("import time; time.sleep(60)"))
-    monkeypatch.setattr(
-        Cell, "judge", lambda self, *_: python(JUDGE, self.judged, *SETS[self.tasks])
-    )
-    return tmp_path
+    monkeypatch.setattr(Cell, "train", lambda self, *_: python(HEAD + TRAIN, self.name))
+    monkeypatch.setattr(Cell, "serve", lambda *_: python(HEAD + SLEEP))
+    monkeypatch.setattr(Cell, "judge", lambda self, *_: python(HEAD + JUDGE, self.name))
+    return place
 
 
-def test_cells_run_once_and_after_their_base(stand_ins):
-    pattern = ["--backbones", "pi0", "--only", "*_ml5_lora_r*", "--jobs", "3"]
-    arguments = options(stand_ins, *pattern)
+def trained(folder):
+    return (folder / "order.txt").read_text().split()
+
+
+def test_cells_run_once_and_after_those_that_they_need(stand_ins):
+    arguments = options(stand_ins, "--only", "metaworld_pi0_ml5_full_*", "--jobs", "2")
     assert compare.main(arguments) == 0
-    order = (stand_ins / "order.txt").read_text().split()
-    assert order[0] == "metaworld_pi0_ml45_full_s0"
-    assert len(order) == 1 + 2 * len(SEEDS)
+    order = trained(stand_ins)
+    assert sorted(order[:3]) == sorted(cell.name for cell in Cell("pi0", "ml5", "full", 0).pilots)
+    assert order[3] == "metaworld_pi0_ml45_full_s0"
+    assert len(order) == 3 + 1 + len(SEEDS)
     results = json.loads((stand_ins / "r.json").read_text())
-    assert results["metaworld_pi0_ml5_lora_r16_s1"] == {
+    assert results["metaworld_pi0_ml5_full_s1"] == {
         "active_rank": {"vision": 3.25},
-        "outcomes": dict.fromkeys(sorted(HELD_OUT), "10"),
+        "outcomes": dict.fromkeys(sorted(HELD_OUT), "1" + "0" * 9),
+        "rate": 0.5,
+        "trainable": 0.25,
     }
     assert compare.main(arguments) == 0
-    assert (stand_ins / "order.txt").read_text().split() == order
+    assert trained(stand_ins) == order
 
 
-def test_a_failed_command_is_named_and_stops_no_other(stand_ins, monkeypatch, capsys):
+def test_failures_are_named_and_stop_no_other(stand_ins, monkeypatch, capsys):
     def train(self, *_):
-        return python("raise SystemExit(3)" if self.seed == 1 else TRAIN, self.run)
+        return python("raise SystemExit(3)" if self.pilot_rate == 1e-3 else HEAD + TRAIN, self.name)
 
     monkeypatch.setattr(Cell, "train", train)
-    assert compare.main(options(stand_ins, "--only", "metaworld_pi0_mt50_full_*")) == 1
-    assert "training of metaworld_pi0_mt50_full_s1 failed: see" in capsys.readouterr().err
-    assert len(json.loads((stand_ins / "r.json").read_text())) == len(SEEDS) - 1
+    assert compare.main(options(stand_ins, "--only", "metaworld_pi0_mt50_full_s0")) == 1
+    errors = capsys.readouterr().err
+    assert "training of metaworld_pi0_pilot_full_0.001 failed: see" in errors
+    assert "metaworld_pi0_mt50_full_s0 needs a policy that failed" in errors
+    assert len(json.loads((stand_ins / "r.json").read_text())) == 2
 
 
 def test_a_server_that_dies_ends_the_judgment(stand_ins, monkeypatch, capsys):
     monkeypatch.setattr(Cell, "serve", lambda *_: python("raise SystemExit(2)"))
-    monkeypatch.setattr(Cell, "judge", lambda *_: python("import time; time.sleep(60)"))
-    assert compare.main(options(stand_ins, "--only", "metaworld_pi0_mt50_full_s0")) == 1
-    assert "serving of metaworld_pi0_mt50_full_s0 failed" in capsys.readouterr().err
+    monkeypatch.setattr(Cell, "judge", lambda *_: python(HEAD + SLEEP))
+    only = "metaworld_pi0_pilot_full_0.001"
+    assert compare.main(options(stand_ins, "--only", only)) == 1
+    assert f"serving of {only} failed" in capsys.readouterr().err
 
 
-def test_jobs_share_the_gpus(stand_ins, monkeypatch):
-    names = "CUDA_VISIBLE_DEVICES", "MUJOCO_EGL_DEVICE_ID", "XLA_PYTHON_CLIENT_MEM_FRACTION"
-    code = f"import os; values = ' '.join(os.environ[name] for name in {names})\n"
+def test_a_damaged_file_is_named_and_hides_no_other(stand_ins, capsys):
+    first, second, _ = Cell("pi0", "mt50", "full", 0).pilots
+    write_judged(first, 1)
+    write_judged(second, 1)
+    first.judged.write_text("{")
+    arguments = options(stand_ins, "--only", "*pilot_full*", "--backbones", "pi0", "--no-run")
+    assert compare.main(arguments) == 1
+    assert "0.0003/judged.json is damaged, delete it" in capsys.readouterr().err
+    assert [*json.loads((stand_ins / "r.json").read_text())] == [second.name]
+
+
+def test_a_missing_judge_is_refused_at_once(stand_ins, capsys):
+    with pytest.raises(SystemExit):
+        compare.main(options(stand_ins, "--judge", "nowhere/python"))
+    assert "--judge must be the Python with metaworld, got 'nowhere/python'" in (
+        capsys.readouterr().err
+    )
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_all_processes(stand_ins, monkeypatch, number):
+    code = HEAD + "with open('pids.txt', 'a') as file: file.write(f'{os.getpid()}\\n')\n" + SLEEP
+    monkeypatch.setattr(Cell, "train", lambda *_: python(code))
+
+    def interrupt():
+        while not (stand_ins / "pids.txt").exists():
+            time.sleep(0.05)
+        os.kill(os.getpid(), number)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    assert compare.main(options(stand_ins, "--only", "*pilot_full*", "--jobs", "2")) == 130
+    thread.join()
+    pids = (stand_ins / "pids.txt").read_text().split()
+    assert len(pids) <= 2
+    assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
+
+
+@pytest.mark.parametrize(
+    ("jobs", "visible", "expected"),
+    [
+        ("4", "", {"0 0.450", "1 0.450"}),
+        ("3", "", {"0 0.450", "1 0.450"}),
+        ("2", "5,7", {"5 0.900", "7 0.900"}),
+    ],
+)
+def test_jobs_share_the_gpus(stand_ins, monkeypatch, jobs, visible, expected):
+    names = "CUDA_VISIBLE_DEVICES", "XLA_PYTHON_CLIENT_MEM_FRACTION"
+    code = f"values = ' '.join(os.environ[name] for name in {names})\n"
     code += "with open('gpus.txt', 'a') as file: file.write(values + '\\n')\n"
-    monkeypatch.setattr(Cell, "train", lambda self, *_: python(code + TRAIN, self.run))
-    pattern = ["--backbones", "pi0", "--only", "*_mt50_*", "--jobs", "4", "--gpus", "2"]
+    monkeypatch.setattr(Cell, "train", lambda self, *_: python(HEAD + code, self.name))
+    monkeypatch.delenv("XLA_PYTHON_CLIENT_MEM_FRACTION", raising=False)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    pattern = ["--only", "metaworld_pi0_pilot*", "--jobs", jobs, "--gpus", "2"]
     assert compare.main(options(stand_ins, *pattern)) == 0
-    lines = set((stand_ins / "gpus.txt").read_text().splitlines())
-    assert lines == {"0 0 0.450", "1 1 0.450"}
+    assert set((stand_ins / "gpus.txt").read_text().splitlines()) == expected
 
 
 def policy(right, ranks=None):
     """Return a result that succeeds in the first `right` of ten episodes of each task."""
     outcomes = dict.fromkeys(SETS["mt50"], "1" * right + "0" * (10 - right))
-    return {"outcomes": outcomes, "active_rank": ranks or {}}
+    return {"outcomes": outcomes, "active_rank": ranks or {}, "rate": 1e-3, "trainable": 0.25}
 
 
 def synthetic():
@@ -161,14 +257,15 @@ def test_table_has_groups_means_and_paired_differences():
     rows = [line.split(" | ") for line in page.tables(synthetic()).splitlines() if "|" in line]
     by_label = {row[0].strip("| "): row[1:] for row in rows}
     ours, other = by_label["LoRA-SP, R = 64"], by_label["LoRA, r = 64"]
-    assert ours[0] == "11.0, 3.0"
-    assert ours[1:5] == ["60.0", "60.0", "60.0", "40.0"]
-    assert ours[5].startswith("58.0 [")
-    assert ours[6] == "– |"
-    assert other[5].startswith("40.0 [")
-    assert other[6].startswith("−18.0 [−")
-    assert by_label["full fine-tuning"][0] == "–"
-    assert by_label["AdaLoRA, mean r = 16"][0] == "1 of 3 seeds so far"
+    assert ours[:3] == ["0.001", "25.0 %", "11.0, 3.0"]
+    assert ours[3:7] == ["60.0", "60.0", "60.0", "40.0"]
+    assert ours[7].startswith("58.0 [")
+    assert ours[8] == "– |"
+    assert other[7].startswith("40.0 [")
+    assert other[8].startswith("−18.0 [−")
+    assert by_label["full fine-tuning"][2] == "–"
+    assert by_label["AdaLoRA, 64 cut to a mean of 16"][-1] == "1 of 3 seeds so far |"
+    assert len({len(row) for row in rows}) == 1
     assert "SmolVLA" not in page.tables(synthetic())
 
 

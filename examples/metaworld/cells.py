@@ -9,7 +9,7 @@ from typing import Any
 
 from examples.metaworld.tasks import SETS
 
-SEEDS = (0, 1, 2)
+SEEDS, PILOT_SEED = (0, 1, 2), 1000
 METHODS = {
     "lora_sp": ("--method", "lora_sp", "--peft.rank", "64"),
     "lora_r64": ("--method", "lora", "--peft.rank", "64"),
@@ -18,12 +18,35 @@ METHODS = {
     "full": ("--method", "full"),
 }
 """Name of a method -> its options of train.py."""
-RATES = {
-    "pi0": {"full": 3e-4, "ada_lora": 3e-3},
-    "smolvla": {"ada_lora": 3e-3},
+RATES = (3e-4, 1e-3, 3e-3)
+"""Learning rates, of which short pilots choose one per backbone and method."""
+TUNED_AS = {"lora_r16": "lora_r64"}
+"""Method -> the method whose rate it takes."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """How the policies of one kind are trained and judged.
+
+    Attributes:
+        tasks: what they learn and are judged on, a key of `SETS`.
+        steps: training steps.
+        episodes: judged episodes per task.
+        first_seed: seed of the first episode.
+    """
+
+    tasks: str
+    steps: int
+    episodes: int
+    first_seed: int = 0
+
+
+STAGES = {
+    "pilot": Stage("mt50", 2_500, 5, 10_000),
+    "mt50": Stage("mt50", 10_000, 10),
+    "ml45": Stage("ml45", 10_000, 0),  # only a base
+    "ml5": Stage("ml5", 2_000, 10),
 }
-"""Learning rates other than 1e-3: those that docs/study.md found best, on other tasks."""
-STEPS = {"mt50": 10_000, "ml45": 10_000, "ml5": 2_000}
 
 
 @dataclass(frozen=True)
@@ -32,20 +55,23 @@ class Cell:
 
     Attributes:
         backbone: pi0 or smolvla.
-        tasks: what it learns, a key of `SETS`.
+        stage: a key of `STAGES`.
         method: a key of `METHODS`.
         seed: its seed.
+        pilot_rate: learning rate of a pilot; others take that of the best pilot.
     """
 
     backbone: str
-    tasks: str
+    stage: str
     method: str
     seed: int
+    pilot_rate: float = 0.0
 
     @property
     def name(self) -> str:
         """Name of its run, and of its entry in the results."""
-        return f"metaworld_{self.backbone}_{self.tasks}_{self.method}_s{self.seed}"
+        last = f"{self.pilot_rate:g}" if self.pilot_rate else f"s{self.seed}"
+        return f"metaworld_{self.backbone}_{self.stage}_{self.method}_{last}"
 
     @property
     def run(self) -> Path:
@@ -53,58 +79,109 @@ class Cell:
         return Path("runs") / self.name
 
     @property
+    def pilots(self) -> tuple["Cell", ...]:
+        """The policies whose success decides its learning rate."""
+        if self.pilot_rate:
+            return ()
+        method = TUNED_AS.get(self.method, self.method)
+        return tuple(Cell(self.backbone, "pilot", method, PILOT_SEED, rate) for rate in RATES)
+
+    @property
     def base(self) -> "Cell | None":
         """The fully fine-tuned policy that it starts from; None: the bundled base."""
-        return Cell(self.backbone, "ml45", "full", 0) if self.tasks == "ml5" else None
+        return Cell(self.backbone, "ml45", "full", 0) if self.stage == "ml5" else None
 
-    def train(self, data: Path, more: Sequence[str] = ()) -> list[str]:
+    @property
+    def needs(self) -> tuple["Cell", ...]:
+        """The policies that must be finished first."""
+        return (*self.pilots, self.base) if self.base else self.pilots
+
+    def rate(self) -> float:
+        """Return its learning rate, which the finished pilots decide."""
+        best = max(self.pilots, key=lambda pilot: pilot.success(), default=self)
+        return best.pilot_rate
+
+    def train(self, data: Path) -> list[str]:
         """Return the command that trains it on demonstrations in `data`, or resumes its run."""
-        rate = RATES[self.backbone].get(self.method, 1e-3)
+        stage = STAGES[self.stage]
         options = {
             "name": self.name,
             "seed": self.seed,
-            "data.source": data / self.tasks,
+            "data.source": data / stage.tasks,
             "model.backbone": self.backbone,
-            "optim.steps": STEPS[self.tasks],
-            "optim.learning-rate": rate,
+            "optim.steps": stage.steps,
+            "optim.learning-rate": self.rate(),
         }
         if self.base:
             options["model.checkpoint"] = self.base.run / "base"
         pairs = [text for key, value in options.items() for text in (f"--{key}", str(value))]
-        start = [sys.executable, "train.py", "--config", "configs/metaworld.py", "--resume", "auto"]
-        return [*start, *METHODS[self.method], *pairs, *more]
+        start = [sys.executable, "train.py", "--config", "configs/metaworld.py"]
+        start += ["--scale", "accelerator", "--resume", "auto"]
+        return [*start, *METHODS[self.method], *pairs]
 
     def serve(self, port: int) -> list[str]:
         """Return the command that serves it."""
         command = [sys.executable, "-m", "lorasp_jax.serving", str(self.run)]
         return [*command, "--port", str(port), "--seed", "0"]
 
-    def judge(self, python: str, port: int, episodes: int, processes: int) -> list[str]:
+    def judge(self, python: str, port: int, processes: int) -> list[str]:
         """Return the command that judges it, in another Python environment."""
+        stage = STAGES[self.stage]
         return [
             *(python, "-m", "lorasp_jax.evaluation"),
             *("--server", f"ws://127.0.0.1:{port}", "--wait", "600"),
-            *("--env", "examples.metaworld.world:mt50", "--tasks", *SETS[self.tasks]),
-            *("--episodes", str(episodes), "--processes", str(processes)),
-            *("--out", str(self.judged)),
+            *("--env", "examples.metaworld.world:mt50", "--tasks", *SETS[stage.tasks]),
+            *("--episodes", str(stage.episodes), "--seed", str(stage.first_seed)),
+            *("--processes", str(processes), "--out", str(self.judged)),
         ]
 
     @property
     def judged(self) -> Path:
-        """File with its episodes, which exists once it is finished."""
+        """File with its episodes, written last."""
         return self.run / "judged.json"
 
+    def success(self) -> float:
+        """Return its success rate; see `outcomes` for errors."""
+        digits = "".join(self.outcomes().values())
+        return digits.count("1") / len(digits)
+
+    def outcomes(self) -> dict[str, str]:
+        """Return a digit per episode, 1 for success, by task.
+
+        Raises:
+            ValueError: the file is damaged, or has other episodes than this comparison's.
+        """
+        stage, judged = STAGES[self.stage], _read(self.judged)
+        tasks = {n: "".join(str(int(o)) for o in t["outcomes"]) for n, t in judged["tasks"].items()}
+        right = [judged["seed"] == stage.first_seed, set(tasks) == set(SETS[stage.tasks])]
+        if not all([*right, *(len(text) == stage.episodes for text in tasks.values())]):
+            raise ValueError(f"{self.judged} has other tasks or episodes: delete it")
+        return tasks
+
     def result(self) -> dict[str, Any]:
-        """Return its outcomes by task, a digit per episode, and its active ranks by module."""
-        tasks = json.loads(self.judged.read_text())["tasks"]
-        *_, last = (self.run / "metrics.jsonl").read_text().splitlines()
-        ranks = {
-            key.split("/")[1]: value for key, value in json.loads(last).items() if _is_rank(key)
-        }
+        """Return its outcomes, active ranks by module, learning rate and trainable share.
+
+        Raises:
+            ValueError: see `outcomes`; also if a file of the run is damaged.
+        """
+        outcomes, run = self.outcomes(), _read(self.run / "results.json")
+        *_, last = (self.run / "metrics.jsonl").read_text().splitlines() or [""]
+        metrics = {} if last == "" else json.loads(last)
+        ranks = {key.split("/")[1]: value for key, value in metrics.items() if _is_rank(key)}
         return {
-            "outcomes": {n: "".join(str(int(o)) for o in t["outcomes"]) for n, t in tasks.items()},
+            "outcomes": outcomes,
             "active_rank": ranks,
+            "rate": _read(self.run / "config.json")["optim"]["learning_rate"],
+            "trainable": run["trainable_parameters"] / run["total_parameters"],
         }
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Read a JSON file; a damaged one raises ValueError with its name."""
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged, delete it: {error}") from error
 
 
 def _is_rank(key: str) -> bool:
@@ -113,9 +190,15 @@ def _is_rank(key: str) -> bool:
 
 
 def cells(backbones: Sequence[str]) -> Iterator[Cell]:
-    """Yield all cells of the comparison, without the bases."""
+    """Yield all policies of the comparison, each after those that it needs."""
     for backbone in backbones:
-        for tasks in ("mt50", "ml5"):
+        for method in METHODS:
+            if method not in TUNED_AS:
+                yield from Cell(backbone, "mt50", method, 0).pilots
+    for backbone in backbones:
+        yield Cell(backbone, "ml45", "full", 0)
+    for backbone in backbones:
+        for stage in ("mt50", "ml5"):
             for method in METHODS:
                 for seed in SEEDS:
-                    yield Cell(backbone, tasks, method, seed)
+                    yield Cell(backbone, stage, method, seed)

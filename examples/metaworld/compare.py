@@ -3,30 +3,35 @@
     python -m examples.metaworld.compare --judge ~/metaworld/bin/python
 
 Needs the demonstrations of `python -m examples.metaworld.collect` in data/mt50, data/ml45 and
-data/ml5. Stopped at any moment, the same command goes on. `--no-run` writes the page again.
+data/ml5. After Ctrl-C or SIGTERM, the same command goes on. `--no-run` only writes the page again.
 """
 
 import argparse
 import concurrent.futures
 import contextlib
 import fnmatch
-import json
 import os
 import queue
+import shutil
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
+from envs.datasets.writing import write_text
 from examples.metaworld import page
-from examples.metaworld.cells import Cell, cells
+from examples.metaworld.cells import STAGES, Cell, cells
+from lorasp_jax.training.interrupt import sigterm_as_interrupt
 
 FIRST_PORT = 8100
 LOGS = Path("runs/metaworld_logs")
 POLL = 1.0
 """Time between two looks at a judge and its server [s]."""
+INTERRUPTED = 130
 
 
 class Runner:
@@ -38,32 +43,32 @@ class Runner:
         self._places = queue.SimpleQueue[int]()
         for place in range(options.jobs):
             self._places.put(place)
+        self._lock, self._stopped = threading.Lock(), False
+        self._running = list[subprocess.Popen]()
 
-    def finish(self, cell: Cell, base: concurrent.futures.Future | None) -> None:
-        """Train and judge a cell, as soon as the base that it starts from is trained.
+    def finish(self, cell: Cell, needs: Sequence[Future[None]]) -> None:
+        """Train and judge a cell, as soon as the cells that it needs are finished.
 
         Raises:
-            ValueError: a command failed.
+            ValueError: a command failed, here or for a cell that it needs, or `stop` was called.
         """
-        if base:
-            base.result()
+        if any(need.exception() for need in needs):
+            raise ValueError(f"{cell.name} needs a policy that failed")
         with self._place() as place:
             started = time.perf_counter()
             self._train(cell, place)
             trained = time.perf_counter()
-            self._judge(cell, place)
+            if STAGES[cell.stage].episodes:
+                self._judge(cell, place)
         times = trained - started, time.perf_counter() - trained
         print(f"{cell.name}: trained in {times[0]:.0f} s, judged in {times[1]:.0f} s", flush=True)
 
-    def make_base(self, cell: Cell) -> None:
-        """Train a policy that others start from, unless that is done.
-
-        Raises:
-            ValueError: the command failed.
-        """
-        if not (cell.run / "base").exists():
-            with self._place() as place:
-                self._train(cell, place)
+    def stop(self) -> None:
+        """Tell all processes to save and stop, and start no others."""
+        with self._lock:
+            self._stopped = True
+            for process in self._running:
+                process.terminate()
 
     @contextlib.contextmanager
     def _place(self) -> Iterator[int]:
@@ -75,42 +80,53 @@ class Runner:
             self._places.put(place)
 
     def _train(self, cell: Cell, place: int) -> None:
-        command = cell.train(self._options.data, self._options.train)
-        with _log(cell) as log:
-            code = self._start(command, place, log).wait()
-        _check(cell, "training", code)
+        with _log(cell) as log, self._process(cell.train(self._options.data), place, log) as train:
+            _check(cell, "training", train.wait())
 
     def _judge(self, cell: Cell, place: int) -> None:
-        options, port = self._options, FIRST_PORT + place
-        judge = cell.judge(options.judge, port, options.episodes, options.processes)
-        with _log(cell) as log:
-            server = self._start(cell.serve(port), place, log)
-            judging = self._start(judge, place, log)
-            try:
-                while judging.poll() is None:
-                    _check(cell, "serving", server.poll() or 0)
-                    time.sleep(POLL)
-            finally:
-                for process in (judging, server):
-                    process.terminate()
-                    process.wait()
-        _check(cell, "judging", judging.returncode)
+        port = FIRST_PORT + place
+        judge = cell.judge(self._options.judge, port, self._options.processes)
+        with (
+            _log(cell) as log,
+            self._process(cell.serve(port), place, log) as serving,
+            self._process(judge, place, log) as judging,
+        ):
+            while judging.poll() is None:
+                _check(cell, "serving", serving.poll() or 0)
+                time.sleep(POLL)
+            _check(cell, "judging", judging.returncode)
 
-    def _start(self, command: Sequence[str], place: int, log: IO[str]) -> subprocess.Popen:
-        return subprocess.Popen(command, stdout=log, stderr=log, env=self._environment(place))
+    @contextlib.contextmanager
+    def _process(self, command: Sequence[str], place: int, log: IO[str]) -> Iterator[Any]:
+        """Start a process, and end it after this block."""
+        with self._lock:
+            if self._stopped:
+                raise ValueError("stopped")
+            process = subprocess.Popen(
+                command,
+                stdout=log,
+                stderr=log,
+                env=self._environment(place),
+                start_new_session=True,  # Ctrl-C reaches only this command, which then calls `stop`
+            )
+            self._running.append(process)
+        try:
+            yield process
+        finally:
+            process.terminate()
+            process.wait()
 
     def _environment(self, place: int) -> Mapping[str, str]:
         """Return the environment of a job's processes, which share the GPUs."""
-        if not self._options.gpus:
-            return os.environ
-        gpu = str(place % self._options.gpus)
-        share = 0.9 * self._options.gpus / max(self._options.jobs, self._options.gpus)
-        return {
-            "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{share:.3f}",
-            **os.environ,
-            "CUDA_VISIBLE_DEVICES": gpu,
-            "MUJOCO_EGL_DEVICE_ID": gpu,
-        }
+        jobs, gpus = self._options.jobs, self._options.gpus
+        found = dict(os.environ)
+        if jobs > 1:
+            share = 0.9 / -(-jobs // gpus)
+            found.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", f"{share:.3f}")
+        if gpus > 1:
+            visible = found.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(gpus)))
+            found["CUDA_VISIBLE_DEVICES"] = visible.split(",")[place % gpus]
+        return found
 
 
 def _log(cell: Cell) -> IO[str]:
@@ -125,32 +141,76 @@ def _check(cell: Cell, what: str, code: int) -> None:
 
 def main(arguments: Sequence[str]) -> int:
     """Run the missing cells and write the page; return the exit code."""
-    options = _parser().parse_args(arguments)
-    chosen = [c for c in cells(options.backbones) if fnmatch.fnmatchcase(c.name, options.only)]
-    failed = 0 if options.no_run else _run(options, chosen)
-    found = json.loads(options.results.read_text()) if options.results.exists() else {}
-    found |= {cell.name: cell.result() for cell in chosen if cell.judged.exists()}
-    options.results.write_text(page.dumps(found))
-    page.write(found, options.page)
-    print(f"{len(found)} policies in {options.results}; written: {options.page}")
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if not options.no_run and not shutil.which(options.judge):
+        parser.error(f"--judge must be the Python with metaworld, got {options.judge!r}")
+    known = page.load(options.results)
+    chosen = _chosen(options)
+    try:
+        failed = 0 if options.no_run else _run(options, chosen)
+    except KeyboardInterrupt:
+        print("stopped; to go on, give the same command", file=sys.stderr)
+        return INTERRUPTED
+    for cell in chosen:
+        try:
+            known |= {cell.name: cell.result()} if cell.judged.exists() else {}
+        except ValueError as error:
+            print(f"error: {error}", file=sys.stderr)
+            failed += 1
+    write_text(options.results, page.dumps(known))
+    page.write(known, options.page)
+    print(f"{len(known)} policies in {options.results}; written: {options.page}")
     return 1 if failed else 0
+
+
+def _chosen(options: argparse.Namespace) -> list[Cell]:
+    """Return the cells of --backbones and --only, and those that they need, in order."""
+    every = [*cells(options.backbones)]
+    wanted = {cell for cell in every if fnmatch.fnmatchcase(cell.name, options.only)}
+    for cell in reversed(every):
+        wanted |= {*cell.needs} if cell in wanted else set()
+    return [cell for cell in every if cell in wanted]
 
 
 def _run(options: argparse.Namespace, chosen: Sequence[Cell]) -> int:
     """Run the cells that are not finished; return how many failed."""
-    runner, failed = Runner(options), 0
-    missing = [cell for cell in chosen if not cell.judged.exists()]
-    bases = dict.fromkeys(cell.base for cell in missing if cell.base)
-    with concurrent.futures.ThreadPoolExecutor(options.jobs) as pool:
-        made = {base: pool.submit(runner.make_base, base) for base in bases}
-        jobs = [pool.submit(runner.finish, c, c.base and made[c.base]) for c in missing]
-        for job in concurrent.futures.as_completed(jobs):
+    runner, failed, jobs = Runner(options), 0, dict[Cell, Future[None]]()
+    with ThreadPoolExecutor(options.jobs) as pool, _stopping(runner, pool):
+        for cell in _missing(chosen):
+            needs = [jobs[need] for need in cell.needs if need in jobs]
+            jobs[cell] = pool.submit(runner.finish, cell, needs)
+        for job in concurrent.futures.as_completed(jobs.values()):
             try:
                 job.result()
-            except ValueError as error:
+            except (ValueError, OSError) as error:
                 print(f"error: {error}", file=sys.stderr)
                 failed += 1
     return failed
+
+
+def _missing(chosen: Sequence[Cell]) -> list[Cell]:
+    """Return the cells that are not judged, and the bases that these start from."""
+    unjudged = {c for c in chosen if STAGES[c.stage].episodes and not c.judged.exists()}
+    return [c for c in chosen if c in unjudged or any(c == other.base for other in unjudged)]
+
+
+@contextlib.contextmanager
+def _stopping(runner: Runner, pool: ThreadPoolExecutor) -> Iterator[None]:
+    """On Ctrl-C or SIGTERM in this block, let the running processes save and stop."""
+    try:
+        with sigterm_as_interrupt():
+            yield
+    except KeyboardInterrupt:
+        pool.shutdown(wait=False, cancel_futures=True)
+        runner.stop()
+        raise
+
+
+def _positive(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"must be a positive whole number, got {text!r}")
+    return int(text)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -160,14 +220,13 @@ def _parser() -> argparse.ArgumentParser:
     add("--data", type=Path, default=Path("data"), help="folder of the demonstrations")
     add("--backbones", nargs="+", choices=("pi0", "smolvla"), default=["pi0", "smolvla"])
     add("--only", default="*", metavar="PATTERN", help="policies to run, such as '*_mt50_*'")
-    add("--jobs", type=int, default=1, metavar="N", help="policies that are made at once")
-    add("--gpus", type=int, default=0, metavar="N", help="GPUs that the jobs share")
-    add("--episodes", type=int, default=10, metavar="N", help="episodes per task")
-    add("--processes", type=int, default=2, metavar="N", help="processes that judge a policy")
+    add("--jobs", type=_positive, default=1, metavar="N", help="policies that are made at once")
+    add("--gpus", type=_positive, default=1, metavar="N", help="GPUs that the jobs share")
+    text = "processes that judge a policy (default: %(default)s)"
+    add("--processes", type=_positive, default=2, metavar="N", help=text)
     add("--results", type=Path, default=Path("docs/metaworld.json"), metavar="FILE")
     add("--page", type=Path, default=Path("docs/metaworld.md"), metavar="FILE")
     add("--no-run", action="store_true", help="run nothing, but write results and page")
-    add("train", nargs="*", help="more options of train.py, after --")
     return parser
 
 

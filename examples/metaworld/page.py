@@ -19,7 +19,7 @@ LABELS = {
     "lora_sp": "LoRA-SP, R = 64",
     "lora_r64": "LoRA, r = 64",
     "lora_r16": "LoRA, r = 16",
-    "ada_lora": "AdaLoRA, mean r = 16",
+    "ada_lora": "AdaLoRA, 64 cut to a mean of 16",
     "full": "full fine-tuning",
 }
 BACKBONES = {"pi0": "π0", "smolvla": "SmolVLA"}
@@ -39,6 +39,18 @@ def dumps(results: Results) -> str:
     """Return results as JSON with a line per policy, sorted, and numbers of four digits."""
     lines = [f"{json.dumps(n)}: {json.dumps(_rounded(results[n]))}" for n in sorted(results)]
     return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def load(path: Path) -> dict[str, Any]:
+    """Read results; none, if there is no file yet.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    try:
+        return json.loads(path.read_text()) if path.exists() else {}
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged, restore it: {error}") from error
 
 
 def write(results: Results, path: Path) -> None:
@@ -71,7 +83,8 @@ def _table(results: Results, backbone: str, tasks: str) -> str:
     """Return the table of a backbone: a row per method, the success on each group or task."""
     groups = {name: tuple(members) for name, members in GROUPS.items()}
     columns = groups if tasks == "mt50" else {task: (task,) for task in HELD_OUT}
-    head = [BACKBONES[backbone], "active rank", *columns, "mean", "minus LoRA-SP"]
+    head = [BACKBONES[backbone], "rate", "trained", "active rank", *columns]
+    head += ["mean", "minus LoRA-SP"]
     seeds = {method: _seeds(results, backbone, tasks, method) for method in METHODS}
     rows = [_row(LABELS[method], seeds[method], seeds["lora_sp"], columns) for method in METHODS]
     return "".join(f"| {' | '.join(row)} |\n" for row in [head, ["---"] * len(head), *rows])
@@ -80,7 +93,7 @@ def _table(results: Results, backbone: str, tasks: str) -> str:
 def _row(label: str, seeds: Seeds, reference: Seeds, columns: Columns) -> list[str]:
     """Return the cells of a method's row; `reference` is LoRA-SP."""
     if len(seeds) < len(SEEDS):
-        return [label, f"{len(seeds)} of {len(SEEDS)} seeds so far", *["–"] * (len(columns) + 2)]
+        return [label, *["–"] * (len(columns) + 4), f"{len(seeds)} of {len(SEEDS)} seeds so far"]
     found, order = statistics.outcomes([[cell] for cell in seeds]), sorted(seeds[0]["outcomes"])
     rates = dict(zip(order, found.mean((0, 2)), strict=True))
     means = [np.mean([rates[task] for task in members]) for members in columns.values()]
@@ -88,8 +101,9 @@ def _row(label: str, seeds: Seeds, reference: Seeds, columns: Columns) -> list[s
     if len(reference) == len(SEEDS) and reference != seeds:
         other = statistics.outcomes([[cell] for cell in reference])
         difference = _points(statistics.difference(found, other), sign="+")
+    facts = [f"{seeds[0]['rate']:g}", f"{100 * seeds[0]['trainable']:.1f} %", _ranks(seeds)]
     success = [f"{100 * mean:.1f}" for mean in means]
-    return [label, _ranks(seeds), *success, _points(statistics.success(found)), difference]
+    return [label, *facts, *success, _points(statistics.success(found)), difference]
 
 
 def _seeds(results: Results, backbone: str, tasks: str, method: str) -> Seeds:

@@ -54,8 +54,9 @@ def _run(options: argparse.Namespace) -> None:
     if options.out:
         source = options.server or str(options.run)
         described = {"policy": source, "env": options.env, "seed": options.seed, **results}
-        with options.out.open("x") as file:
-            json.dump(described, file, indent=1)
+        temporary = options.out.with_name(f".{options.out.name}.tmp")
+        temporary.write_text(json.dumps(described, indent=1))
+        temporary.replace(options.out)  # so that a file is always whole
         print(f"written: {options.out}")
 
 

@@ -6,10 +6,9 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
-from typing import ClassVar
 
-import gymnasium
 import jax
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from PIL import Image
 
 from lorasp_jax import models
 from lorasp_jax.evaluation.__main__ import main
-from lorasp_jax.evaluation.gymnasium import Task
 from lorasp_jax.evaluation.gymnasium.actors import RunActor, ServerActor
 from lorasp_jax.evaluation.gymnasium.judge import judge
 from lorasp_jax.evaluation.gymnasium.parallel import judge_in_processes
@@ -27,43 +25,10 @@ from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import FullFineTuning
 from lorasp_jax.training import export
 from tests import ROOT
+from tests.evaluation.line_world import TASK, Line, tasks
 from tests.evaluation.policy_servers import policy_server
 from tests.models.random_models import random_backbone
 from tests.runs import CONFIG, make_run
-
-
-class Line(gymnasium.Env):
-    """A point at distance 1 to 2 from the goal, on either side; one step moves it by 0.1."""
-
-    metadata: ClassVar = {"render_fps": 20}
-    action_space = gymnasium.spaces.Box(-1, 1, (1,))
-
-    def __init__(self, key="success"):
-        self._key = key
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.at = self.np_random.uniform(1, 2) * self.np_random.choice([-1, 1])
-        return self._observe(), {}
-
-    def step(self, action):
-        self.at += 0.1 * float(np.clip(action, -1, 1)[0])
-        return self._observe(), 0.0, False, abs(self.at) > 3, {self._key: abs(self.at) < 0.06}
-
-    def _observe(self):
-        return {"pixels": np.full((8, 8, 3), 100, np.uint8), "at": np.array([self.at])}
-
-
-TASK = Task("line", "go to zero", Line, {"front": "pixels"}, "at", replan=2, max_steps=40)
-
-
-def tasks():
-    """Return what a user's factory returns."""
-    return [TASK, dataclasses.replace(TASK, name="other", group="easy")]
-
-
-def not_tasks():
-    return 3
 
 
 class Mover:
@@ -157,7 +122,7 @@ def test_bad_tasks_are_refused(fields, message):
         dataclasses.replace(TASK, **fields)
 
 
-HERE = "tests.evaluation.test_gymnasium"
+HERE = "tests.evaluation.line_world"
 
 
 @pytest.mark.parametrize(
@@ -213,6 +178,37 @@ def test_processes_judge_as_one_does(tmp_path):
             assert sorted(path.name for path in films.iterdir()) == ["line.webp", "other.webp"]
     for key in ("tasks", "groups", "steps"):
         assert found["1"][key] == found["2"][key]
+
+
+def test_processes_end_with_the_judge(tmp_path):
+    """A killed judge must leave no process behind."""
+
+    def wait(_request):
+        (tmp_path / "asked").touch()
+        time.sleep(3)
+        return np.zeros((2, 1), np.float32)
+
+    command = [sys.executable, "-m", "lorasp_jax.evaluation", "--env", f"{HERE}:tasks"]
+    with policy_server(wait) as url:
+        judging = subprocess.Popen([*command, "--server", url, "--processes", "2"], cwd=ROOT)
+        while not (tmp_path / "asked").exists():
+            time.sleep(0.1)
+        children = Path(f"/proc/{judging.pid}/task/{judging.pid}/children").read_text().split()
+        judging.kill()
+        judging.wait()
+        deadline = time.monotonic() + 20
+        while any(map(_runs, children)) and time.monotonic() < deadline:
+            time.sleep(0.2)
+    assert len(children) >= 2
+    assert not any(map(_runs, children))
+
+
+def _runs(pid):
+    """Say whether a process is there and no zombie."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 def die():

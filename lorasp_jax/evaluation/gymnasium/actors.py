@@ -25,7 +25,7 @@ class Actor(Protocol):
 class ServerActor:
     """Asks a policy server.
 
-    The server's own `--seed` sets the noise of the actions, the same in every episode.
+    The noise of the actions depends on the server's `--seed` and on the number of the connection.
     """
 
     def __init__(self, address: str, *, token: str = "", wait: float = 0.0) -> None:

@@ -1,11 +1,13 @@
 """Judge several tasks at once, each in a process that asks the same policy server."""
 
-import concurrent.futures
 import contextlib
 import functools
 import multiprocessing
+import os
+import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
@@ -37,7 +39,8 @@ def judge_in_processes(
     Args:
         env: factory of the tasks, as for `load_tasks`; each process calls it.
         names: tasks to judge; empty: all.
-        connect: connects to the server, once for each task; it is sent to the processes.
+        connect: connects to the server, once for each task; it is sent to the processes. The
+            server's noise depends on which task connects first.
         episodes: episodes per task.
         processes: number of processes.
         seed: first seed.
@@ -53,7 +56,7 @@ def judge_in_processes(
     runs = dict[str, list[Episode]]()
     context = multiprocessing.get_context("spawn")  # a copy of a process with threads may hang
     try:
-        with concurrent.futures.ProcessPoolExecutor(processes, context) as pool:
+        with ProcessPoolExecutor(processes, context, initializer=_end_with_parent) as pool:
             for name, done in pool.map(run, [task.name for task in tasks]):
                 runs[name] = done
                 if progress:
@@ -61,6 +64,18 @@ def judge_in_processes(
     except BrokenProcessPool as error:
         raise ValueError("a process that judged a task was killed: lower --processes?") from error
     return summarize(tasks, runs, time.perf_counter() - started)
+
+
+def _end_with_parent() -> None:
+    """End this process once its parent has gone, since it would wait for tasks forever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def _run(
