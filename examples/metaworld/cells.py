@@ -2,13 +2,15 @@
 
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from examples.metaworld.tasks import SETS
 
+Results = Mapping[str, Mapping[str, Any]]
+"""Name of a policy -> its result; see `Cell.result`."""
 SEEDS, PILOT_SEED = (0, 1, 2), 1000
 METHODS = {
     "lora_sp": ("--method", "lora_sp", "--peft.rank", "64"),
@@ -96,12 +98,12 @@ class Cell:
         """The policies that must be finished first."""
         return (*self.pilots, self.base) if self.base else self.pilots
 
-    def rate(self) -> float:
-        """Return its learning rate, which the finished pilots decide."""
-        best = max(self.pilots, key=lambda pilot: pilot.success(), default=self)
+    def rate(self, results: Results) -> float:
+        """Return its learning rate, which the results of its pilots decide."""
+        best = max(self.pilots, key=lambda pilot: success(results[pilot.name]), default=self)
         return best.pilot_rate
 
-    def train(self, data: Path) -> list[str]:
+    def train(self, data: Path, rate: float) -> list[str]:
         """Return the command that trains it on demonstrations in `data`, or resumes its run."""
         stage = STAGES[self.stage]
         options = {
@@ -110,7 +112,7 @@ class Cell:
             "data.source": data / stage.tasks,
             "model.backbone": self.backbone,
             "optim.steps": stage.steps,
-            "optim.learning-rate": self.rate(),
+            "optim.learning-rate": rate,
         }
         if self.base:
             options["model.checkpoint"] = self.base.run / "base"
@@ -139,11 +141,6 @@ class Cell:
     def judged(self) -> Path:
         """File with its episodes, written last."""
         return self.run / "judged.json"
-
-    def success(self) -> float:
-        """Return its success rate; see `outcomes` for errors."""
-        digits = "".join(self.outcomes().values())
-        return digits.count("1") / len(digits)
 
     def outcomes(self) -> dict[str, str]:
         """Return a digit per episode, 1 for success, by task.
@@ -174,6 +171,12 @@ class Cell:
             "rate": _read(self.run / "config.json")["optim"]["learning_rate"],
             "trainable": run["trainable_parameters"] / run["total_parameters"],
         }
+
+
+def success(result: Mapping[str, Any]) -> float:
+    """Return the success rate over all episodes of a result."""
+    digits = "".join(result["outcomes"].values())
+    return digits.count("1") / len(digits)
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -3,7 +3,8 @@
     python -m examples.metaworld.compare --judge ~/metaworld/bin/python
 
 Needs the demonstrations of `python -m examples.metaworld.collect` in data/mt50, data/ml45 and
-data/ml5. After Ctrl-C or SIGTERM, the same command goes on. `--no-run` only writes the page again.
+data/ml5. Stopped at any moment, the same command goes on; a policy whose result is in --results is
+finished, even if its run is gone. `--no-run` only writes the page again.
 """
 
 import argparse
@@ -24,7 +25,7 @@ from typing import IO, Any
 
 from envs.datasets.writing import write_text
 from examples.metaworld import page
-from examples.metaworld.cells import STAGES, Cell, cells
+from examples.metaworld.cells import STAGES, Cell, Results, cells
 from lorasp_jax.training.interrupt import sigterm_as_interrupt
 
 FIRST_PORT = 8100
@@ -37,9 +38,14 @@ INTERRUPTED = 130
 class Runner:
     """Runs cells, each in processes of its own; several threads may use it."""
 
-    def __init__(self, options: argparse.Namespace) -> None:
-        """Start nothing; `options` are the command's."""
-        self._options = options
+    def __init__(self, options: argparse.Namespace, known: dict[str, Any]) -> None:
+        """Start nothing.
+
+        Args:
+            options: the command's options.
+            known: results of the finished cells; those of others are added, and all are written.
+        """
+        self._options, self._known = options, known
         self._places = queue.SimpleQueue[int]()
         for place in range(options.jobs):
             self._places.put(place)
@@ -56,10 +62,13 @@ class Runner:
             raise ValueError(f"{cell.name} needs a policy that failed")
         with self._place() as place:
             started = time.perf_counter()
-            self._train(cell, place)
+            if not cell.judged.exists():
+                self._train(cell, place)
             trained = time.perf_counter()
             if STAGES[cell.stage].episodes:
-                self._judge(cell, place)
+                if not cell.judged.exists():
+                    self._judge(cell, place)
+                self._add(cell)
         times = trained - started, time.perf_counter() - trained
         print(f"{cell.name}: trained in {times[0]:.0f} s, judged in {times[1]:.0f} s", flush=True)
 
@@ -69,6 +78,13 @@ class Runner:
             self._stopped = True
             for process in self._running:
                 process.terminate()
+
+    def _add(self, cell: Cell) -> None:
+        """Write the results with those of a cell, so that nothing is lost whenever this stops."""
+        result = cell.result()
+        with self._lock:
+            self._known[cell.name] = result
+            write_text(self._options.results, page.dumps(self._known))
 
     @contextlib.contextmanager
     def _place(self) -> Iterator[int]:
@@ -80,8 +96,9 @@ class Runner:
             self._places.put(place)
 
     def _train(self, cell: Cell, place: int) -> None:
-        with _log(cell) as log, self._process(cell.train(self._options.data), place, log) as train:
-            _check(cell, "training", train.wait())
+        command = cell.train(self._options.data, cell.rate(self._known))
+        with _log(cell) as log, self._process(command, place, log) as process:
+            _check(cell, "training", process.wait())
 
     def _judge(self, cell: Cell, place: int) -> None:
         port = FIRST_PORT + place
@@ -145,39 +162,34 @@ def main(arguments: Sequence[str]) -> int:
     options = parser.parse_args(arguments)
     if not options.no_run and not shutil.which(options.judge):
         parser.error(f"--judge must be the Python with metaworld, got {options.judge!r}")
-    known = page.load(options.results)
-    chosen = _chosen(options)
+    known, failed = page.load(options.results), 0
     try:
-        failed = 0 if options.no_run else _run(options, chosen)
+        if not options.no_run:
+            failed = _run(options, known)
     except KeyboardInterrupt:
         print("stopped; to go on, give the same command", file=sys.stderr)
         return INTERRUPTED
-    for cell in chosen:
-        try:
-            known |= {cell.name: cell.result()} if cell.judged.exists() else {}
-        except ValueError as error:
-            print(f"error: {error}", file=sys.stderr)
-            failed += 1
-    write_text(options.results, page.dumps(known))
     page.write(known, options.page)
     print(f"{len(known)} policies in {options.results}; written: {options.page}")
     return 1 if failed else 0
 
 
-def _chosen(options: argparse.Namespace) -> list[Cell]:
-    """Return the cells of --backbones and --only, and those that they need, in order."""
+def _missing(options: argparse.Namespace, known: Results) -> list[Cell]:
+    """Return the cells of --backbones and --only without results, and those that they need."""
     every = [*cells(options.backbones)]
-    wanted = {cell for cell in every if fnmatch.fnmatchcase(cell.name, options.only)}
+    missing = set[Cell]()
     for cell in reversed(every):
-        wanted |= {*cell.needs} if cell in wanted else set()
-    return [cell for cell in every if cell in wanted]
+        is_wanted = fnmatch.fnmatchcase(cell.name, options.only) and STAGES[cell.stage].episodes
+        if cell.name not in known and (is_wanted or any(cell in other.needs for other in missing)):
+            missing.add(cell)
+    return [cell for cell in every if cell in missing]
 
 
-def _run(options: argparse.Namespace, chosen: Sequence[Cell]) -> int:
+def _run(options: argparse.Namespace, known: dict[str, Any]) -> int:
     """Run the cells that are not finished; return how many failed."""
-    runner, failed, jobs = Runner(options), 0, dict[Cell, Future[None]]()
+    runner, failed, jobs = Runner(options, known), 0, dict[Cell, Future[None]]()
     with ThreadPoolExecutor(options.jobs) as pool, _stopping(runner, pool):
-        for cell in _missing(chosen):
+        for cell in _missing(options, known):
             needs = [jobs[need] for need in cell.needs if need in jobs]
             jobs[cell] = pool.submit(runner.finish, cell, needs)
         for job in concurrent.futures.as_completed(jobs.values()):
@@ -187,12 +199,6 @@ def _run(options: argparse.Namespace, chosen: Sequence[Cell]) -> int:
                 print(f"error: {error}", file=sys.stderr)
                 failed += 1
     return failed
-
-
-def _missing(chosen: Sequence[Cell]) -> list[Cell]:
-    """Return the cells that are not judged, and the bases that these start from."""
-    unjudged = {c for c in chosen if STAGES[c.stage].episodes and not c.judged.exists()}
-    return [c for c in chosen if c in unjudged or any(c == other.base for other in unjudged)]
 
 
 @contextlib.contextmanager

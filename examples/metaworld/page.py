@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from envs.datasets.writing import write_text
-from examples.metaworld.cells import METHODS, SEEDS, Cell
+from examples.metaworld.cells import METHODS, SEEDS, Cell, Results
 from examples.metaworld.tasks import GROUPS, HELD_OUT
 from lorasp_jax.study import statistics
 from lorasp_jax.study.statistics import Estimate
@@ -27,8 +27,6 @@ TITLES = {
     "mt50": "All fifty tasks, from the base that has only seen a simulated Panda",
     "ml5": "Five tasks, after full fine-tuning on the other 45",
 }
-Results = Mapping[str, Mapping[str, Any]]
-"""Name of a policy -> its outcomes and active ranks."""
 Seeds = Sequence[Mapping[str, Any]]
 """Results of one method, by seed."""
 Columns = Mapping[str, Sequence[str]]
