@@ -54,8 +54,8 @@ class _Maker:
         methods = [self.cells(prefix) for prefix in prefixes]
         if not all(methods):
             return ()
-        rates = [published.rates(prefix, self.rank) for prefix in prefixes]
-        paper = None if any(r is None for r in rates) else float(statistic(*rates))
+        number = published.compute(statistic, prefixes, self.rank)
+        paper = None if number is None else float(number)
         estimate = functools.partial(_outcomes, interval, statistic, methods)
         return (Criterion(measure, naming.flat(*methods), estimate, paper=paper, **fields),)
 

@@ -87,8 +87,9 @@ def _paper_lora_sp(axes: Axes, book: Book, backbone: str) -> None:
 
 def _paper(book: Book, backbone: str, method: str) -> float | None:
     """Return the paper's success relative to full fine-tuning [%]; None if it has none."""
-    rates, full = (published.rates(f"{backbone}/multi/{m}", book.rank) for m in (method, "full"))
-    return None if rates is None or full is None else 100 * float(statistics.ratio(rates, full))
+    prefixes = [f"{backbone}/multi/{m}" for m in (method, "full")]
+    ratio = published.compute(statistics.ratio, prefixes, book.rank)
+    return None if ratio is None else 100 * float(ratio)
 
 
 def _scaled(book: Book) -> str:

@@ -39,9 +39,9 @@ def _paper(book: Book, leads: dict[str, Estimate]) -> str:
     found = {}
     for backbone in leads:
         prefixes = f"{backbone}/multi/lora_sp", f"{backbone}/multi/lora_r{book.rank}"
-        rates = [r for p in prefixes if (r := published.rates(p, book.rank)) is not None]
-        if len(rates) == 2:
-            found[backbone] = float(statistics.minus(*rates))
+        difference = published.compute(statistics.minus, prefixes, book.rank)
+        if difference is not None:
+            found[backbone] = float(difference)
     if not found:
         return ""
     outside = all(not leads[b].low <= theirs <= leads[b].high for b, theirs in found.items())

@@ -102,10 +102,10 @@ def _compared(
     found = {}
     for backbone in book.complete(*methods):
         prefixes = [f"{backbone}/{method}" for method in methods]
-        a, b = (float(book.outcomes(prefix).mean()) for prefix in prefixes)
-        paper = [r.mean() for p in prefixes if (r := published.rates(p, book.rank)) is not None]
-        theirs = f" ({show(*map(float, paper))})" if len(paper) == 2 else ""
-        found[backbone] = show(a, b) + theirs
+        means = lambda *rates: show(*(float(r.mean()) for r in rates))  # noqa: E731
+        paper = published.compute(means, prefixes, book.rank)
+        ours = means(*map(book.outcomes, prefixes))
+        found[backbone] = ours if paper is None else f"{ours} ({paper})"
     return found
 
 

@@ -19,8 +19,8 @@ def highest_rank(book: Book) -> str:
     for backbone in book.complete(*methods):
         prefixes = [f"{backbone}/{method}" for method in methods]
         ratio = statistics.bootstrap(statistics.ratio, *map(book.outcomes, prefixes))
-        rates = [r for p in prefixes if (r := published.rates(p, book.rank)) is not None]
-        paper = f" ({100 * statistics.ratio(*rates):.1f})" if len(rates) == 2 else ""
+        theirs = published.compute(statistics.ratio, prefixes, book.rank)
+        paper = "" if theirs is None else f" ({100 * theirs:.1f})"
         texts[backbone] = f"{percent(ratio)}{paper}"
     if not texts:
         return ""

@@ -2,6 +2,7 @@
 
 import functools
 import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,3 +42,9 @@ def rates(prefix: str, rank: int) -> np.ndarray | None:
     """Return the paper's success rates of a method `[T]`, from 0 to 1; None if it has none."""
     row = cell(prefix, rank)
     return np.array(list(row["success"].values())) / 100 if row else None
+
+
+def compute(statistic: Callable[..., Any], prefixes: Sequence[str], rank: int) -> Any:
+    """Return a function of the paper's `rates` of some methods; None if it lacks one of them."""
+    found = [rates(prefix, rank) for prefix in prefixes]
+    return None if any(row is None for row in found) else statistic(*found)
