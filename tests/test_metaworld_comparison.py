@@ -195,6 +195,13 @@ def test_a_judged_policy_is_not_trained_again(stand_ins):
     assert len(json.loads((stand_ins / "r.json").read_text())) == 3
 
 
+def test_damaged_results_are_named_in_a_sentence(stand_ins, capsys):
+    arguments = options(stand_ins, "--no-run")
+    (stand_ins / "r.json").write_text("{")
+    assert compare.main(arguments) == 2
+    assert capsys.readouterr().err.startswith(f"error: {stand_ins / 'r.json'} is damaged")
+
+
 def test_a_missing_judge_is_refused_at_once(stand_ins, capsys):
     with pytest.raises(SystemExit):
         compare.main(options(stand_ins, "--judge", "nowhere/python"))

@@ -23,6 +23,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import IO, Any
 
+from rich.console import Console
+
+from envs.cli.arguments import positive
+from envs.cli.errors import run_command
 from envs.datasets.writing import write_text
 from examples.metaworld import page
 from examples.metaworld.cells import STAGES, Cell, Results, cells
@@ -32,7 +36,6 @@ FIRST_PORT = 8100
 LOGS = Path("runs/metaworld_logs")
 POLL = 1.0
 """Time between two looks at a judge and its server [s]."""
-INTERRUPTED = 130
 
 
 class Runner:
@@ -162,13 +165,13 @@ def main(arguments: Sequence[str]) -> int:
     options = parser.parse_args(arguments)
     if not options.no_run and not shutil.which(options.judge):
         parser.error(f"--judge must be the Python with metaworld, got {options.judge!r}")
-    known, failed = page.load(options.results), 0
-    try:
-        if not options.no_run:
-            failed = _run(options, known)
-    except KeyboardInterrupt:
-        print("stopped; to go on, give the same command", file=sys.stderr)
-        return INTERRUPTED
+    stopped = "stopped; to go on, give the same command"
+    return run_command(lambda: _execute(options), Console(stderr=True), stopped)
+
+
+def _execute(options: argparse.Namespace) -> int:
+    known = page.load(options.results)
+    failed = 0 if options.no_run else _run(options, known)
     page.write(known, options.page)
     print(f"{len(known)} policies in {options.results}; written: {options.page}")
     return 1 if failed else 0
@@ -213,12 +216,6 @@ def _stopping(runner: Runner, pool: ThreadPoolExecutor) -> Iterator[None]:
         raise
 
 
-def _positive(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"must be a positive whole number, got {text!r}")
-    return int(text)
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m examples.metaworld.compare")
     add = parser.add_argument
@@ -226,10 +223,10 @@ def _parser() -> argparse.ArgumentParser:
     add("--data", type=Path, default=Path("data"), help="folder of the demonstrations")
     add("--backbones", nargs="+", choices=("pi0", "smolvla"), default=["pi0", "smolvla"])
     add("--only", default="*", metavar="PATTERN", help="policies to run, such as '*_mt50_*'")
-    add("--jobs", type=_positive, default=1, metavar="N", help="policies that are made at once")
-    add("--gpus", type=_positive, default=1, metavar="N", help="GPUs that the jobs share")
+    add("--jobs", type=positive, default=1, metavar="N", help="policies that are made at once")
+    add("--gpus", type=positive, default=1, metavar="N", help="GPUs that the jobs share")
     text = "processes that judge a policy (default: %(default)s)"
-    add("--processes", type=_positive, default=2, metavar="N", help=text)
+    add("--processes", type=positive, default=2, metavar="N", help=text)
     add("--results", type=Path, default=Path("docs/metaworld.json"), metavar="FILE")
     add("--page", type=Path, default=Path("docs/metaworld.md"), metavar="FILE")
     add("--no-run", action="store_true", help="run nothing, but write results and page")

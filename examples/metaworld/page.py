@@ -11,7 +11,8 @@ from envs.datasets.writing import write_text
 from examples.metaworld.cells import METHODS, SEEDS, Cell, Results
 from examples.metaworld.tasks import GROUPS, HELD_OUT
 from lorasp_jax.study import statistics
-from lorasp_jax.study.statistics import Estimate
+from lorasp_jax.study.book import BACKBONES, percent, signed
+from lorasp_jax.study.results import rounded
 
 BEGIN, END = "<!-- begin: examples.metaworld.compare -->\n", "<!-- end -->\n"
 """What the tables stand between."""
@@ -22,7 +23,6 @@ LABELS = {
     "ada_lora": "AdaLoRA, 64 cut to a mean of 16",
     "full": "full fine-tuning",
 }
-BACKBONES = {"pi0": "π0", "smolvla": "SmolVLA"}
 TITLES = {
     "mt50": "All fifty tasks, from the base that has only seen a simulated Panda",
     "ml5": "Five tasks, after full fine-tuning on the other 45",
@@ -34,8 +34,11 @@ Columns = Mapping[str, Sequence[str]]
 
 
 def dumps(results: Results) -> str:
-    """Return results as JSON with a line per policy, sorted, and numbers of four digits."""
-    lines = [f"{json.dumps(n)}: {json.dumps(_rounded(results[n]))}" for n in sorted(results)]
+    """Return results as JSON with a line per policy, sorted, and rounded numbers."""
+    lines = [
+        f"{json.dumps(n)}: {json.dumps(rounded(results[n]), sort_keys=True)}"
+        for n in sorted(results)
+    ]
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
@@ -98,10 +101,11 @@ def _row(label: str, seeds: Seeds, reference: Seeds, columns: Columns) -> list[s
     difference = "–"
     if len(reference) == len(SEEDS) and reference != seeds:
         other = statistics.outcomes([[cell] for cell in reference])
-        difference = _points(statistics.difference(found, other), sign="+")
+        value, low, high = (signed(100 * x) for x in statistics.difference(found, other))
+        difference = f"{value} [{low}, {high}]"
     facts = [f"{seeds[0]['rate']:g}", f"{100 * seeds[0]['trainable']:.1f} %", _ranks(seeds)]
     success = [f"{100 * mean:.1f}" for mean in means]
-    return [label, *facts, *success, _points(statistics.success(found)), difference]
+    return [label, *facts, *success, percent(statistics.success(found)), difference]
 
 
 def _seeds(results: Results, backbone: str, tasks: str, method: str) -> Seeds:
@@ -115,16 +119,3 @@ def _ranks(seeds: Seeds) -> str:
     modules = [m for m in ("vision", "language", "action") if m in seeds[0]["active_rank"]]
     means = [np.mean([cell["active_rank"][module] for cell in seeds]) for module in modules]
     return ", ".join(f"{mean:.1f}" for mean in means) or "–"
-
-
-def _points(estimate: Estimate, sign: str = "") -> str:
-    value, low, high = (f"{100 * number:{sign}.1f}" for number in estimate)
-    return f"{value} [{low}, {high}]".replace("-", "−")
-
-
-def _rounded(value: Any) -> Any:
-    if isinstance(value, float):
-        return float(f"{value:.4g}")
-    if isinstance(value, Mapping):
-        return {key: _rounded(value[key]) for key in sorted(value)}
-    return value

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from envs.cli.arguments import positive
 from envs.cli.errors import REFUSED, parse_arguments, run_command
 from lorasp_jax.study import listing, results
 from lorasp_jax.study.status import BROKEN, Board, State, Status, clear_failure, results_of, tidy
@@ -40,7 +41,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--scale", choices=SCALES, default="accelerator", help="size preset (default: accelerator)")
     text = "cells to run, such as 'pi0/multi/*'"
     add("--only", metavar="PATTERN", nargs="+", default=["*"], help=text)
-    add("--jobs", type=_positive, default=1, metavar="N", help="processes that share the device")
+    add("--jobs", type=positive, default=1, metavar="N", help="processes that share the device")
     add("--shard", type=_shard, default=(1, 1), metavar="I/N", help="run the I-th of N parts")
     add("--dry-run", action="store_true", help="list the cells, then exit")
     add("--no-run", action="store_true", help="run no cell, but write results and page")
@@ -122,13 +123,6 @@ def _run(
         results.load_study, options.config, options.scale, options.results
     )
     Workers(load_study, folder, names, console).run(options.jobs)
-
-
-def _positive(text: str) -> int:
-    """Parse a positive integer."""
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"must be a positive whole number, got {text!r}")
-    return int(text)
 
 
 def _shard(text: str) -> tuple[int, int]:

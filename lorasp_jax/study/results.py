@@ -34,7 +34,7 @@ def write(path: Path, study: str, results: Mapping[str, Mapping[str, Any]]) -> N
     settings = {name: dict(_flat(result["config"])) for name, result in results.items()}
     common = _most_common(list(settings.values()))
     cells = {
-        name: _rounded(result) | {"config": _changes(settings[name], common)}
+        name: rounded(result) | {"config": _changes(settings[name], common)}
         for name, result in sorted(results.items())
     }
     lines = [f"{json.dumps(name)}:{_dump(cell)}" for name, cell in cells.items()]
@@ -85,14 +85,14 @@ def _dump(value: Any) -> str:
     return json.dumps(value, sort_keys=True, separators=(",", ":"))
 
 
-def _rounded(value: Any) -> Any:
-    """Round the floats in JSON values."""
+def rounded(value: Any) -> Any:
+    """Round the floats in JSON values to `DIGITS` digits."""
     if isinstance(value, float):
         number = float(f"{value:.{DIGITS}g}")
         return int(number) if number.is_integer() and abs(number) < 10**DIGITS else number
     if isinstance(value, Mapping):
-        return {str(key): _rounded(item) for key, item in value.items()}
-    return [*map(_rounded, value)] if isinstance(value, list | tuple) else value
+        return {str(key): rounded(item) for key, item in value.items()}
+    return [*map(rounded, value)] if isinstance(value, list | tuple) else value
 
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
