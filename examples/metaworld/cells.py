@@ -44,8 +44,8 @@ class Stage:
 
 
 STAGES = {
-    "pilot": Stage("mt50", 2_500, 5, 10_000),
-    "mt50": Stage("mt50", 10_000, 10),
+    "pilot": Stage("mt50", 2_000, 5, 10_000),
+    "mt50": Stage("mt50", 6_000, 10),
     "ml45": Stage("ml45", 10_000, 0),  # only a base
     "ml5": Stage("ml5", 2_000, 10),
 }
