@@ -41,7 +41,7 @@ def shared_directions(book: Book) -> Figure:
 def gradients(book: Book) -> Figure:
     """Plot by method whether gradients of different tasks point the same way."""
     methods = {b: [p.split("/")[2] for p in gradient_methods(book, b)] for b in book.backbones}
-    figure, grid = panels(book, 1, 1.0 + 1.2 * _ROW * max(map(len, methods.values())))
+    figure, grid = panels(book, 1, 1.0 + 1.2 * _ROW * max(map(len, methods.values())), sharex=True)
     for axes, backbone in zip(grid[0], book.backbones, strict=True):
         for row, method in enumerate(methods[backbone]):
             two, one = book.cosines(f"{backbone}/multi/{method}")
