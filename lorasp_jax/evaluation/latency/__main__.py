@@ -12,7 +12,7 @@ from envs.cli.errors import parse_arguments, run_command
 from envs.compilation import cache
 from envs.datasets.files import check_local
 from lorasp_jax.evaluation.latency import figure
-from lorasp_jax.evaluation.latency.curve import FILE, MAX_DELAY, Options, measure
+from lorasp_jax.evaluation.latency.curve import FILE, MAX_DELAY, Options, extrapolated, measure
 from lorasp_jax.evaluation.latency.execution import EXECUTIONS
 
 
@@ -34,6 +34,9 @@ def _measure(options: argparse.Namespace) -> None:
     for run in options.runs:
         with bars(Console(stderr=True), "points") as progress:
             curves.append((run.name, measure(run, chosen, progress)))
+        if beyond := extrapolated(run, curves[-1][1]):
+            text = ", ".join(map(str, beyond))
+            print(f"{run}: trained execution at d = {text} is beyond its --optim.rtc-max-delay")
     figure.write(path, curves)
     for written in (*(run / FILE for run in options.runs), path):
         print(f"written: {written}")

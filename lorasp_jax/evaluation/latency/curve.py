@@ -254,3 +254,15 @@ def _executions(run: Path, config: dict[str, Any], chosen: Sequence[str]) -> lis
         raise ValueError(f"{run} was not trained for execution trained: --optim.rtc-max-delay is 0")
     supported = {"trained": trained, "corrected": (run / correction.DESCRIPTION).exists()}
     return [*chosen] or [name for name in EXECUTIONS if supported.get(name, True)]
+
+
+def extrapolated(run: Path, curves: dict[str, Any]) -> list[int]:
+    """Return the delays of trained execution beyond those that a run was trained for.
+
+    Args:
+        run: folder of the run.
+        curves: the content of its latency.json.
+    """
+    limit = read_json(run / CONFIG_FILE, _CONFIG)["optim"].get("rtc_max_delay", 0)
+    points = (p for task in curves["curves"].values() for p in task.get("trained", []))
+    return sorted({point["delay"] for point in points if point["delay"] > limit})

@@ -72,7 +72,8 @@ def refused(capsys, *arguments):
 
 def test_every_execution_is_measured_at_every_delay(folder, capsys):
     assert command.main([str(folder), "--episodes", "4"]) == 0
-    written = capsys.readouterr().out.splitlines()
+    beyond, *written = capsys.readouterr().out.splitlines()
+    assert beyond.endswith("trained execution at d = 3, 4, 5 is beyond its --optim.rtc-max-delay")
     assert written == [f"written: {folder / name}" for name in ("latency.json", "latency.svg")]
     found = read_json(folder / "latency.json", curve.SCHEMA)
     assert (found["chunk"], found["execute_steps"], found["denoise_steps"]) == (10, 5, 3)
