@@ -140,6 +140,18 @@ def measure(run: Path, options: Options, progress: Progress | None = None) -> di
     return found
 
 
+def extrapolated(run: Path, curves: dict[str, Any]) -> list[int]:
+    """Return the delays of trained execution beyond those that a run was trained for.
+
+    Args:
+        run: folder of the run.
+        curves: the content of its latency.json.
+    """
+    limit = _trained_delay(read_json(run / CONFIG_FILE, _CONFIG))
+    points = (p for task in curves["curves"].values() for p in task.get("trained", []))
+    return sorted({point["delay"] for point in points if point["delay"] > limit})
+
+
 def measure_point(
     policy: Policy,
     env: Env,
@@ -249,20 +261,13 @@ def _tasks(run: Path, chosen: Sequence[str]) -> list[str]:
 
 def _executions(run: Path, config: dict[str, Any], chosen: Sequence[str]) -> list[str]:
     """Return the executions to measure."""
-    trained = config["optim"].get("rtc_max_delay", 0) > 0
+    trained = _trained_delay(config) > 0
     if "trained" in chosen and not trained:
         raise ValueError(f"{run} was not trained for execution trained: --optim.rtc-max-delay is 0")
     supported = {"trained": trained, "corrected": (run / correction.DESCRIPTION).exists()}
     return [*chosen] or [name for name in EXECUTIONS if supported.get(name, True)]
 
 
-def extrapolated(run: Path, curves: dict[str, Any]) -> list[int]:
-    """Return the delays of trained execution beyond those that a run was trained for.
-
-    Args:
-        run: folder of the run.
-        curves: the content of its latency.json.
-    """
-    limit = read_json(run / CONFIG_FILE, _CONFIG)["optim"].get("rtc_max_delay", 0)
-    points = (p for task in curves["curves"].values() for p in task.get("trained", []))
-    return sorted({point["delay"] for point in points if point["delay"] > limit})
+def _trained_delay(config: dict[str, Any]) -> int:
+    """Return the largest delay that a run was trained for, 0 if for none."""
+    return config["optim"].get("rtc_max_delay", 0)
