@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -267,6 +268,17 @@ def synthetic():
     return found
 
 
+def rows_by_label(table):
+    """Return the last cell of each method's row."""
+    rows = [line.strip("| ").split(" | ") for line in table.splitlines() if line.startswith("| ")]
+    return {row[0]: row[-1] for row in rows if re.match(r"[−+][\d.]+ \[", row[-1])}
+
+
+def _excludes_zero(difference):
+    low, high = re.findall(r"[−+]", difference.partition("[")[2])
+    return low == high
+
+
 def test_table_has_groups_means_and_paired_differences():
     rows = [line.split(" | ") for line in page.tables(synthetic()).splitlines() if "|" in line]
     by_label = {row[0].strip("| "): row[1:] for row in rows}
@@ -302,6 +314,41 @@ def test_committed_page_is_made_from_the_committed_results(tmp_path):
     copy.write_text((docs / "metaworld.md").read_text())
     page.write(json.loads(results.read_text()) if results.exists() else {}, copy)
     assert copy.read_text() == (docs / "metaworld.md").read_text()
+
+
+def test_findings_quote_the_tables():
+    text = (ROOT / "docs" / "metaworld.md").read_text()
+    findings, _, tables = text.partition("### What was found")[2].partition(page.BEGIN)
+    fifty, _, five = tables.partition(page.TITLES["ml5"])
+    pi0, smolvla = (rows_by_label(part) for part in fifty.split("| SmolVLA |"))
+    said = {
+        "LoRA, r = 64": ("−4.6", "+0.7", "4.6 points more than LoRA with r = 64", "cannot be told"),
+        "LoRA, r = 16": ("−5.5", "−4.6", "5.5 more than LoRA with r = 16", "r = 16 (−4.6)"),
+        "AdaLoRA": ("−4.3", "−4.9", "4.3 more than\n  AdaLoRA", "AdaLoRA (−4.9)"),
+        "full fine-tuning": ("−1.7", "−6.1", "cannot be told", "full fine-tuning (−6.1)"),
+    }
+    for method, (of_pi0, of_smolvla, *texts) in said.items():
+        assert all(part in findings for part in texts)
+        for rows, value in ((pi0, of_pi0), (smolvla, of_smolvla)):
+            ((label, difference),) = [r for r in rows.items() if r[0].startswith(method)]
+            assert difference.startswith(value), label
+            assert _excludes_zero(difference) == (value not in ("+0.7", "−1.7"))
+    assert "LoRA-SP succeeds in 52.1 %" in findings
+    assert "| 52.1 [" in fifty
+    differences = [d for part in five.split("| SmolVLA |") for d in rows_by_label(part).values()]
+    assert len(differences) == 8
+    assert not any(map(_excludes_zero, differences))
+
+
+def test_the_readme_quotes_the_comparison():
+    *_, quoted = (ROOT / "README.md").read_text().partition("[fifty tasks](docs/metaworld.md)")
+    fifty = (ROOT / "docs" / "metaworld.md").read_text().partition(page.TITLES["mt50"])[2]
+    for backbone, ours, other in (("π0", "52.1", "47.5"), ("SmolVLA", "50.1", "50.9")):
+        assert f"{ours} and {other} % with {backbone}" in quoted
+        table = fifty.partition(f"| {backbone} |")[2].partition("\n\n")[0]
+        means = {label: rest for label, _, rest in (r.partition(" | ") for r in table.split("\n"))}
+        assert f"| {ours} [" in means["| LoRA-SP, R = 64"]
+        assert f"| {other} [" in means["| LoRA, r = 64"]
 
 
 def test_results_are_written_the_same_way_every_time():
