@@ -43,6 +43,7 @@ from lorasp_jax.kernels.threshold_search import (
     bisected_mask,
     block_boundary,
     energies,
+    float_bits,
 )
 
 Implementation = Literal["pairwise", "sort", "bisection", "block", "pallas"]
@@ -115,12 +116,42 @@ def default_implementation(rank: int) -> Implementation:
     return "pallas" if backend == "gpu" else "bisection"
 
 
+def kept_flags(scores: jax.Array, energy_target: float) -> jax.Array:
+    """Compute the mask as int32 0 and 1, [..., R], inside a kernel, from f32 scores >= 0.
+
+    A thread has seven registers for booleans; a kernel that holds more of them moves them to and
+    from other registers one by one. These flags are integers from the start.
+    """
+    ratio, constant = exact_ratio(energy_target), jax.lax.stop_gradient(scores)
+    keep_all = ratio.numerator == ratio.denominator
+    return _positive_flags(constant) if keep_all else _block_flags(constant, ratio)
+
+
+def _block_flags(scores: jax.Array, ratio: Ratio) -> jax.Array:
+    """Compare with the boundary of `block_boundary`: the sign bit of a difference is the flag."""
+    last = block_boundary(scores, ratio)
+    position = jax.lax.broadcasted_iota(jnp.int32, scores.shape, scores.ndim - 1)
+    is_later = jax.lax.shift_right_logical(last.index - position, 31)
+    difference = float_bits(last.score) - 1 + is_later - float_bits(scores)
+    keeps_any = (last.score == last.score).astype(jnp.int32)  # else NaN
+    return jax.lax.shift_right_logical(difference, 31) & keeps_any
+
+
+def _positive_flags(scores: jax.Array) -> jax.Array:
+    """`positive` as int32."""
+    keeps_any = (scores.sum(-1, keepdims=True) > 0).astype(jnp.int32)
+    return jax.lax.shift_right_logical(-float_bits(scores), 31) & keeps_any
+
+
 def _mask_function(implementation: str, interpret: bool) -> Callable[[jax.Array, Ratio], jax.Array]:
     """Return the function that maps scores [..., R] and η to the mask."""
-    masks = {"pairwise": _pairwise_mask, "bisection": bisected_mask}
+    masks = {
+        "pairwise": _pairwise_mask,
+        "bisection": bisected_mask,
+        "block": lambda scores, ratio: _block_flags(scores, ratio) != 0,
+    }
     boundaries = {
         "sort": _sorted_boundary,
-        "block": block_boundary,
         "pallas": functools.partial(_pallas_boundary, interpret=interpret),
     }
     if implementation in masks:
@@ -129,12 +160,11 @@ def _mask_function(implementation: str, interpret: bool) -> Callable[[jax.Array,
         valid = ", ".join(get_args(Implementation))
         raise ValueError(f"implementation must be one of {valid}, got {implementation!r}")
     boundary = boundaries[implementation]
-    # Without a barrier, XLA may compute the scores twice, for the boundary and for the comparison
-    # with it, and round them differently. "block" runs in a kernel, which computes them once.
-    barrier = (lambda scores: scores) if implementation == "block" else jax.lax.optimization_barrier
 
     def compute_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
-        scores = barrier(scores)
+        # Without the barrier, XLA may compute the scores twice, for the boundary and for the
+        # comparison with it, and round them differently. A kernel computes them once.
+        scores = jax.lax.optimization_barrier(scores)
         return kept_mask(scores, boundary(scores, ratio))
 
     return compute_mask
@@ -167,13 +197,13 @@ def kept_mask(scores: jax.Array, last: Boundary) -> jax.Array:
 
 
 def kept_energy(scores: jax.Array, mask: jax.Array) -> jax.Array:
-    """Compute E_k of eq. (12), f32 [...], from f32 scores and a mask [..., R].
+    """Compute E_k of eq. (12), f32 [...], from f32 scores and a mask [..., R], bool or 0 and 1.
 
     A row of zeros gives 1 with zero gradient; a row with NaN gives NaN.
     """
     energy = energies(scores)
     total = energy.sum(-1)
-    kept = jnp.where(mask, energy, 0).sum(-1)
+    kept = (mask * energy).sum(-1)
     return jnp.where(total == 0, 1, kept / jnp.where(total == 0, 1, total))
 
 

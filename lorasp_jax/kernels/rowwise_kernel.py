@@ -89,8 +89,8 @@ def rowwise_kernel(
         rows. Triton requires dimensions to be powers of two, and at least 16 in a matmul.
         columns: list of [b, width].
         valid: bool [b, 1].
-        mask: bool [b, K], K >= 8. The forward pass passes None, and the function computes the mask.
-          The backward pass passes this mask as a constant.
+        mask: int32 [b, K] of 0 and 1, K >= 8. The forward pass passes None, and the function
+          computes the mask. The backward pass passes this mask as a constant.
         output: [b, O].
         sums: pytree of fp32 arrays, summed over blocks.
         statistics: list of [b, 1], without gradient.
@@ -239,17 +239,17 @@ def _call(
 
 
 def _pack_bits(mask: jax.Array) -> jax.Array:
-    """Pack bools [n, K] into bits, uint8 [n, K / 8]."""
+    """Pack 0 and 1, int32 [n, K], into bits, uint8 [n, K / 8]."""
     rows, width = mask.shape
-    bits = mask.astype(jnp.int32).reshape(rows, 8, width // 8)
+    bits = mask.reshape(rows, 8, width // 8)
     return jax.lax.shift_left(bits, _bit_numbers(bits)).sum(1, dtype=jnp.int32).astype(jnp.uint8)
 
 
 def _unpack_bits(packed: jax.Array) -> jax.Array:
-    """Unpack bools [n, K] from bits, uint8 [n, K / 8]."""
+    """Unpack 0 and 1, int32 [n, K], from bits, uint8 [n, K / 8]."""
     rows, width = packed.shape
     bits = jnp.broadcast_to(packed.astype(jnp.int32)[:, None, :], (rows, 8, width))
-    return (jax.lax.shift_right_logical(bits, _bit_numbers(bits)) & 1).reshape(rows, -1) != 0
+    return (jax.lax.shift_right_logical(bits, _bit_numbers(bits)) & 1).reshape(rows, -1)
 
 
 def _bit_numbers(bits: jax.Array) -> jax.Array:

@@ -13,6 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+UNCOUNTED_STEPS = 8
+"""Steps of the search in a kernel before it looks whether rows are decided."""
+
 
 class Boundary(NamedTuple):
     """Last kept score of each row; larger ones are kept, and ties up to and including `index`."""
@@ -39,7 +42,7 @@ def energies(scores: jax.Array) -> jax.Array:
     maximum ignores it, as in Triton.
     """
     largest = _by_row(jnp.max, jnp.abs(jax.lax.stop_gradient(scores)))
-    exponent = jax.lax.shift_right_logical(_bits(largest), 23)
+    exponent = jax.lax.shift_right_logical(float_bits(largest), 23)
     scale = _float(jax.lax.shift_left(jnp.maximum(253 - exponent, 1), 23))
     scale = jnp.where(largest == jnp.inf, 0, scale)
     return jnp.square(jnp.where(jnp.abs(scores) == jnp.inf, 1, scores * scale))
@@ -50,7 +53,8 @@ def _by_row(reduce: Callable, rows: jax.Array, **options: Any) -> jax.Array:
     return reduce(rows, axis=-1, keepdims=rows.ndim > 1, **options)
 
 
-def _bits(x: jax.Array) -> jax.Array:
+def float_bits(x: jax.Array) -> jax.Array:
+    """Return the bits of f32 as int32; non-negative numbers sort like them."""
     return jax.lax.bitcast_convert_type(x, jnp.int32)
 
 
@@ -110,30 +114,40 @@ def block_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
 
     One binary search finds the largest score s such that the scores >= s together reach the target.
     It stops once all rows of the block are decided: for softplus scores and R = 128, after 11 of 31
-    steps. A second search finds the last tie with s that is needed. A single row gives scalars,
-    whose comparisons cost nothing in a kernel.
+    steps. The first steps only halve: to tell whether a row is decided costs as much as halving. A
+    second search finds the last tie with s that is needed. A single row gives scalars, whose
+    comparisons cost nothing in a kernel.
     """
     if scores.size == scores.shape[-1]:
         scores = scores.reshape(-1)
     energy = energies(scores)
     target = ratio.numerator * _by_row(jnp.sum, energy)
 
-    def halve(bracket: _Bracket) -> _Bracket:
-        middle = bracket.low + jax.lax.shift_right_logical(bracket.high - bracket.low, 1)
-        above = scores >= _float(middle)
-        count = _by_row(jnp.sum, above.astype(jnp.int32), dtype=jnp.int32)
+    def reaches(threshold: jax.Array) -> tuple[jax.Array, jax.Array]:
+        above = scores >= _float(threshold)
         reached = _by_row(jnp.sum, jnp.where(above, energy, 0))
-        is_low = ratio.denominator * reached >= target
+        return ratio.denominator * reached >= target, above
+
+    def halve(_: Any, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        middle = _middle(*ends)
+        is_low, _ = reaches(middle)
+        return jnp.where(is_low, middle, ends[0]), jnp.where(is_low, ends[1], middle)
+
+    def halve_and_count(bracket: _Bracket) -> _Bracket:
+        middle = _middle(bracket.low, bracket.high)
+        is_low, above = reaches(middle)
+        count = _count(above)
         upper_half = bracket._replace(low=middle, num_low=count)
         lower_half = bracket._replace(high=middle, num_high=count)
         return jax.tree.map(functools.partial(jnp.where, is_low), upper_half, lower_half)
 
-    lowest, highest = (_bits(_by_row(f, scores)) for f in (jnp.min, jnp.max))
+    lowest, highest = (float_bits(_by_row(f, scores)) for f in (jnp.min, jnp.max))
     zero = jnp.zeros_like(lowest)
+    ends = jax.lax.fori_loop(0, UNCOUNTED_STEPS, halve, (lowest, highest + 1))
     bracket = jax.lax.while_loop(
         lambda b: _any((b.high - b.low > 1) & (b.num_low - b.num_high > 1)),
-        halve,
-        _Bracket(lowest, highest + 1, zero + scores.shape[-1], zero),
+        halve_and_count,
+        _Bracket(*ends, *(_count(scores >= _float(end)) for end in ends)),
     )
     # The bracket now holds a single score or ties.
     score = _by_row(jnp.max, jnp.where(scores <= _float(bracket.high - 1), scores, -1))
@@ -165,6 +179,15 @@ def _last_tie(
         return jnp.where(falls_short, candidate, index)
 
     return jax.lax.fori_loop(0, num_bits, step, jnp.zeros_like(score, jnp.int32))
+
+
+def _middle(low: jax.Array, high: jax.Array) -> jax.Array:
+    return low + jax.lax.shift_right_logical(high - low, 1)
+
+
+def _count(rows: jax.Array) -> jax.Array:
+    """Count True in each row, int32."""
+    return _by_row(jnp.sum, rows.astype(jnp.int32), dtype=jnp.int32)
 
 
 def _any(condition: jax.Array) -> jax.Array:

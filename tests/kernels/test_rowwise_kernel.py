@@ -14,8 +14,8 @@ def gated(shared, columns, valid, mask):
     """Use every feature: two column groups, a matmul, a mask, sums, statistics."""
     left, right = columns
     mixed = left * jnp.tanh(right.astype(jnp.float32) @ shared["w"] + shared["b"])
-    mask = mixed > 0 if mask is None else mask
-    output = jnp.where(mask, mixed, 0)
+    mask = (mixed > 0).astype(jnp.int32) if mask is None else mask
+    output = jnp.where(mask != 0, mixed, 0)
     sums = {
         "squares": jnp.where(valid, output**2, 0).sum(0),
         "rows": jnp.where(valid, 1.0, 0).sum(0),
@@ -162,8 +162,8 @@ def test_stacked_functions(shared, few, monkeypatch):
     jax.tree.map(close, (actual, d_pair.tree(), d_rows), (expected, d_stacked, others))
 
 
-def test_bits_unpack_to_the_bools():
-    mask = jax.random.bernoulli(jax.random.key(0), 0.5, (16, 128))
+def test_bits_unpack_to_the_mask():
+    mask = jax.random.bernoulli(jax.random.key(0), 0.5, (16, 128)).astype(jnp.int32)
     packed = kernels._pack_bits(mask)
     assert packed.dtype == jnp.uint8
     np.testing.assert_array_equal(kernels._unpack_bits(packed), mask)

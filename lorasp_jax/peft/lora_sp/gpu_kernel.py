@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from lorasp_jax.kernels.energy_gate import energy_gate, kept_energy
+from lorasp_jax.kernels.energy_gate import kept_energy, kept_flags
 from lorasp_jax.kernels.packing import PackedTree
 from lorasp_jax.kernels.rowwise_kernel import rowwise_kernel
 from lorasp_jax.peft._aux import Aux
@@ -85,7 +85,8 @@ def bottleneck_block(
       router: b1 [H], w2 [H, S], b2 [S], with S >= R scores.
       columns: V x [n, R] and x W1 [n, H], of the same dtype.
       valid: bool [n, 1], False for padding.
-      mask: bool [n, S], the gate's mask. None in the forward pass, which computes it. No gradient.
+      mask: int32 [n, S], 0 or 1, the gate's mask without gradient. None in the forward pass, which
+        computes it.
       energy_target: η.
       scale: α/R.
 
@@ -94,15 +95,56 @@ def bottleneck_block(
       each.
     """
     v_x, hidden = columns
-    scores, logits = router_scores(router, hidden, "gelu")
+    matmul = _matmul if mask is None else _differentiable_matmul
+    scores, logits = router_scores(router, hidden, "gelu", matmul)
     if mask is None:
-        mask = energy_gate(scores, energy_target, implementation="block")[0]
-        mask &= jax.lax.broadcasted_iota(jnp.int32, mask.shape, 1) < v_x.shape[1]
-    energy = kept_energy(scores, mask)[:, None]
-    in_bank = [_first(a, v_x.shape[1]) for a in (scale * scores, mask.astype(jnp.float32))]
-    z = apply_masked_scores(v_x, in_bank[0], in_bank[1] != 0, energy)
-    active_rank = mask.astype(jnp.float32).sum(-1, keepdims=True)
-    return z, loss_sums(scores, logits, mask, energy, valid), mask, [active_rank, energy]
+        mask = kept_flags(scores, energy_target)
+        in_bank = jax.lax.broadcasted_iota(jnp.int32, mask.shape, 1) < v_x.shape[1]
+        mask &= in_bank.astype(jnp.int32)
+    kept = mask.astype(jnp.float32)
+    energy = kept_energy(scores, kept)[:, None]
+    scaled, is_kept = (_first(a, v_x.shape[1]) for a in (scale * scores, kept))
+    z = apply_masked_scores(v_x, scaled, is_kept != 0, energy)
+    sums = loss_sums(scores, logits, kept, energy, valid)
+    return z, sums, mask, [kept.sum(-1, keepdims=True), energy]
+
+
+def _matmul(rows: jax.Array, matrix: jax.Array) -> jax.Array:
+    """rows @ matrix, [n, R]. A single row uses a sum: Triton's matmul needs at least 16 rows."""
+    return rows @ matrix if len(rows) > 1 else (rows.T * matrix).sum(0, keepdims=True)
+
+
+def _matmul_forward(rows: jax.Array, matrix: jax.Array) -> tuple[jax.Array, tuple]:
+    rows = _computed_once(rows)
+    return _matmul(rows, matrix), (rows, matrix)
+
+
+def _matmul_gradient(
+    residuals: tuple[jax.Array, jax.Array], d: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Return the gradients of rows and matrix for the cotangent d [n, R].
+
+    JAX's own gradient of the matrix has the transposed d as its left operand. Triton would compute
+    everything that leads to d twice, the second time in the transposed layout.
+    """
+    rows, matrix = residuals
+    if len(rows) > 1:
+        return d @ matrix.T, rows.T @ d
+    return (d * matrix).sum(1)[None], rows.T * d
+
+
+_differentiable_matmul = jax.custom_vjp(_matmul)
+_differentiable_matmul.defvjp(_matmul_forward, _matmul_gradient)
+
+
+def _computed_once(x: jax.Array) -> jax.Array:
+    """Return x. Triton would compute it for each operand of a matmul, and by each warp.
+
+    It does not look for what to compute again beyond a sum, here of x and zeros.
+    """
+    x_and_zero = jnp.broadcast_to(x[..., None], (*x.shape, 2))
+    last = jax.lax.broadcasted_iota(jnp.int32, x_and_zero.shape, x.ndim)
+    return jnp.where(last == 0, x_and_zero, 0).sum(-1)
 
 
 def _first(x: jax.Array, n: int) -> jax.Array:

@@ -5,6 +5,7 @@ Everything is in fp32.
 
 import functools
 import math
+from collections.abc import Callable
 from typing import Literal
 
 import jax
@@ -47,7 +48,10 @@ def init_output_layer(
 
 
 def router_scores(
-    router: dict[str, jax.Array], hidden: jax.Array, kind: Router
+    router: dict[str, jax.Array],
+    hidden: jax.Array,
+    kind: Router,
+    matmul: Callable[[jax.Array, jax.Array], jax.Array] = jnp.matmul,
 ) -> tuple[jax.Array, jax.Array]:
     """Eq. (10): h = φ(x W1 + b1), s(x) = ψ(h W2 + b2) with a non-negative ψ.
 
@@ -59,6 +63,7 @@ def router_scores(
       router: w2 [H, R], and b1 [H], b2 [R] unless `kind` is "softmax".
       hidden: x W1, [..., H] of any dtype.
       kind: the router variant.
+      matmul: multiplies by W2, unless `kind` is "softmax".
 
     Returns:
       scores f32 [..., R], and the logits for the z-loss: the input of ψ [..., R], or that of φ
@@ -67,7 +72,7 @@ def router_scores(
     hidden = cast_and_clip(hidden)
     if kind == "softmax":
         return jax.nn.relu(jax.nn.softmax(hidden) @ router["w2"]), hidden
-    logits = _matmul(gelu(hidden + router["b1"]), router["w2"]) + router["b2"]
+    logits = matmul(gelu(hidden + router["b1"]), router["w2"]) + router["b2"]
     if kind == "gelu_softmax":
         return logits.shape[-1] * jax.nn.softmax(logits), logits
     return (softplus if kind == "gelu" else jax.nn.relu)(logits), logits
@@ -106,13 +111,6 @@ def _(primals: tuple[jax.Array], tangents: tuple[jax.Array]) -> tuple[jax.Array,
     (x,), (tangent,) = primals, tangents
     e = jnp.exp(-jnp.abs(x))
     return softplus(x), tangent * jnp.where(x < 0, e, 1) / (1 + e)
-
-
-def _matmul(rows: jax.Array, matrix: jax.Array) -> jax.Array:
-    """rows @ matrix, [n, R]. A single row uses a sum: Triton's matmul needs at least 16 rows."""
-    if rows.shape[:-1] != (1,):
-        return rows @ matrix
-    return (rows.reshape(-1, 1) * matrix).sum(0, keepdims=True)
 
 
 def pooled_scores(scores: jax.Array, valid: jax.Array, granularity: Granularity) -> jax.Array:
