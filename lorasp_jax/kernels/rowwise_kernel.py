@@ -33,8 +33,7 @@ class Launch(NamedTuple):
     warps: int
     """Warps per program."""
     programs: int
-    """Approximate number of programs per function; the actual number divides the number of blocks.
-    Each writes one partial sum."""
+    """Number of programs per function, if there are as many blocks. Each writes partial sums."""
 
 
 FORWARD = Launch(16, 2, 816)
@@ -221,13 +220,11 @@ def _call(
     (values,), launch, num_rows = shared, blocks.launch, len(arrays[0])
     arrays = [jnp.pad(array, ((0, -num_rows % launch.rows), (0, 0))) for array in arrays]
     num_blocks, num_functions = len(arrays[0]) // launch.rows, len(values)
-    max_blocks = pl.cdiv(num_blocks, launch.programs)
-    per_program = next(n for n in range(max_blocks, 0, -1) if num_blocks % n == 0)
-    programs = num_blocks // per_program
+    programs = min(launch.programs, num_blocks)
     size = sum(leaf.size for leaf in jax.tree.leaves(blocks.sums))
     rows = [_shape(o.array, len(arrays[0]), num_functions * sum(o.widths)) for o in blocks.outputs]
     outputs, partial_sums = pl.pallas_call(
-        functools.partial(_kernel, blocks, per_program),
+        functools.partial(_kernel, blocks, num_blocks, programs),
         grid=(programs, num_functions),
         out_shape=(rows, _shape(jnp.float32, programs, num_functions, size)),
         compiler_params=triton.CompilerParams(num_warps=launch.warps, num_stages=1),
@@ -263,18 +260,19 @@ def _shape(dtype: Any, *shape: int) -> jax.ShapeDtypeStruct:
 def _kernel(
     blocks: _Blocks,
     num_blocks: int,
+    programs: int,
     shared_ref: Any,
     input_refs: Any,
     output_refs: Any,
     sum_ref: Any,
 ) -> None:
-    """Run one program: `num_blocks` consecutive blocks of one function."""
+    """Run one program: every `programs`-th block of one function."""
     program, function = pl.program_id(0), pl.program_id(1)
     shared = blocks.shared_tree(lambda *span: shared_ref[function, pl.ds(*span)])
     num_rows = blocks.launch.rows
 
     def block(i: jax.Array, sums: Any) -> Any:
-        at = pl.ds((program * num_blocks + i) * num_rows, num_rows)
+        at = pl.ds((program + i * programs) * num_rows, num_rows)
         loaded = [
             [ref[at, pl.ds(*span)] for span in operand.spans(function)]
             for ref, operand in zip(input_refs, blocks.inputs, strict=True)
@@ -286,6 +284,7 @@ def _kernel(
         return jax.tree.map(jnp.add, sums, block_sums)
 
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), blocks.sums)
-    leaves = jax.tree.leaves(jax.lax.fori_loop(0, num_blocks, block, zeros))
+    count = pl.cdiv(num_blocks - program, programs)
+    leaves = jax.tree.leaves(jax.lax.fori_loop(0, count, block, zeros))
     for span, leaf in zip(spans(tuple(leaf.size for leaf in leaves)), leaves, strict=True):
         sum_ref[program, function, pl.ds(*span)] = leaf.reshape(-1)
