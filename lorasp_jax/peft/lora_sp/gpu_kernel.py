@@ -111,7 +111,7 @@ def bottleneck_block(
 
 def _matmul(rows: jax.Array, matrix: jax.Array) -> jax.Array:
     """rows @ matrix, [n, R]. A single row uses a sum: Triton's matmul needs at least 16 rows."""
-    return rows @ matrix if len(rows) > 1 else (rows.T * matrix).sum(0, keepdims=True)
+    return rows @ matrix if len(rows) > 1 else (rows.reshape(-1, 1) * matrix).sum(0)[None]
 
 
 def _matmul_forward(rows: jax.Array, matrix: jax.Array) -> tuple[jax.Array, tuple]:
