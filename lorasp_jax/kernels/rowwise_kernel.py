@@ -36,8 +36,8 @@ class Launch(NamedTuple):
     """Number of programs per function, if there are as many blocks. Each writes partial sums."""
 
 
-FORWARD = Launch(16, 2, 816)
-BACKWARD = Launch(16, 4, 512)
+FORWARD = Launch(16, 2, 1056)
+BACKWARD = Launch(16, 4, 264)
 """Launch parameters of the two passes, chosen by hand."""
 FEW, FEW_ROWS = Launch(1, 1, 8192), 1024
 """Launch parameters of both passes for up to FEW_ROWS rows, chosen by hand: one warp per row, for
