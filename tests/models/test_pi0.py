@@ -1,6 +1,7 @@
 """Properties of pi0, without recorded values: sizes and attention masks."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -8,9 +9,11 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.models.transformer.layers import block_mask
-from tests.models.random_models import observation, random_backbone
+from lorasp_jax.models.pi0.pi0 import Pi0, Prefix
+from lorasp_jax.models.transformer.layers import block_mask, positions
+from tests.models.random_models import observation, random_backbone, with_random_parameters
 
 CONFIG = Pi0Config.dummy()
 BATCH = 2
@@ -82,3 +85,78 @@ def test_state_does_not_attend_to_actions(model, obs):
 
     row = jax.jit(state_row)
     np.testing.assert_array_equal(row(actions(1)), row(actions(2)))
+
+
+THREE_CAMERAS = dataclasses.replace(CONFIG, cameras=("left", "side", "wrist"))
+
+
+def gaps():
+    """The first example lacks the middle camera, the second the first one; both have padding."""
+    cameras = THREE_CAMERAS.cameras
+    obs = observation(THREE_CAMERAS, BATCH)
+    present = jnp.array([[True, False, True], [False, True, True]])
+    # Different images, so that their order matters.
+    images = {name: jnp.roll(obs.images[name], 3 * i, axis=2) for i, name in enumerate(cameras)}
+    masks = dict(zip(cameras, present.T, strict=True))
+    return dataclasses.replace(obs, images=images, image_masks=masks)
+
+
+def compact(obs, example):
+    """One example without its missing camera and without padding."""
+    one = jax.tree.map(lambda x: x[example : example + 1], obs)
+    cameras = [name for name, present in one.image_masks.items() if present[0]]
+    length = int(one.token_mask.sum())
+    return cameras, dataclasses.replace(
+        one,
+        images={name: one.images[name] for name in cameras},
+        image_masks={name: one.image_masks[name] for name in cameras},
+        tokens=one.tokens[:, :length],
+        token_mask=one.token_mask[:, :length],
+    )
+
+
+@pytest.mark.parametrize("pi05", [False, True], ids=["pi0", "pi05"])
+def test_missing_cameras_and_padding_are_as_if_left_out(pi05):
+    config = dataclasses.replace(THREE_CAMERAS, pi05=pi05)
+    model, obs, x_t, time = random_backbone(config), gaps(), actions(), jnp.array([0.3, 0.8])
+    velocity = jax.jit(lambda model, *inputs: model.velocity(*inputs))
+    v_t = velocity(model, obs, x_t, time)
+    for i in range(BATCH):
+        cameras, one = compact(obs, i)
+        assert len(cameras) == 2
+        model.config = dataclasses.replace(config, cameras=tuple(cameras))
+        expected = velocity(model, one, x_t[i : i + 1], time[i : i + 1])
+        np.testing.assert_allclose(v_t[i : i + 1], expected, rtol=1e-4, atol=1e-5)
+
+
+class Masked(Pi0):
+    """pi0 with the prefix in its original order and a mask."""
+
+    def run_prefix(self, obs: Observation):
+        tokens, valid, vision_aux = self.embed_prefix(obs)
+        block = np.zeros(valid.shape[1], int)
+        mask = block_mask(block, block, valid, valid)
+        out, cache, aux = self.language(tokens, positions(valid), mask, token_mask=valid)
+        return Prefix(cache, valid, out), {**vision_aux, "language": aux}
+
+
+def test_a_masked_prefix_gives_the_same_loss_gradients_and_samples():
+    obs, x_t = gaps(), actions()
+
+    def results(make):
+        graphdef, parameters = nnx.split(
+            with_random_parameters(lambda: make(THREE_CAMERAS, rngs=nnx.Rngs(0)))
+        )
+
+        def loss(parameters):
+            model = nnx.merge(graphdef, parameters)
+            return model.loss(jax.random.key(2), obs, x_t)[0].mean()
+
+        def sample(parameters):
+            sampler = nnx.merge(graphdef, parameters).sampler()
+            return sampler.sample_actions(jax.random.key(0), obs, noise=x_t, num_steps=2)
+
+        return jax.jit(lambda p: (jax.value_and_grad(loss)(p), sample(p)))(parameters)
+
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5)
+    jax.tree.map(close, results(Pi0), results(Masked))

@@ -28,9 +28,9 @@ from lorasp_jax.models.transformer.experts import AdaptiveExpert, Expert, KeysVa
 from lorasp_jax.models.transformer.layers import (
     LayerAux,
     ModelAux,
-    block_mask,
     positions,
     time_embedding,
+    valid_first,
 )
 from lorasp_jax.models.transformer.siglip import SigLIP
 
@@ -106,7 +106,7 @@ class Pi0Config(BackboneConfig):
 
 
 class Prefix(NamedTuple):
-    """Encoded images and instruction.
+    """Encoded images and instruction, valid tokens first.
 
     Attributes:
         cache: keys and values `[L, B, P, K, H]` of all layers of the language expert.
@@ -161,9 +161,10 @@ class Pi0(Backbone):
     def run_prefix(self, obs: Observation) -> tuple[Prefix, ModelAux]:
         """Encode images and instruction."""
         tokens, valid, vision_aux = self.embed_prefix(obs)
-        block = np.zeros(valid.shape[1], int)
-        mask = block_mask(block, block, valid, valid)
-        out, cache, aux = self.language(tokens, positions(valid), mask, token_mask=valid)
+        # All tokens attend to the valid ones. With these first, attention needs only their number.
+        tokens, valid = valid_first(tokens, valid)
+        count = jnp.sum(valid, axis=1, dtype=jnp.int32)
+        out, cache, aux = self.language(tokens, positions(valid), count, token_mask=valid)
         return Prefix(cache, valid, out), {**vision_aux, "language": aux}
 
     def run_suffix(

@@ -31,7 +31,10 @@ CUDNN_MULTIPLE = 8
 def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) -> jax.Array:
     """Grouped-query attention with fp32 softmax; 16-bit floats on GPUs use faster kernels.
 
-    These are cuDNN for long inputs, and `kernels.short_attention` for few keys.
+    These are cuDNN for long inputs, and `kernels.short_attention` for few keys. cuDNN is faster
+    with numbers of keys than with a mask: forward and backward pass of a layer of pi0's language
+    model take 2.8 instead of 5.0 ms (H200, bf16, batch size 32, 816 tokens, 8 heads of 256, one key
+    head).
 
     cuDNN accumulates gradients in nondeterministic order: two runs differ by rounding errors.
     Neither kernel has a forward-mode or second derivative.
@@ -40,18 +43,19 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) 
         q: `[B, T, N, H]`, already scaled.
         k: `[B, S, K, H]`; each key head serves N / K query heads.
         v: `[B, S, K, H]`.
-        mask: `[B, T, S]` bool, or None to attend to all keys.
+        mask: `[B, T, S]` bool; or `[B]` int32, if all queries attend to the first mask[b] keys; or
+            None to attend to all keys. A query without keys attends to all of them equally, but
+            with cuDNN and `[B]` to the first one.
 
     Returns:
         `[B, T, N H]`.
     """
     batch, tokens, heads, size = q.shape
     if _use_cudnn(q, k, mask):
-        attend = functools.partial(jax.nn.dot_product_attention, implementation="cudnn", scale=1.0)
-        if mask is not None:
-            q, k, v, mask = _pad_for_cudnn(q, k, v, mask)
-        y = attend(q, k, v, mask=None if mask is None else mask[:, None])
-        return y[:, :tokens].reshape(batch, tokens, heads * size)
+        return _cudnn_attention(q, k, v, mask)[:, :tokens].reshape(batch, tokens, heads * size)
+    if mask is not None and mask.ndim == 1:
+        first = jnp.arange(k.shape[1]) < mask[:, None]
+        mask = jnp.broadcast_to(first[:, None], (batch, tokens, k.shape[1]))
     if _use_short_attention(q, k):
         return short_attention(q, k, v, mask)
     k, v, mask = _pad_keys(k, v, mask)
@@ -93,13 +97,19 @@ def _use_short_attention(q: jax.Array, k: jax.Array) -> bool:
     return platform() == "gpu" and half_precision and head_dim in HEAD_DIMS and few
 
 
-def _pad_for_cudnn(
-    q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Append masked keys and queries up to multiples of `CUDNN_MULTIPLE`."""
+def _cudnn_attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) -> jax.Array:
+    """Return `[B, T, N, H]`; with a mask, T is rounded up to a multiple of `CUDNN_MULTIPLE`."""
+    attend = functools.partial(jax.nn.dot_product_attention, implementation="cudnn", scale=1.0)
+    if mask is None:
+        return attend(q, k, v)
     queries, keys = (-a.shape[1] % CUDNN_MULTIPLE for a in (q, k))
     q, k, v = (_pad_tokens(a, n) for a, n in ((q, queries), (k, keys), (v, keys)))
-    return q, k, v, jnp.pad(mask, ((0, 0), (0, queries), (0, keys)))
+    if mask.ndim == 1:
+        # Computed from the mask, the queries' constant number is sharded and vmapped like it.
+        all_queries = jnp.clip(mask, q.shape[1], q.shape[1])
+        some_keys = jnp.maximum(mask, 1)
+        return attend(q, k, v, query_seq_lengths=all_queries, key_value_seq_lengths=some_keys)
+    return attend(q, k, v, mask=jnp.pad(mask, ((0, 0), (0, queries), (0, keys)))[:, None])
 
 
 def _pad_tokens(x: jax.Array, padding: int) -> jax.Array:

@@ -97,7 +97,7 @@ class ExpertBlock(nnx.Module):
         Args:
             x: `[B, T, D]`.
             table: RoPE sine and cosine for these tokens, from `rope_table`.
-            mask: `[B, T, S + T]` bool over the cached keys followed by this layer's keys.
+            mask: see `attention`; the keys are the cached ones, followed by this layer's.
             cache: keys and values of preceding tokens, or None (S = 0).
             token_mask: `[B, T]` bool, False excludes a token from aux.
             condition: `[B, 1, D]` or `[B, T, D]` for adaptive norms, or None.
@@ -167,7 +167,7 @@ class Expert(nnx.Module):
         Args:
             x: `[B, T, D]`.
             position: `[B, T]` int32.
-            mask: `[B, T, S + T]` bool over the cached keys followed by this expert's keys.
+            mask: see `attention`; the keys are the cached ones, followed by this expert's.
             cache: keys and values `[L, B, S, K, H]` of preceding tokens, or None (S = 0).
             token_mask: `[B, T]` bool, False excludes a token from aux.
             condition: `[B, 1, D]` or `[B, T, D]` for adaptive norms, or None.

@@ -161,6 +161,25 @@ def positions(valid: jax.Array) -> jax.Array:
     return jnp.cumsum(valid, axis=-1, dtype=jnp.int32) - 1
 
 
+def valid_first(x: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Move the valid tokens before the others; their own order is kept.
+
+    Args:
+        x: `[B, T, D]`.
+        valid: `[B, T]` bool.
+
+    Returns:
+        x and valid in the new order.
+    """
+    order = jnp.argsort(~valid, axis=1, stable=True)
+
+    def permute(x: jax.Array, order: jax.Array) -> jax.Array:
+        # Unique indices: the backward pass stores gradients instead of adding them atomically.
+        return x.at[order].get(unique_indices=True, mode="promise_in_bounds")
+
+    return jax.vmap(permute)(x, order), jax.vmap(permute)(valid, order)
+
+
 def block_mask(
     query_block: np.ndarray, key_block: np.ndarray, query_valid: jax.Array, key_valid: jax.Array
 ) -> jax.Array:

@@ -46,25 +46,107 @@ def test_attention_over_many_keys(keys):
     np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_token_counts_are_padded_for_cudnn(monkeypatch):
-    """XLA computes what cuDNN would: padded queries and keys do not change the result."""
-    sizes, attend = [], jax.nn.dot_product_attention
+@pytest.fixture
+def cudnn(monkeypatch):
+    """Use cuDNN, or on a host without a GPU, XLA in its place; yield the calls' arguments."""
+    calls, attend = [], jax.nn.dot_product_attention
+    implementation = "cudnn" if jax.default_backend() == "gpu" else "xla"
 
-    def in_xla(q, k, v, *args, implementation, **options):
-        assert implementation == "cudnn"
-        sizes.append((q.shape[1], k.shape[1]))
-        return attend(q, k, v, *args, implementation="xla", **options)
+    def record(q, k, v, **options):
+        assert options.pop("implementation") == "cudnn"
+        calls.append({"sizes": (q.shape[1], k.shape[1]), **options})
+        return attend(q, k, v, implementation=implementation, **options)
 
-    seeds = jax.random.split(jax.random.key(0), 4)
-    q = jax.random.normal(seeds[0], (2, 131, 4, 64), "bfloat16") / 8
-    k, v = (jax.random.normal(seed, (2, 141, 2, 64), "bfloat16") for seed in seeds[1:3])
-    mask = jax.random.bernoulli(seeds[3], 0.5, (2, 131, 141))
-    expected = attention(q, k, v, mask)
-    monkeypatch.setattr(jax.nn, "dot_product_attention", in_xla)
+    monkeypatch.setattr(jax.nn, "dot_product_attention", record)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    actual = attention(q, k, v, mask)
-    assert sizes == [(136, 144)]
+    return calls
+
+
+@pytest.fixture
+def interpreted(monkeypatch):
+    """Use `short_attention` without a GPU; yield the calls' arguments."""
+    calls = []
+
+    def record(*arrays):
+        calls.append(arrays)
+        return short_attention(*arrays, interpret=True)
+
+    monkeypatch.setattr(module, "platform", lambda: "gpu")
+    monkeypatch.setattr(module, "short_attention", record)
+    return calls
+
+
+def random_inputs(tokens, keys, head_dim, dtype):
+    seeds = jax.random.split(jax.random.key(0), 3)
+    q = jax.random.normal(seeds[0], (4, tokens, 4, head_dim)) / 8
+    k, v = (jax.random.normal(seed, (4, keys, 2, head_dim)) for seed in seeds[1:])
+    return [a.astype(dtype) for a in (q, k, v)]
+
+
+def result_and_gradients(q, k, v, mask):
+    y, vjp = jax.vjp(lambda *arrays: attention(*arrays, mask), q, k, v)
+    dy = jnp.cos(jnp.arange(y.size)).reshape(y.shape)
+    return [np.float32(a) for a in (y, *vjp(dy.astype(y.dtype)))]
+
+
+def test_token_counts_are_padded_for_cudnn(request):
+    """Padded queries and keys do not change the result."""
+    arrays = random_inputs(131, 141, 64, "bfloat16")
+    mask = jax.random.bernoulli(jax.random.key(1), 0.5, (4, 131, 141))
+    expected = attention(*arrays, mask)
+    calls = request.getfixturevalue("cudnn")
+    actual = attention(*arrays, mask)
+    assert [call["sizes"] for call in calls] == [(136, 144)]
     np.testing.assert_allclose(actual.astype("f4"), expected.astype("f4"), atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("tokens", "keys", "head_dim", "dtype", "kernel"),
+    [
+        (5, 37, 16, "float32", None),
+        (5, 600, 16, "float32", None),  # padded keys
+        pytest.param(11, 37, 16, "bfloat16", "interpreted", marks=ALLOW_TRITON),
+        (131, 141, 64, "bfloat16", "cudnn"),
+        (136, 144, 256, "bfloat16", "cudnn"),  # nothing padded, as in pi0
+    ],
+)
+def test_a_number_of_keys_equals_a_mask(tokens, keys, head_dim, dtype, kernel, request):
+    """Values and gradients; also for a single key and for all."""
+    arrays = random_inputs(tokens, keys, head_dim, dtype)
+    count = jnp.array([1, 20, keys - 1, keys], jnp.int32)
+    mask = jnp.arange(keys) < count[:, None, None]
+    expected = result_and_gradients(*arrays, jnp.broadcast_to(mask, (4, tokens, keys)))
+    calls = request.getfixturevalue(kernel) if kernel else [None]
+    actual = result_and_gradients(*arrays, count)
+    assert calls
+    tolerance = 1e-5 if dtype == "float32" else 0.02
+    for a, b in zip(actual, expected, strict=True):
+        assert np.linalg.norm(a - b) <= tolerance * np.linalg.norm(b)
+    for gradient in actual[2:]:  # of keys and values
+        assert not gradient[~np.asarray(mask)[:, 0]].any()
+
+
+def test_cudnn_gets_numbers_of_keys_instead_of_a_mask(cudnn):
+    attention(*random_inputs(131, 141, 64, "bfloat16"), jnp.array([3, 141, 0, 1], jnp.int32))
+    (call,) = cudnn
+    assert call["sizes"] == (136, 144)
+    assert "mask" not in call
+    np.testing.assert_array_equal(call["key_value_seq_lengths"], [3, 141, 1, 1])
+    np.testing.assert_array_equal(call["query_seq_lengths"], [136] * 4)
+
+
+@pytest.mark.parametrize("kernel", [None, pytest.param("interpreted", marks=ALLOW_TRITON), "cudnn"])
+def test_no_keys_give_finite_results(kernel, request):
+    """The mean of all values, or with cuDNN the first value."""
+    tokens, keys, head_dim = (131, 141, 64) if kernel == "cudnn" else (5, 37, 16)
+    arrays = random_inputs(tokens, keys, head_dim, "bfloat16")
+    if kernel:
+        request.getfixturevalue(kernel)
+    y, *gradients = result_and_gradients(*arrays, jnp.zeros(4, jnp.int32))
+    assert all(np.isfinite(gradient).all() for gradient in gradients)
+    values = np.float32(arrays[2]).repeat(2, axis=2).reshape(4, keys, -1)
+    expected = values[:, :1] if kernel == "cudnn" else values.mean(axis=1, keepdims=True)
+    np.testing.assert_allclose(y, np.broadcast_to(expected, y.shape), atol=0.02)
 
 
 @ALLOW_TRITON
@@ -128,18 +210,11 @@ def test_kernels_in_a_policy(backbone, remat):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("backbone", [pi0, smolvla], ids=["pi0", "smolvla"])
-def test_kernels_change_a_policy_by_rounding_errors_only(backbone, monkeypatch):
+def test_kernels_change_a_policy_by_rounding_errors_only(backbone, request):
     """XLA's own bf16 gradients differ as much from fp32: by up to 3% of a parameter's gradient."""
     loss, parameters = small_policy(backbone, "bfloat16", "products")
     expected = jax.jit(jax.value_and_grad(loss))(parameters)
-    calls = []
-
-    def interpreted(*arrays):
-        calls.append(arrays)
-        return short_attention(*arrays, interpret=True)
-
-    monkeypatch.setattr(module, "platform", lambda: "gpu")
-    monkeypatch.setattr(module, "short_attention", interpreted)
+    calls = request.getfixturevalue("interpreted")
     actual = jax.jit(jax.value_and_grad(loss))(parameters)
     assert calls
     np.testing.assert_allclose(actual[0], expected[0], rtol=5e-3)
