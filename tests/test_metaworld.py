@@ -1,7 +1,9 @@
 """Test the Meta-World example without Meta-World: its tasks, and that its datasets can be read."""
 
+import importlib
 import json
 import os
+import re
 import subprocess
 import sys
 import venv
@@ -10,7 +12,7 @@ import numpy as np
 import pytest
 
 from examples.metaworld import dataset
-from examples.metaworld.tasks import GROUPS, INSTRUCTIONS
+from examples.metaworld.tasks import GROUPS, INSTALL, INSTRUCTIONS
 from lorasp_jax.data import open_source
 from lorasp_jax.evaluation.gymnasium.task import load_tasks
 from lorasp_jax.policies import tokenizer
@@ -80,8 +82,16 @@ def test_a_dataset_is_not_overwritten(written):
 def test_missing_package_names_the_command(monkeypatch):
     monkeypatch.setitem(sys.modules, "metaworld.env_dict", None)
     monkeypatch.delitem(sys.modules, "examples.metaworld.world", raising=False)
-    with pytest.raises(ValueError, match=r"pip install metaworld==3\.1\.1 packaging"):
+    with pytest.raises(ValueError, match=re.escape(INSTALL)):
         load_tasks("examples.metaworld.world:mt50")
+
+
+def test_recording_without_the_package_names_the_command(monkeypatch):
+    monkeypatch.setitem(sys.modules, "metaworld.policies", None)
+    for name in ("collect", "expert"):
+        monkeypatch.delitem(sys.modules, f"examples.metaworld.{name}", raising=False)
+    with pytest.raises(SystemExit, match=re.escape(INSTALL)):
+        importlib.import_module("examples.metaworld.collect")
 
 
 @pytest.mark.slow
@@ -89,8 +99,7 @@ def test_unmodified_metaworld_records_and_judges(tmp_path):
     """In an environment of its own, which pins another MuJoCo and has no JAX."""
     venv.create(tmp_path / "venv", with_pip=True)
     python = str(tmp_path / "venv" / "bin" / "python")
-    packages = ["metaworld==3.1.1", "packaging", "pyarrow", "lazy_loader", "msgpack", "websockets"]
-    run([python, "-m", "pip", "install", "-q", *packages])
+    run([python, "-m", "pip", "-q", *INSTALL.split()[1:]])
     data = tmp_path / "data"
     collect = [python, "-m", "examples.metaworld.collect", str(data), "--tasks", "reach"]
     run([*collect, "--episodes", "2", "--processes", "1"])

@@ -14,10 +14,14 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
-from examples.metaworld import dataset
-from examples.metaworld.expert import demonstrate
-from examples.metaworld.tasks import INSTRUCTIONS, SETS
-from examples.metaworld.world import IMAGE_SIZE, World
+from examples.metaworld.tasks import INSTALL, INSTRUCTIONS, SETS
+
+try:
+    from examples.metaworld import dataset
+    from examples.metaworld.expert import demonstrate
+    from examples.metaworld.world import IMAGE_SIZE, World
+except ModuleNotFoundError as error:
+    raise SystemExit(f"error: {error.name} is missing: {INSTALL}") from error
 
 FIRST_SEED = 1_000_000
 """Seeds of demonstrations start here; those of the judge start at 0."""

@@ -3,6 +3,9 @@
 Groups: Seo et al., Masked World Models for Visual Control, 2022, appendix.
 """
 
+INSTALL = "pip install metaworld==3.1.1 packaging pyarrow lazy_loader msgpack websockets"
+"""Installs what recording and judging need, in an environment of its own."""
+
 GROUPS = {
     "easy": {
         "button-press": "push the button on the front of the box",

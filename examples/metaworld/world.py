@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from examples.metaworld.tasks import GROUPS
+from examples.metaworld.tasks import GROUPS, INSTALL
 from lorasp_jax.evaluation.gymnasium import Task
 
 try:
@@ -20,9 +20,7 @@ try:
     import metaworld.env_dict as tables  # pyright: ignore[reportMissingImports]
     import mujoco
 except ModuleNotFoundError as error:
-    raise ValueError(
-        f"Meta-World's tasks need {error.name}: pip install metaworld==3.1.1 packaging"
-    ) from error
+    raise ValueError(f"Meta-World's tasks need {error.name}: {INSTALL}") from error
 
 CAMERA = "corner2"
 CAMERA_POSITION = (0.75, 0.075, 0.7)

@@ -10,7 +10,7 @@ from lorasp_jax.data.lerobot_export import to_lerobot
 from tests import ROOT, foreign
 from tests.data.lerobots import golden
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]  # installs torch
 
 SCRIPT = ROOT / "tests" / "data" / "lerobot_script.py"
 # LeRobot 0.5 and later need Python 3.12.
