@@ -38,7 +38,7 @@ class Launch(NamedTuple):
 
 FORWARD = Launch(16, 2, 1056)
 BACKWARD = Launch(16, 4, 264)
-"""Launch parameters of the two passes, chosen by hand."""
+"""Launch parameters of the two passes, the fastest of about 15 each on an H200."""
 FEW, FEW_ROWS = Launch(1, 1, 8192), 1024
 """Launch parameters of both passes for up to FEW_ROWS rows, chosen by hand: one warp per row, for
 low latency."""
