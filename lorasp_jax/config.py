@@ -251,7 +251,7 @@ class Config:
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     """Evaluation in simulation."""
     control_dt: float = 0.1
-    """Control period [s]; must match the demonstrations and the base."""
+    """Control period [s]; must match the dataset or, without one, the base."""
     fsdp: int = 1
     """Devices per FSDP group, over which large arrays (base, trainable parameters, optimizer state)
     are sharded; the rest of the mesh is data parallel."""

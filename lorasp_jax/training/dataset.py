@@ -33,8 +33,8 @@ def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
     if abs(source.control_dt / config.control_dt - 1) > _DT_TOLERANCE:
         raise ValueError(
             f"{path} has a control period of {source.control_dt:.4g} s, but this run has "
-            f"--control-dt {config.control_dt:g}: keep every N-th step with python -m "
-            "lorasp_jax.data convert --every N"
+            f"--control-dt {config.control_dt:g}: pass --control-dt {source.control_dt:.4g}, or "
+            "keep every N-th step with python -m lorasp_jax.data convert --every N"
         )
     if len(source.cameras) > len(model.cameras):
         raise ValueError(

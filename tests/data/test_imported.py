@@ -55,7 +55,7 @@ def test_a_dataset_becomes_a_cache_once(tmp_path):
         (
             {"control_dt": 0.05},
             {},
-            r"has a control period of 0\.1 s, but this run has --control-dt 0\.05",
+            r"period of 0\.1 s, but this run has --control-dt 0\.05: pass --control-dt 0\.1, or",
         ),
         ({}, {"cameras": ("side",)}, "has cameras side, wrist, but the backbone accepts at most 1"),
     ],

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from lorasp_jax import models
 from lorasp_jax.adapters import adaptation, paths
-from lorasp_jax.config import ModelConfig
+from lorasp_jax.config import DataConfig, ModelConfig
 from lorasp_jax.data.opening import open_source
 from lorasp_jax.models import inputs
 from lorasp_jax.models.checkpoints import loading
@@ -29,7 +29,7 @@ from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.overrides import override
 from lorasp_jax.training.run import Run
-from tests import GOLDEN
+from tests import GOLDEN, ROOT
 from tests.data.lerobots import golden
 from tests.models.random_models import observation, random_backbone
 from tests.runs import CONFIG, leaves, random_episodes
@@ -89,6 +89,15 @@ def test_an_incompatible_tokenizer_is_rejected_before_collection(config, tmp_pat
     fail = lambda *_: pytest.fail("it collects")  # noqa: E731
     with pytest.raises(ValueError, match="beyond the backbone's vocabulary of 320: "):
         prepare(other, tmp_path, collect=fail)
+
+
+def test_a_bundled_base_learns_another_control_period_from_recordings():
+    config = dataclasses.replace(CONFIG, model=ModelConfig(), control_dt=0.05)
+    with pytest.raises(ValueError, match=r"with control_dt 0\.1 s, but this run has 0\.05 s"):
+        base.base_model(config)
+    recorded = dataclasses.replace(config, data=DataConfig(source="recorded"))
+    _, digest = base.base_model(recorded)
+    assert digest == models.weights_hash(ROOT / "assets" / "pi0_nano")
 
 
 def test_lerobot_policies_are_preprocessed_as_their_config_says(config, tmp_path, monkeypatch):
