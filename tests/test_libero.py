@@ -111,6 +111,8 @@ def test_the_servers_policy_is_measured_and_reported(libero, monkeypatch, capsys
             return np.zeros((50, 3))
 
     class Env(World):
+        language_instruction = "Move"
+
         def __init__(self, **options):
             super().__init__()
             self.episodes = 0
@@ -130,7 +132,9 @@ def test_the_servers_policy_is_measured_and_reported(libero, monkeypatch, capsys
     modules = {
         "libero.libero": types.SimpleNamespace(get_libero_path=lambda _: "root"),
         "libero.libero.benchmark": types.SimpleNamespace(
-            get_benchmark_dict=lambda: {"libero_goal_swap": Suite, "libero_100": Suite}
+            get_benchmark_dict=lambda: dict.fromkeys(
+                ("libero_goal_swap", "libero_goal_task", "libero_100"), Suite
+            )
         ),
         "libero.libero.envs": types.SimpleNamespace(OffScreenRenderEnv=Env),
     }
@@ -145,10 +149,14 @@ def test_the_servers_policy_is_measured_and_reported(libero, monkeypatch, capsys
             "33% [6%, 79%]  1 of 3 episodes: go",
             "33% [6%, 79%]  1 of 3 episodes: all",
         ]
+        options |= {"suite": "libero_goal_task", "address": server.address}
+        libero.main(libero.Config(tasks=(1,), **options))
+        assert capsys.readouterr().out.startswith("33% [6%, 79%]  1 of 3 episodes: move\n")
+        options |= {"suite": "libero_goal_swap"}
         with pytest.raises(ValueError, match=r"libero_goal_swap has tasks 0 to 1, got 2"):
-            libero.main(libero.Config(tasks=(2,), address=server.address, **options))
+            libero.main(libero.Config(tasks=(2,), **options))
     for suite, sentence in (
-        ("nonsense", "no suite nonsense; LIBERO has libero_100, libero_goal_swap"),
+        ("nonsense", "no suite nonsense; LIBERO has libero_100, libero_goal_swap, libero_goal_"),
         ("libero_100", "no limit of steps for libero_100: choose --steps"),
     ):
         with pytest.raises(ValueError, match=sentence):
