@@ -113,10 +113,11 @@ def write(book: Book, folder: Path) -> None:
     """
     for name, drawn in DRAWINGS.items():
         complete = [b for b in book.backbones if not book.missing(*drawn.needs(book, b))]
-        for scheme in figure_style.SCHEMES:
+        texts = figure_style.svgs(drawn.draw, book.of(complete)) if complete else {}
+        for scheme in figure_style.INKS:
             path = folder / "figures" / _file(name, scheme)
             if complete:
-                write_text(path, figure_style.svg(drawn.draw, book.of(complete), scheme))
+                write_text(path, texts[scheme])
             else:
                 path.unlink(missing_ok=True)
 

@@ -11,32 +11,35 @@ from matplotlib.figure import Figure
 
 from lorasp_jax.study.book import Book
 
-SCHEMES = {
-    "light": {"ink": "#1f2328", "soft": "#8b949e"},
-    "dark": {"ink": "#e6edf3", "soft": "#8b949e"},
-}
-"""Colors for light and dark pages; the background is transparent."""
+INKS = {"light": "#1f2328", "dark": "#e6edf3"}
+"""Color of text and lines by color scheme of the page; the background is transparent."""
+SOFT = "#8b949e"
+"""Color of frames and grids in both schemes."""
 LORA_SP, LORA, SINGLE, FULL = "#ff725c", "#a463f2", "#9c6b4e", "#8b949e"
 """Colors of LoRA-SP, of LoRA, of LoRA for single tasks, and of full fine-tuning in all figures."""
 WIDTH = 7.2
 """Width of a figure [inches], that of a page, so that text keeps its size."""
 
 
-def svg(draw: Callable[[Book], Figure], book: Book, scheme: str) -> str:
-    """Draw a figure in a color scheme, the same text every time."""
-    ink, soft = SCHEMES[scheme]["ink"], SCHEMES[scheme]["soft"]
+def svgs(draw: Callable[[Book], Figure], book: Book) -> dict[str, str]:
+    """Draw a figure, the same every time; return it by color scheme.
+
+    It is drawn once: the schemes differ only in the ink, whose color nothing else has.
+    """
+    ink = INKS["light"]
     style: Any = {
         **{f"{name}.color": ink for name in ("text", "xtick", "ytick", "lines")},
-        **{"axes.labelcolor": ink, "axes.titlecolor": ink, "axes.edgecolor": soft},
+        **{"axes.labelcolor": ink, "axes.titlecolor": ink, "axes.edgecolor": SOFT},
         **{"axes.spines.top": False, "axes.spines.right": False, "font.size": 9},
-        **{"axes.titlesize": 10, "axes.grid": True, "grid.alpha": 0.25, "grid.color": soft},
+        **{"axes.titlesize": 10, "axes.grid": True, "grid.alpha": 0.25, "grid.color": SOFT},
         **{"axes.facecolor": "none", "legend.frameon": False},
         **{"svg.fonttype": "path", "svg.hashsalt": "lorasp_jax"},
     }
     buffer = io.StringIO()
     with mpl.rc_context(style):
         draw(book).savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
-    return buffer.getvalue()
+    text = buffer.getvalue()
+    return {scheme: text.replace(ink, other) for scheme, other in INKS.items()}
 
 
 def panels(book: Book, rows: int, height: float, **subplots: Any) -> tuple[Figure, np.ndarray]:

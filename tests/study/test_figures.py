@@ -14,11 +14,14 @@ BOOK = Book(tuple(synthetic.results()), synthetic.results())
 
 
 def test_figures_are_readable_on_light_and_dark_pages():
-    for scheme, colors in figure_style.SCHEMES.items():
-        text = figure_style.svg(figures.figure_1, BOOK, scheme)
+    texts = figure_style.svgs(figures.figure_1, BOOK)
+    assert texts.keys() == figure_style.INKS.keys()
+    for scheme, text in texts.items():
         root = xml.etree.ElementTree.fromstring(text)
         assert root.tag.endswith("svg")
-        assert colors["ink"] in text
+        assert [ink for ink in figure_style.INKS.values() if ink in text] == [
+            figure_style.INKS[scheme]
+        ]
         assert "<dc:date>" not in text
         assert "fill: #ffffff" not in text
 
