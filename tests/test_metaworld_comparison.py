@@ -274,7 +274,7 @@ def rows_by_label(table):
     return {row[0]: row[-1] for row in rows if re.match(r"[−+][\d.]+ \[", row[-1])}
 
 
-def _excludes_zero(difference):
+def excludes_zero(difference):
     low, high = re.findall(r"[−+]", difference.partition("[")[2])
     return low == high
 
@@ -332,12 +332,12 @@ def test_findings_quote_the_tables():
         for rows, value in ((pi0, of_pi0), (smolvla, of_smolvla)):
             ((label, difference),) = [r for r in rows.items() if r[0].startswith(method)]
             assert difference.startswith(value), label
-            assert _excludes_zero(difference) == (value not in ("+0.7", "−1.7"))
+            assert excludes_zero(difference) == (value not in ("+0.7", "−1.7"))
     assert "LoRA-SP succeeds in 52.1 %" in findings
     assert "| 52.1 [" in fifty
     differences = [d for part in five.split("| SmolVLA |") for d in rows_by_label(part).values()]
     assert len(differences) == 8
-    assert not any(map(_excludes_zero, differences))
+    assert not any(map(excludes_zero, differences))
 
 
 def test_the_readme_quotes_the_comparison():

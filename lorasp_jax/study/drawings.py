@@ -116,7 +116,7 @@ def write(book: Book, folder: Path) -> None:
         texts = figure_style.svgs(drawn.draw, book.of(complete)) if complete else {}
         for scheme in figure_style.INKS:
             path = folder / "figures" / _file(name, scheme)
-            if complete:
+            if scheme in texts:
                 write_text(path, texts[scheme])
             else:
                 path.unlink(missing_ok=True)

@@ -54,6 +54,7 @@ def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str
         checkpoint = loading.find(options.source)
         inputs = checkpoint.inputs or model_config.inputs
         model = checkpoint.load(dataclasses.replace(model_config, inputs=inputs))
+        # Actions of recordings may mean anything, and a base can learn another period from them.
         if checkpoint.layout == "ours" and not config.data.source:
             _check_control_dt(checkpoint.folder, config.control_dt)
         return model, models.weights_hash(model)
@@ -76,10 +77,7 @@ def quantized(model: Any, kind: Kind | Literal[""] | None) -> Any:
 
 
 def _check_control_dt(folder: Path, control_dt: float) -> None:
-    """Raise ValueError unless the base in `folder` was trained with this control period.
-
-    Recordings are exempt: their actions may mean anything, and a base can learn another period.
-    """
+    """Raise ValueError unless the base in `folder` was trained with this control period."""
     path = folder / TRAINING
     if "control_dt" not in (training := read_json(path)):
         raise ValueError(f"{path} is missing or lacks control_dt, the control period of the base")
