@@ -11,6 +11,7 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from examples.metaworld import compare, page
@@ -319,12 +320,13 @@ def test_committed_page_is_made_from_the_committed_results(tmp_path):
 def test_findings_quote_the_tables():
     text = (ROOT / "docs" / "metaworld.md").read_text()
     findings, _, tables = text.partition("### What was found")[2].partition(page.BEGIN)
+    findings = " ".join(findings.split())
     fifty, _, five = tables.partition(page.TITLES["ml5"])
     pi0, smolvla = (rows_by_label(part) for part in fifty.split("| SmolVLA |"))
     said = {
         "LoRA, r = 64": ("−4.6", "+0.7", "4.6 points more than LoRA with r = 64", "cannot be told"),
         "LoRA, r = 16": ("−5.5", "−4.6", "5.5 more than LoRA with r = 16", "r = 16 (−4.6)"),
-        "AdaLoRA": ("−4.3", "−4.9", "4.3 more than\n  AdaLoRA", "AdaLoRA (−4.9)"),
+        "AdaLoRA": ("−4.3", "−4.9", "4.3 more than AdaLoRA", "AdaLoRA (−4.9)"),
         "full fine-tuning": ("−1.7", "−6.1", "cannot be told", "full fine-tuning (−6.1)"),
     }
     for method, (of_pi0, of_smolvla, *texts) in said.items():
@@ -333,6 +335,8 @@ def test_findings_quote_the_tables():
             ((label, difference),) = [r for r in rows.items() if r[0].startswith(method)]
             assert difference.startswith(value), label
             assert excludes_zero(difference) == (value not in ("+0.7", "−1.7"))
+    leads = [seed_mean("lora_sp", s) - seed_mean("lora_r64", s) for s in range(3)]
+    assert "(by seed {:.1f}, {:.1f} and {:.1f})".format(*leads) in findings
     assert "LoRA-SP succeeds in 52.1 %" in findings
     assert "| 52.1 [" in fifty
     differences = [d for part in five.split("| SmolVLA |") for d in rows_by_label(part).values()]
@@ -340,9 +344,20 @@ def test_findings_quote_the_tables():
     assert not any(map(excludes_zero, differences))
 
 
+def seed_mean(method, seed):
+    """Return the mean success [%] over fifty tasks of one π0."""
+    results = json.loads((ROOT / "docs" / "metaworld.json").read_text())
+    outcomes = results[f"metaworld_pi0_mt50_{method}_s{seed}"]["outcomes"].values()
+    return 100 * np.mean([episode == "1" for task in outcomes for episode in task])
+
+
 def test_the_readme_quotes_the_comparison():
     *_, quoted = (ROOT / "README.md").read_text().partition("[fifty tasks](docs/metaworld.md)")
     fifty = (ROOT / "docs" / "metaworld.md").read_text().partition(page.TITLES["mt50"])[2]
+    assert "(difference 4.6 [0.7, 8.8])" in quoted
+    assert "−4.6 [−8.8, −0.7]" in fifty
+    assert "(−0.7 [−4.0, 2.6])" in quoted
+    assert "+0.7 [−2.6, +4.0]" in fifty
     for backbone, ours, other in (("π0", "52.1", "47.5"), ("SmolVLA", "50.1", "50.9")):
         assert f"{ours} and {other} % with {backbone}" in quoted
         table = fifty.partition(f"| {backbone} |")[2].partition("\n\n")[0]

@@ -1,5 +1,6 @@
 """Meta-World's scripted experts at a tenth of a second per action."""
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -22,7 +23,7 @@ class Demonstration:
     """An episode of T actions.
 
     Attributes:
-        pictures: T pictures, uint8 `[H, W, 3]`, each before its action.
+        pictures: T pictures, uint8 `[H, W, 3]`, each before its action; none without success.
         state: f32 `[T, 4]`.
         action: f32 `[T, 4]`, hand displacement and gripper force in [-1, 1].
         success: whether the environment said so.
@@ -46,11 +47,11 @@ def _run(world: World, name: str, seed: int, plan: Plan) -> Demonstration:
     """Run an expert until the environment reports success, at most `MAX_STEPS` steps."""
     expert = ENV_POLICY_MAP[f"{name}-v3"]()
     observation, _ = world.reset(seed=seed)
-    pictures, states, actions = [], [], []
+    moments, states, actions = [], [], []
     success, steps = False, 0
     while not success and steps < MAX_STEPS:
         action = plan(world, expert, observation)
-        pictures.append(world.picture())
+        moments.append(copy.copy(world.inner.data))
         states.append(state(observation))
         actions.append(action)
         for _ in range(HOLD):
@@ -59,6 +60,7 @@ def _run(world: World, name: str, seed: int, plan: Plan) -> Demonstration:
             success = bool(info["success"])
             if success:
                 break
+    pictures = [world.picture(moment) for moment in moments] if success else []
     rows = np.array(states, np.float32), np.array(actions, np.float32)
     return Demonstration(pictures, rows[0], rows[1], success, steps)
 

@@ -64,11 +64,17 @@ class World(gymnasium.Env):
         """Run the environment for 12.5 ms."""
         return self.inner.step(action)
 
-    def picture(self) -> np.ndarray:
-        """Render the camera, uint8 `[IMAGE_SIZE, IMAGE_SIZE, 3]`."""
+    def picture(self, moment: Any = None) -> np.ndarray:
+        """Render the camera, uint8 `[IMAGE_SIZE, IMAGE_SIZE, 3]`.
+
+        Args:
+            moment: `mujoco.MjData`, such as a copy of `inner.data`; none: the present.
+        """
         if self._renderer is None:
             self._renderer = mujoco.Renderer(self.inner.model, IMAGE_SIZE, IMAGE_SIZE)
-        self._renderer.update_scene(self.inner.data, camera=CAMERA)
+            # Nothing reflects into this camera, but MuJoCo would draw the reflection.
+            self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+        self._renderer.update_scene(self.inner.data if moment is None else moment, camera=CAMERA)
         return np.ascontiguousarray(self._renderer.render()[::-1, ::-1])
 
     def close(self) -> None:
