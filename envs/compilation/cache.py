@@ -56,8 +56,8 @@ def enable() -> None:
     if jax.config.jax_compilation_cache_dir is None:
         folder = os.path.join(os.path.expanduser("~"), ".cache", "lorasp_jax", "xla")
         jax.config.update("jax_compilation_cache_dir", folder)
-    # JAX's default, even if the environment sets another value.
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+    # Below JAX's default of 1 s: initializing adapters compiles dozens of small programs.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
     _compat.use_file_cache(WholeFiles)
     _end_turns()
 

@@ -13,9 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs import checks
+from envs.compilation import traced
 from envs.datasets.episodes import Episodes, concatenate
 from envs.env import Env
-from envs.experts import expert, traced
+from envs.experts import expert
 from envs.making import AnyRobot, make
 from envs.scene.randomization import Draw, prepare
 from envs.scene.ranges import Randomization

@@ -14,11 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import envs
-from envs.compilation import fast_cpu
+from envs.compilation import fast_cpu, traced
 from envs.env import Env
 from envs.scene.ranges import Randomization
 from envs.state import Poses, State
 from lorasp_jax.config import Config
+from lorasp_jax.evaluation import rollout
 from lorasp_jax.evaluation.rollout import Rollout, act, as_rollout, num_calls, predict
 from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.policies.correction import CorrectionHead, correct
@@ -89,7 +90,7 @@ class Worlds:
 
     def act(self, actions: jax.Array, execute_steps: int) -> Poses:
         """Execute the first actions of chunks `[W, C, J+1]`; see `rollout.act`."""
-        self.state, poses = _act(self._env, self.state, actions, execute_steps=execute_steps)
+        self.state, poses = _act(self._env, self.state, actions[:, :execute_steps])
         return poses
 
     def correct(
@@ -139,20 +140,25 @@ def _sampler(model: Any) -> Any:
     return model.sampler()
 
 
-@functools.partial(fast_cpu.jit, static_argnums=0)
+_cached = functools.partial(traced.cached, files=(__file__, rollout.__file__))
+
+
+@_cached
 def _reset(env: Env, key: jax.Array, ranges: Randomization | None) -> State:
     return env.reset(key, ranges)
 
 
-@functools.partial(fast_cpu.jit, static_argnums=0)
+@_cached
 def _observe(env: Env, state: State) -> RawObservation:
     return env.observe(state)
 
 
-_act = fast_cpu.jit(act, static_argnums=0, static_argnames="execute_steps")
+@_cached
+def _act(env: Env, state: State, actions: jax.Array) -> tuple[State, Poses]:
+    return act(env, state, actions, execute_steps=actions.shape[1])
 
 
-@functools.partial(fast_cpu.jit, static_argnums=0)
+@_cached
 def _hold(env: Env, state: State, action: jax.Array, steps: jax.Array) -> State:
     return jax.lax.fori_loop(0, steps, lambda _, state: env.step(state, action), state)
 

@@ -34,7 +34,7 @@ from tests import ROOT
 from tests.runs import CONFIG
 
 POLICY = {"_sampler": 1, "predict": 1}
-WORLD = ("_reset", "_observe", "act")
+WORLD = ("_reset", "_observe", "_act")
 
 
 @contextlib.contextmanager

@@ -193,7 +193,7 @@ def test_one_compilation_gives_the_whole_curve(numbering):
                 rollout(numbering, jax.random.key(0), delay)
     assert counts.pop("predict") == 3  # plain, trained, guided
     assert counts.pop("correct_action") == 1
-    assert counts == {"_reset": 1, "_observe": 1, "act": 1, "_hold": 1}
+    assert counts == {"_reset": 1, "_observe": 1, "_act": 1, "_hold": 1}
 
 
 def test_delays_that_do_not_fit_are_refused(numbering):

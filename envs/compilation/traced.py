@@ -2,7 +2,7 @@
 
 JAX has to trace a program before it can look it up, and tracing MJX takes 6 to 8 s per scene
 (measured). Reading a traced program from a file takes 0.2 s. The cache key covers the scene, all
-source files of this package, all settings of JAX and the package versions. A change to any of them
+source files of the program, all settings of JAX and the package versions. A change to any of them
 causes a new trace.
 """
 
@@ -13,7 +13,7 @@ import importlib.metadata
 import importlib.util
 import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,18 @@ from envs.compilation import fast_cpu
 from envs.datasets.writing import write_bytes
 from envs.env import Env
 from envs.rendering.renderer import RayRenderer
+from envs.scene.randomization import Draw
+from envs.state import Data, Poses, State
 from envs.tasks import Task
+
+for _node in (State, Data, Draw):
+    export.register_pytree_node_serialization(
+        _node,
+        serialized_name=f"{_node.__module__}.{_node.__qualname__}",
+        serialize_auxdata=lambda _: b"",
+        deserialize_auxdata=lambda _: (),
+    )
+export.register_namedtuple_serialization(Poses, serialized_name=f"{Poses.__module__}.Poses")
 
 # Python can only trace one program at a time. With this lock, the first program compiles and runs
 # while the second is traced. Without it, none would start before the last is traced.
@@ -36,49 +47,77 @@ _VERSIONED = ("jax", "jaxlib", "mujoco", "mujoco-mjx")
 _CHECKSUM = hashlib.sha256().digest_size  # bytes at the start of a file
 
 
-def cached(
-    function: Callable[..., Any], sources: Callable[[], str] | None = None
-) -> Callable[..., Any]:
+def cached(function: Callable[..., Any], files: Sequence[str] = ()) -> Callable[..., Any]:
     """Apply `jax.jit(..., static_argnums=0)`, tracing once for all processes on a machine.
 
-    Programs are cached only if JAX's compilation cache is a local folder and the task comes with
-    this package. Programs that use Warp are not cached, since they contain memory addresses. The
-    result is thread-safe, but cannot be vmapped.
+    Programs are cached only if JAX's compilation cache is a local folder, the task comes with this
+    package and every argument is on one device. Programs that use Warp are not cached, since they
+    contain memory addresses. The result is thread-safe, but cannot be vmapped.
 
     Args:
-        function: a function in this package that takes an `Env` and pytrees of arrays, and returns
-            arrays in dicts, lists and tuples.
-        sources: returns a digest of the program's source files; default: those of this package.
+        function: a function that takes an `Env` and pytrees of arrays, and returns arrays in
+            `State`, `Poses`, dicts, lists and tuples.
+        files: source files outside this package on which the program depends.
     """
-    jitted = fast_cpu.jit(function, static_argnums=0)
+    jitted, traced = fast_cpu.jit(function, static_argnums=0), set()
 
     @functools.lru_cache(maxsize=32)
-    def program(
-        env: Env, tree: Any, kinds: tuple[Any, ...], settings: tuple[Any, ...]
-    ) -> Callable[..., Any]:
-        def run(*leaves: Any) -> Any:
-            return function(env, *jax.tree.unflatten(tree, leaves))
+    def program(*key: Any) -> Callable[..., Any]:
+        exported = _load_or_trace(function, files, *key)
 
-        name = f"{function.__module__}.{function.__qualname__}"
-        file = _folder() / f"{name}-{_key(env, tree, kinds, settings, (sources or _sources)())}"
-        if (exported := _load(file)) is None:
-            exported = export.export(jax.jit(run))(*kinds)
-            _save(file, exported.serialize())
-        return fast_cpu.jit(exported.call)
+        @functools.wraps(function)  # programs are named after functions
+        def call_exported(*leaves: Any) -> Any:
+            return exported.call(*leaves)
+
+        return fast_cpu.jit(call_exported)
 
     @functools.wraps(function)
     def call(env: Env, *arguments: Any) -> Any:
         leaves, tree = jax.tree.flatten(arguments)
-        if _is_cacheable(env):
-            kinds = tuple(jax.eval_shape(lambda *x: x, *leaves))
+        kinds = tuple(map(_kind, leaves))
+        if _is_cacheable(env) and not any(map(_is_shared, leaves)):
             with _TRACING:
                 run = program(env, tree, kinds, _settings())
             return run(*leaves)
         with _TRACING:
-            jitted.lower(env, *arguments)  # the call below reuses this trace
+            if (env, tree, kinds) not in traced:
+                jitted.lower(env, *arguments)  # the call below reuses this trace
+                traced.add((env, tree, kinds))
         return jitted(env, *arguments)
 
     return call
+
+
+def _load_or_trace(
+    function: Callable[..., Any],
+    files: Sequence[str],
+    env: Env,
+    tree: Any,
+    kinds: tuple[Any, ...],
+    settings: tuple[Any, ...],
+) -> export.Exported:
+    """Return the program that takes the leaves of the arguments, of these shapes and types."""
+    name = f"{function.__module__}.{function.__qualname__}"
+    file = _folder() / f"{name}-{_key(env, tree, kinds, settings, _sources(tuple(files)))}"
+    if (exported := _load(file)) is None:
+
+        def run(*leaves: Any) -> Any:
+            return function(env, *jax.tree.unflatten(tree, leaves))
+
+        exported = export.export(jax.jit(run))(*kinds)
+        _save(file, exported.serialize())
+    return exported
+
+
+def _kind(leaf: Any) -> jax.ShapeDtypeStruct:
+    """Return the shape and type of an array or number."""
+    kind = jax.typeof(leaf)
+    return jax.ShapeDtypeStruct(kind.shape, kind.dtype, weak_type=kind.weak_type)
+
+
+def _is_shared(leaf: Any) -> bool:
+    """Return whether several devices hold parts or copies of an array."""
+    return isinstance(leaf, jax.Array) and len(leaf.sharding.device_set) > 1
 
 
 def digest(env: Env) -> str:
@@ -97,6 +136,7 @@ def _is_cacheable(env: Env) -> bool:
     return (
         folder is not None
         and "://" not in folder
+        and isinstance(env, Env)
         and env.physics.backend == "jax"
         and isinstance(env.renderer, RayRenderer)
         and _is_shipped(env.task)
@@ -136,11 +176,12 @@ def _key(
 
 
 @functools.cache
-def _sources() -> str:
-    """Compute the hexadecimal SHA-256 of this package's source files."""
+def _sources(files: tuple[str, ...]) -> str:
+    """Compute the hexadecimal SHA-256 of this package's and other source files."""
     digest, package = hashlib.sha256(), Path(__file__).parents[1]
-    for file in sorted(package.rglob("*.py")):
-        digest.update(f"{file.relative_to(package)}\n".encode() + file.read_bytes())
+    for file in [*sorted(package.rglob("*.py")), *map(Path, files)]:
+        name = file.relative_to(package) if file.is_relative_to(package) else file.name
+        digest.update(f"{name}\n".encode() + file.read_bytes())
     return digest.hexdigest()
 
 

@@ -13,7 +13,9 @@ import pytest
 
 import envs
 from envs import Randomization, robots
-from envs.experts import traced as programs
+from envs.compilation import traced as programs
+from envs.scene.randomization import Draw
+from envs.state import Poses
 
 
 @pytest.fixture
@@ -42,10 +44,10 @@ class Drawn:
         return {"noise": noise}, env.reset(key, ranges).info["success"]
 
 
-def new_process(env, *arguments, sources=None):
+def new_process(env, *arguments, files=()):
     """Return the results in a new process, and whether it traced."""
     function = Drawn()
-    return programs.cached(function, sources)(env, *arguments), bool(function.traced)
+    return programs.cached(function, files)(env, *arguments), bool(function.traced)
 
 
 KEY = jax.random.key(0)
@@ -59,6 +61,34 @@ def test_another_process_does_not_trace(env, cache):
     np.testing.assert_array_equal(first[0]["noise"], plain[0]["noise"])
     np.testing.assert_array_equal(second[0]["noise"], plain[0]["noise"] / 2)
     np.testing.assert_array_equal(first[1], plain[1])
+
+
+def test_states_are_read_back(env, cache):
+    count = [0]
+
+    def start(env, key, ranges):
+        count[0] += 1
+        state = env.reset(key, ranges)
+        return state, {"poses": Poses.of(state.data)}
+
+    arguments = env, KEY, Randomization.typical()
+    first, second = (programs.cached(start)(*arguments) for _ in range(2))
+    assert count == [1]
+    assert isinstance(second[0].info["draw"], Draw)
+    assert jax.tree.structure(first) == jax.tree.structure(second)
+    jax.tree.map(np.testing.assert_array_equal, first, second)
+
+
+def test_arrays_on_several_devices_are_not_cached(env, cache):
+    mesh = jax.sharding.Mesh(jax.devices()[:2], "x")
+    everywhere = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec())
+    function = Drawn()
+    call = programs.cached(function)
+    for _ in range(2):
+        results = call(env, jax.device_put(KEY, everywhere), 0.5)
+    assert function.traced == 1
+    assert len(results[1].sharding.device_set) == 2
+    assert not (cache / "traced").exists()
 
 
 def test_a_process_asks_once(env, cache):
@@ -122,7 +152,16 @@ def test_another_setting_is_traced(env, cache):
         assert new_process(env, KEY, 0.5)[1]
     finally:
         jax.config.update("jax_default_matmul_precision", before)
-    assert new_process(env, KEY, 0.5, sources=lambda: "edited")[1]
+
+
+def test_a_changed_source_file_is_traced(env, cache, tmp_path):
+    file = tmp_path / "program.py"
+    file.write_text("before")
+    assert new_process(env, KEY, 0.5, files=[str(file)])[1]
+    assert not new_process(env, KEY, 0.5, files=[str(file)])[1]
+    file.write_text("after")
+    programs._sources.cache_clear()  # read once per process
+    assert new_process(env, KEY, 0.5, files=[str(file)])[1]
 
 
 @pytest.mark.parametrize(
