@@ -57,7 +57,8 @@ def write(path: Path, runs: Sequence[tuple[str, dict[str, Any]]]) -> None:
     for row, label in enumerate(ROWS.values()):
         axes[row, 0].set_ylabel(label)
         axes[row, 0].set_ylim(bottom=0)
-    options: Any = {"loc": "outside upper center", "ncols": len(COLORS), "frameon": False}
+    columns = 3 if len(runs) == 1 else len(COLORS)
+    options: Any = {"loc": "outside upper center", "ncols": columns, "frameon": False}
     figure.legend([*entries.values()], [*entries], **options)
     with atomic_file(path) as unfinished:
         figure.savefig(unfinished, format="svg", metadata={"Date": None})
