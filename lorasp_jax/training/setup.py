@@ -172,7 +172,7 @@ def prepare(
         statistics = input_moments(run, base, inputs)
         model = _adapt(config, base, config.peft, statistics)
     if built.source:
-        console.print(_camera_summary(run, inputs), markup=False, soft_wrap=True)
+        console.print(_camera_summary(inputs), markup=False, soft_wrap=True)
     run.policy = Policy(model, inputs)
     return run
 
@@ -194,14 +194,9 @@ def headline(config: Config, model: Backbone) -> str:
     )
 
 
-def _camera_summary(run: Run, processor: Processor) -> str:
+def _camera_summary(processor: Processor) -> str:
     """Describe on one line which camera fills which of the backbone's camera slots."""
-    images = next(iter(run.episodes.values())).image
-    cameras = [
-        f"{name} ({images[name].shape[3]} x {images[name].shape[2]}) -> {slot}"
-        for slot, name in processor.cameras
-        if name
-    ]
+    cameras = [f"{name} -> {slot}" for slot, name in processor.cameras if name]
     size = processor.image_size
     return f"cameras: {', '.join(cameras)}; resized to {size} x {size}"
 

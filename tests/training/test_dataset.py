@@ -116,7 +116,7 @@ def test_prepare(tmp_path, monkeypatch):
     assert (run.config.tasks, run.config.robot, run.simulated) == (("press",), "piper", True)
     assert not run.streams
     slots = [slot for slot, _ in run.policy.processor.cameras]
-    summary = f"cameras: side (32 x 32) -> {slots[0]}, wrist (32 x 32) -> {slots[1]}; resized to "
+    summary = f"cameras: side -> {slots[0]}, wrist -> {slots[1]}; resized to "
     assert summary in run.console.file.getvalue()
     expected = flatten([group])
     for name in ("state", "action", "end", "instruction"):
