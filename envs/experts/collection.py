@@ -111,7 +111,7 @@ def collect(
     record: Record | None = None,
     **options: Any,
 ) -> Episodes:
-    """Collect successful demonstrations of the scripted expert.
+    """Collect successful demonstrations of the scripted expert, in host memory.
 
     Episodes are padded to the expert's time limit.
 
@@ -209,7 +209,8 @@ def gather(
         tries = env.num_envs if collected < num_episodes else int(wins[-1]) + 1
         attempted, tried = attempted + tries, tried + tries
         if len(wins):
-            won = jax.tree.map(lambda x, wins=wins: x[wins], chunk)
+            # To host memory: on the device, training needs the space.
+            won = jax.tree.map(lambda x, wins=wins: np.asarray(x)[wins], chunk)
             yield Episodes(**won, **_metadata(env), attempted=tried)
             tried = 0
 
