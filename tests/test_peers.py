@@ -99,6 +99,7 @@ def test_a_failed_reference_leaves_no_ratio(tmp_path, capsys, fakes):
     assert content["results"][0]["error"] == "exit status 3"
 
 
+@pytest.mark.slow
 def test_ours_runs_as_a_process(tmp_path, capsys, fakes):
     """The real worker, beside a stand-in."""
     command = ["--warmup", "1", "--steps", "2", "--once", *fakes(openpi={})]

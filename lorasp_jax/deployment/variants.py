@@ -33,7 +33,7 @@ def _whole(model: Backbone, batches: Batches) -> Backbone:
 
 
 def _pruned(model: Backbone, batches: Batches) -> Backbone:
-    return lorasp_jax.prune(model, batches, forward=forward)[0]
+    return lorasp_jax.prune(model, batches, for_kernel=True, forward=forward)[0]
 
 
 def _half(model: Backbone, batches: Batches) -> Backbone:
@@ -51,8 +51,8 @@ FORMS: dict[str, Callable[[Backbone, Batches], Backbone]] = {
     "half": _half,
     "merged": _merged,
 }
-"""Forms by name: as trained; pruned to the directions in use on calibration data; pruned to the
-most used half of the bank; distilled to LoRA and merged."""
+"""Forms by name: as trained; pruned to the directions in use on calibration data, and those more
+that a kernel needs; pruned to the most used half of the bank; distilled to LoRA and merged."""
 BASES: dict[str, Kind | None] = {"bf16": None, "int8": "int8", "nf4": "nf4"}
 """How the base is stored."""
 

@@ -36,6 +36,7 @@ def assert_acts_like(policy, folder, atol=2e-5):
     np.testing.assert_allclose(loaded.act(**given), in_process(policy, given), atol=atol)
 
 
+@pytest.mark.slow
 def test_a_run_is_exported(run, tmp_path, capsys):
     out = tmp_path / "new" / "policy"
     code, printed = call(capsys, run, "--out", out, "--max-batch", 1, "--num-steps", 2)

@@ -31,6 +31,7 @@ def prune(
     tolerance: float = 0.0,
     *,
     rank: int | None = None,
+    for_kernel: bool = False,
     forward: Forward = calibration.call,
 ) -> tuple[adaptation.Model, Compaction]:
     """Prune LoRA-SP directions that are rarely active.
@@ -41,14 +42,14 @@ def prune(
     own contribution, but the layer's other directions stay active for the same tokens. All layers
     of a stack keep as many directions as the one that needs most.
 
-    On NVIDIA GPUs, the fused kernel needs banks of 16, 32, 64, ... directions: set `rank`.
-
     Args:
       model: not modified; the result shares its frozen arrays and can be trained further.
       batches: calibration set.
       tolerance: in [0, 1). With 0, outputs on the calibration set do not change.
       rank: number of directions to keep in each layer, the most used ones, instead of a tolerance;
         at least 1. A smaller bank keeps all of its directions.
+      for_kernel: keep 16, 32, 64, ... directions, at least those that the tolerance asks for. On
+        NVIDIA GPUs, the fused kernel needs such banks; without it, a smaller bank can be slower.
       forward: how to call the model on a batch; see `lorasp_jax.adapters.compress.calibration`.
 
     Raises:
@@ -68,7 +69,10 @@ def prune(
     for path, layer in layers.items():
         usage = np.asarray(sums[path]["usage"] / jnp.maximum(sums[path]["tokens"][..., None], 1))
         in_use = np.asarray((usage > tolerance).sum(-1))
-        kept = max(int(in_use.max()), 1) if rank is None else min(rank, layer.method.rank)
+        kept = max(int(in_use.max()), 1) if rank is None else rank
+        if for_kernel:
+            kept = max(16, 1 << (kept - 1).bit_length())
+        kept = min(kept, layer.method.rank)
         ranks[path] = in_use if rank is None else np.full(in_use.shape, kept)
         replacements[path] = _pruned(layer, usage, kept)
     return replace_adapters(model, batches, replacements, ranks, forward)

@@ -174,6 +174,23 @@ def test_a_rank_keeps_the_most_used_directions(batches):
     assert report.output_error < 1e-5
 
 
+@pytest.mark.parametrize(("rank", "kept"), [(1, 16), (16, 16), (17, 32), (33, 40)])
+def test_kernels_get_16_32_64_directions(batches, rank, kept):
+    model = lora_sp_model(dataclasses.replace(VARIANTS[0], rank=40))
+    smaller, _ = lorasp_jax.prune(model, batches, rank=rank, for_kernel=True, forward=forward)
+    assert {method.rank for method in adaptation.methods(smaller).values()} == {kept}
+
+
+def test_kernels_get_all_directions_in_use(batches):
+    model = lora_sp_model(dataclasses.replace(VARIANTS[0], rank=40))
+    used, report = lorasp_jax.prune(model, batches, forward=forward)
+    more, same = lorasp_jax.prune(model, batches, for_kernel=True, forward=forward)
+    ranks = [{m.rank for m in adaptation.methods(x).values()} for x in (used, more)]
+    assert max(ranks[0]) <= min(ranks[1])
+    assert ranks[1] <= {16, 32, 40}
+    jax.tree.map(np.testing.assert_array_equal, same.ranks, report.ranks)
+
+
 @pytest.mark.parametrize("options", [{"rank": 0}, {"rank": 2.0}, {"rank": 2, "tolerance": 0.1}])
 def test_bad_rank(batches, options):
     with pytest.raises(ValueError, match="rank must be an integer of at least 1, without a tol"):

@@ -60,6 +60,7 @@ def fit(steps, monkeypatch, **settings):
     return fitting.fit(POLICY, steps, jax.random.key(0), denoise_steps=3, progress=lambda *_: None)
 
 
+@pytest.mark.slow
 def test_a_known_residual_is_learned(steps, monkeypatch):
     """Twice the state at the action's step; the chunk knows only the state at its start."""
     head, error = fit(steps, monkeypatch, STEPS=300, BATCH=64, HELD_OUT_BATCHES=8)
