@@ -16,6 +16,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import jax
 import mujoco
@@ -50,20 +51,22 @@ _CHECKSUM = hashlib.sha256().digest_size  # bytes at the start of a file
 def cached(function: Callable[..., Any], files: Sequence[str] = ()) -> Callable[..., Any]:
     """Apply `jax.jit(..., static_argnums=0)`, tracing once for all processes on a machine.
 
-    Programs are cached only if JAX's compilation cache is a local folder, the task comes with this
-    package and every argument is on one device. Programs that use Warp are not cached, since they
-    contain memory addresses. The result is thread-safe, but cannot be vmapped.
+    Programs are cached only if JAX's compilation cache is a local folder, environment and task come
+    with this package, and every argument is on one of JAX's default devices. Programs that use Warp
+    are not cached, since they contain memory addresses. The result is thread-safe, but cannot be
+    vmapped.
 
     Args:
         function: a function that takes an `Env` and pytrees of arrays, and returns arrays in
             `State`, `Poses`, dicts, lists and tuples.
         files: source files outside this package on which the program depends.
     """
-    jitted, traced = fast_cpu.jit(function, static_argnums=0), set()
+    jitted, sources = fast_cpu.jit(function, static_argnums=0), _sources(tuple(files))
+    traced: WeakKeyDictionary[Env, set[Any]] = WeakKeyDictionary()
 
     @functools.lru_cache(maxsize=32)
     def program(*key: Any) -> Callable[..., Any]:
-        exported = _load_or_trace(function, files, *key)
+        exported = _load_or_trace(function, sources, *key)
 
         @functools.wraps(function)  # programs are named after functions
         def call_exported(*leaves: Any) -> Any:
@@ -74,15 +77,16 @@ def cached(function: Callable[..., Any], files: Sequence[str] = ()) -> Callable[
     @functools.wraps(function)
     def call(env: Env, *arguments: Any) -> Any:
         leaves, tree = jax.tree.flatten(arguments)
-        kinds = tuple(map(_kind, leaves))
-        if _is_cacheable(env) and not any(map(_is_shared, leaves)):
+        kinds, settings = tuple(map(_kind, leaves)), _settings()
+        if _is_cacheable(env) and _is_default_device() and all(map(_is_on_default_device, leaves)):
             with _TRACING:
-                run = program(env, tree, kinds, _settings())
+                run = program(env, tree, kinds, settings)
             return run(*leaves)
         with _TRACING:
-            if (env, tree, kinds) not in traced:
+            known = traced.setdefault(env, set())
+            if (tree, kinds, settings) not in known:
                 jitted.lower(env, *arguments)  # the call below reuses this trace
-                traced.add((env, tree, kinds))
+                known.add((tree, kinds, settings))
         return jitted(env, *arguments)
 
     return call
@@ -90,7 +94,7 @@ def cached(function: Callable[..., Any], files: Sequence[str] = ()) -> Callable[
 
 def _load_or_trace(
     function: Callable[..., Any],
-    files: Sequence[str],
+    sources: str,
     env: Env,
     tree: Any,
     kinds: tuple[Any, ...],
@@ -98,7 +102,7 @@ def _load_or_trace(
 ) -> export.Exported:
     """Return the program that takes the leaves of the arguments, of these shapes and types."""
     name = f"{function.__module__}.{function.__qualname__}"
-    file = _folder() / f"{name}-{_key(env, tree, kinds, settings, _sources(tuple(files)))}"
+    file = _folder() / f"{name}-{_key(env, tree, kinds, settings, sources)}"
     if (exported := _load(file)) is None:
 
         def run(*leaves: Any) -> Any:
@@ -115,9 +119,18 @@ def _kind(leaf: Any) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(kind.shape, kind.dtype, weak_type=kind.weak_type)
 
 
-def _is_shared(leaf: Any) -> bool:
-    """Return whether several devices hold parts or copies of an array."""
-    return isinstance(leaf, jax.Array) and len(leaf.sharding.device_set) > 1
+def _is_default_device() -> bool:
+    """Return whether new arrays go to a device of JAX's default platform, for which JAX exports."""
+    device = jax.config.jax_default_device
+    return device is None or getattr(device, "platform", device) == jax.devices()[0].platform
+
+
+def _is_on_default_device(leaf: Any) -> bool:
+    """Return whether an argument is a number, traced, or on one device of the default platform."""
+    if not isinstance(leaf, jax.Array) or isinstance(leaf, jax.core.Tracer):
+        return True
+    platforms = [device.platform for device in leaf.sharding.device_set]
+    return platforms == [jax.devices()[0].platform]
 
 
 def digest(env: Env) -> str:
@@ -136,8 +149,9 @@ def _is_cacheable(env: Env) -> bool:
     return (
         folder is not None
         and "://" not in folder
-        and isinstance(env, Env)
+        and type(env) is Env  # a subclass may have other programs
         and env.physics.backend == "jax"
+        and env.physics.model is env.model
         and isinstance(env.renderer, RayRenderer)
         and _is_shipped(env.task)
     )
@@ -166,13 +180,20 @@ def _key(
     parts = [
         digest(env),
         env.task.name,
-        (env.num_envs, env.image_size, env.antialias),
+        (env.num_envs, env.image_size, env.antialias, _drawn(env)),
         (env.control_dt, env.actions, env.distractors, env.reward, env.discount),
         (tree, kinds, settings, jax.default_backend()),
         [importlib.metadata.version(name) for name in _VERSIONED],
         sources,
     ]
     return hashlib.sha256(repr(parts).encode()).hexdigest()
+
+
+def _drawn(env: Env) -> tuple[Any, ...]:
+    """Return what the renderer draws, which may differ from the scene."""
+    leaves, tree = jax.tree.flatten(env.render_model)
+    arrays = [np.asarray(leaf) for leaf in leaves]
+    return str(tree), [(x.dtype.str, x.shape, x.tobytes().hex()) for x in arrays]
 
 
 @functools.cache

@@ -77,7 +77,7 @@ class Physics:
             ValueError: the backend is unknown or not installed.
         """
         _check_backend(backend)
-        self.backend = backend
+        self.model, self.backend = model, backend
         mjx = _mjx()
         device = jax.local_devices()[0]  # MJX's default is the first device of all processes
         self._model = mjx.put_model(model, impl="jax", device=device)

@@ -72,7 +72,7 @@ class World(gymnasium.Env):
         """
         if self._renderer is None:
             self._renderer = mujoco.Renderer(self.inner.model, IMAGE_SIZE, IMAGE_SIZE)
-            # Nothing reflects into this camera, but MuJoCo would draw the reflection.
+            # MuJoCo would draw a reflection, which changes no picture of the fifty tasks.
             self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
         self._renderer.update_scene(self.inner.data if moment is None else moment, camera=CAMERA)
         return np.ascontiguousarray(self._renderer.render()[::-1, ::-1])

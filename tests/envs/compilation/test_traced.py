@@ -1,10 +1,12 @@
 """Traced programs are cached between processes."""
 
 import dataclasses
+import gc
 import shutil
 import threading
 import time
 import types
+import weakref
 
 import jax
 import jax.numpy as jnp
@@ -91,6 +93,61 @@ def test_arrays_on_several_devices_are_not_cached(env, cache):
     assert not (cache / "traced").exists()
 
 
+def test_a_changed_picture_is_traced(env, cache):
+    def mean(env, key):
+        return {"mean": env.observe(env.reset(key))["image"]["side"].astype(jnp.float32).mean()}
+
+    model = env.render_model
+    black = dataclasses.replace(model.appearance, rgba=np.zeros_like(model.appearance.rgba))
+    changed = dataclasses.replace(model, appearance=black)
+    dark = dataclasses.replace(env, renderer=dataclasses.replace(env.renderer, model=changed))
+    bright = programs.cached(mean)(env, KEY)["mean"]
+    assert programs.cached(mean)(dark, KEY)["mean"] < 0.5 * bright
+
+
+def test_subclasses_are_not_cached(env, cache):
+    class Halved(type(env)):
+        pass
+
+    fields = {f.name: getattr(env, f.name) for f in dataclasses.fields(env)}
+    assert programs._is_cacheable(env)
+    assert not programs._is_cacheable(Halved(**fields))
+
+
+def test_another_platform_is_not_cached(env, cache, monkeypatch):
+    assert programs._is_default_device()
+    for device in jax.devices()[1], "cpu":
+        with jax.default_device(device):
+            assert programs._is_default_device()
+    with monkeypatch.context() as patch:
+        gpu = types.SimpleNamespace(platform="gpu")
+        patch.setattr(programs.jax, "devices", lambda: [gpu])
+        assert not programs._is_on_default_device(KEY)
+        with jax.default_device("cpu"):
+            assert not programs._is_default_device()
+    assert programs._is_on_default_device(KEY)
+    assert programs._is_on_default_device(np.ones(3))
+
+
+def test_a_program_is_part_of_another(env, cache):
+    call = programs.cached(Drawn())
+    inside = jax.jit(lambda key: call(env, key, 0.5)[0]["noise"])(KEY)
+    np.testing.assert_array_equal(inside, call(env, KEY, 0.5)[0]["noise"])
+
+
+def test_environments_are_freed():
+    class Room:
+        pass
+
+    room, call = Room(), programs.cached(lambda env, key: {"key": jax.random.normal(key)})
+    call(room, KEY)
+    reference = weakref.ref(room)
+    del room
+    jax.clear_caches()
+    gc.collect()
+    assert reference() is None
+
+
 def test_a_process_asks_once(env, cache):
     function = Drawn()
     call = programs.cached(function)
@@ -159,8 +216,12 @@ def test_a_changed_source_file_is_traced(env, cache, tmp_path):
     file.write_text("before")
     assert new_process(env, KEY, 0.5, files=[str(file)])[1]
     assert not new_process(env, KEY, 0.5, files=[str(file)])[1]
+    early = Drawn()
+    call = programs.cached(early, [str(file)])  # imported before the change
     file.write_text("after")
     programs._sources.cache_clear()  # read once per process
+    call(env, KEY, 0.5)
+    assert not early.traced
     assert new_process(env, KEY, 0.5, files=[str(file)])[1]
 
 
