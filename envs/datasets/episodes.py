@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from envs.actions import MODES
@@ -223,7 +222,7 @@ def check_camera(name: str) -> None:
 
 
 def concatenate(parts: Sequence[Episodes]) -> Episodes:
-    """Concatenate episodes of one task and robot, padded to the longest.
+    """Concatenate episodes of one task and robot in host memory, padded to the longest.
 
     Raises:
         ValueError: `parts` is empty, or its episodes differ in image shapes or a field of `SHARED`.
@@ -239,9 +238,8 @@ def concatenate(parts: Sequence[Episodes]) -> Episodes:
         raise ValueError(f"all parts must have the same image shapes, got {sorted(shapes)}")
     steps = max(part.state.shape[1] for part in parts)
 
-    def join(*arrays: Array) -> Array:
-        xp = np if all(isinstance(x, np.ndarray) for x in arrays) else jnp
-        return xp.concatenate([_pad(xp, x, steps) for x in arrays])
+    def join(*arrays: Array) -> np.ndarray:
+        return np.concatenate([_pad(x, steps) for x in arrays])
 
     attempted = sum(part.attempted for part in parts)
     same = [dataclasses.replace(part, attempted=attempted) for part in parts]
@@ -253,11 +251,11 @@ def _dtype_and_shape(array: Any) -> str:
     return f"{array.dtype}{list(array.shape)}" if hasattr(array, "dtype") else repr(array)
 
 
-def _pad(xp: Any, array: Array, steps: int) -> Array:
+def _pad(array: Array, steps: int) -> Array:
     """Pad `[E, T, ...]` with zeros to T = `steps`; return `[E]` unchanged."""
     if array.ndim == 1 or array.shape[1] == steps:
         return array
-    return xp.pad(array, [(0, 0), (0, steps - array.shape[1])] + [(0, 0)] * (array.ndim - 2))
+    return np.pad(array, [(0, 0), (0, steps - array.shape[1])] + [(0, 0)] * (array.ndim - 2))
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:

@@ -23,6 +23,7 @@ from lorasp_jax.peft import Method
 from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Params
 from lorasp_jax.peft.lora_sp.bank import BankMethod, normalized_bank
+from lorasp_jax.peft.lora_sp.gpu_kernel import supported_size
 
 
 def prune(
@@ -48,8 +49,8 @@ def prune(
       tolerance: in [0, 1). With 0, outputs on the calibration set do not change.
       rank: number of directions to keep in each layer, the most used ones, instead of a tolerance;
         at least 1. A smaller bank keeps all of its directions.
-      for_kernel: keep 16, 32, 64, ... directions, at least those that the tolerance asks for. On
-        NVIDIA GPUs, the fused kernel needs such banks; without it, a smaller bank can be slower.
+      for_kernel: keep more directions, 16, 32, 64, ... in all, as the fused kernel on NVIDIA GPUs
+        needs; without it, a smaller bank can be slower.
       forward: how to call the model on a batch; see `lorasp_jax.adapters.compress.calibration`.
 
     Raises:
@@ -71,7 +72,7 @@ def prune(
         in_use = np.asarray((usage > tolerance).sum(-1))
         kept = max(int(in_use.max()), 1) if rank is None else rank
         if for_kernel:
-            kept = max(16, 1 << (kept - 1).bit_length())
+            kept = supported_size(kept)
         kept = min(kept, layer.method.rank)
         ranks[path] = in_use if rank is None else np.full(in_use.shape, kept)
         replacements[path] = _pruned(layer, usage, kept)

@@ -21,6 +21,11 @@ from lorasp_jax.peft.lora_sp.losses import Losses, LossSums, loss_sums
 from lorasp_jax.peft.lora_sp.router import router_scores
 
 
+def supported_size(size: int) -> int:
+    """Return the first size from `size` on that Triton's matmuls support: 16, 32, 64, ..."""
+    return max(16, 1 << (size - 1).bit_length())
+
+
 @dataclasses.dataclass(frozen=True)
 class FusedBottleneck(BatchedBottleneck):
     """`LoRASP.bottleneck` with router "gelu", one mask per token and a constant η."""
@@ -36,9 +41,9 @@ class FusedBottleneck(BatchedBottleneck):
 
     @property
     def is_supported(self) -> bool:
-        """Whether Triton supports the sizes: powers of two, and at least 16 for its matmuls."""
+        """Whether Triton supports the sizes."""
         sizes = self.rank, self.num_scores, self.hidden_width
-        return all(size >= 16 and size.bit_count() == 1 for size in sizes)
+        return all(size == supported_size(size) for size in sizes)
 
     def pack(self, params: Any) -> Any:
         """Pack the router into one flat array."""

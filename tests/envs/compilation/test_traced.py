@@ -106,12 +106,12 @@ def test_a_changed_picture_is_traced(env, cache):
 
 
 def test_subclasses_are_not_cached(env, cache):
-    class Halved(type(env)):
+    class Other(type(env)):
         pass
 
     fields = {f.name: getattr(env, f.name) for f in dataclasses.fields(env)}
     assert programs._is_cacheable(env)
-    assert not programs._is_cacheable(Halved(**fields))
+    assert not programs._is_cacheable(Other(**fields))
 
 
 def test_another_platform_is_not_cached(env, cache, monkeypatch):
