@@ -197,7 +197,7 @@ class Backbone(nnx.Module):
 
     def sample_actions(self, key: jax.Array, obs: Observation, **options: Any) -> Any:
         """Sample action chunks; see `Sampler.sample_actions` for the arguments."""
-        return self.sampler().sample_actions(key, obs, **options)
+        return Sampler.from_model(self, once=True).sample_actions(key, obs, **options)
 
     def sampler(self) -> Sampler:
         """Create a sampler, which prepares the weights once for repeated sampling."""

@@ -59,9 +59,15 @@ class Sampler:
     """Distinct adapter methods of the backbone."""
 
     @classmethod
-    def from_model(cls, model: FlowModel) -> Self:
-        """Create a sampler; the backbone is not modified."""
-        models = (_prefix_model(model), _suffix_model(model))
+    def from_model(cls, model: FlowModel, *, once: bool = False) -> Self:
+        """Create a sampler; the backbone is not modified.
+
+        Args:
+            model: the backbone.
+            once: the sampler is used only once. The prefix then uses the kernels as they are:
+                copying them would take longer than it saves.
+        """
+        models = (_prefix_model(model, once), _suffix_model(model))
         graphdefs, states = zip(*map(nnx.split, models), strict=True)
         weights, tree = jax.tree.flatten(states)
         methods = dict.fromkeys(adaptation.methods(cast(nnx.Module, model)).values())
@@ -115,6 +121,7 @@ class Sampler:
         states = jax.tree.unflatten(tree, self.weights)
         prefix_model, suffix_model = map(nnx.merge, graphdefs, states)
         encoded, aux = prefix_model.run_prefix(obs)
+        encoded = encoded.by_layer()
         sample = flow_matching.sample
         if prefix is not None:
             condition = {"prefix": prefix, "length": prefix_length, "guidance": guidance}
@@ -133,11 +140,12 @@ class Sampler:
         return actions, merge_action_aux({**aux, "action": prefix_action_aux}, action_aux)
 
 
-def _prefix_model(model: FlowModel) -> FlowModel:
+def _prefix_model(model: FlowModel, once: bool) -> FlowModel:
     """Copy a model for the prefix, blocks unstacked so that an outer loop slices no weights."""
     model = nnx.merge(*nnx.split(model))
     for tower in (model.vision, model.language):
-        tower.blocks = unstack(prepared.fuse_stack(tower.blocks))
+        copy_kernels = not once and not prepared.has_quantized_kernels(tower.blocks)
+        tower.blocks = unstack(prepared.fuse_stack(tower.blocks, copy_kernels=copy_kernels))
     return model
 
 

@@ -8,10 +8,12 @@ time. Layers with a shared input are therefore fused into one input and one outp
     y = x W + z diag(U)           with z = f(x P), and diag(U) block-diagonal
 
 The functions f of all layers run as one GPU kernel if their method has one. Layers without adapters
-and with a shared input become one matmul, x [W1, W2, ...]. For stacked layers
-that run once, such as the vision tower's, copying W would cost more than it saves: only the P are
-concatenated, and P and U are cast to the compute dtype. The original layers are removed. For
-training, see `lorasp_jax.kernels.low_rank_matmul`.
+and with a shared input become one matmul, x [W1, W2, ...]. The original layers are removed.
+
+A wide layer computes y = [x, z] [W; U] instead: another pass over y would cost more than the second
+matmul with x. Where copying W would cost more than it saves, as for layers that run once, only the
+P are concatenated, and P and U are cast to the compute dtype. For training, see
+`lorasp_jax.kernels.low_rank_matmul`.
 """
 
 import dataclasses
@@ -27,6 +29,7 @@ from typing import (
     TypeAlias,
     TypeGuard,
     TypeVar,
+    cast,
     runtime_checkable,
 )
 
@@ -46,6 +49,8 @@ TILE, MIN_TILES = 64, 256
 """Output tile size of a matmul, and the number of tiles that saturate a GPU."""
 MIN_SPLIT_INPUTS, MIN_SPLIT_SIZE = 2048, 512
 """Minimum I for a split-K matmul, and minimum K per split."""
+MAX_FUSED_WIDTH = 8
+"""Maximum ΣO / I of `FusedLayers`."""
 
 
 class BottleneckSpec(NamedTuple):
@@ -80,17 +85,17 @@ class FusedLayers:
 @functools.partial(_pytree, data_fields=["params", "down", "ups", "kernels", "biases"])
 @dataclasses.dataclass(frozen=True)
 class SharedProjection:
-    """Like `FusedLayers`, but W is not copied."""
+    """Like `FusedLayers`, but only the layers' P are one matrix."""
 
     bottleneck: BottleneckSpec
     params: Any
     """As in `FusedLayers`."""
     down: jax.Array
     """P of all layers, [I, ΣQ], padded."""
-    ups: list[jax.Array]
-    """U [R, O] of each layer."""
-    kernels: list[jax.Array | QuantizedKernel]
-    """W [I, O] of each layer; kept quantized."""
+    ups: Sequence[jax.Array | None]
+    """U [R, O] of each layer, or None if it is in `kernels`."""
+    kernels: Sequence[jax.Array | QuantizedKernel]
+    """W [I, O] of each layer, kept quantized, or [W; U] [I + R, O]."""
     biases: list[jax.Array | None]
     """[O] of each layer."""
 
@@ -179,7 +184,7 @@ def fuse_layers(layers: Sequence[Layer], *, copy_kernels: bool = True) -> list[L
     ):
         return [Prepared(_fused_kernels(plain)), *(Prepared() for _ in plain[1:])]
     fusable = [layer for layer in layers if _is_fusable(layer)]
-    fuse = _fused_layers if copy_kernels else _shared_projection
+    fuse = _with_copied_kernels if copy_kernels else _shared_projection
     if len(fusable) == len(layers) and len({(layer.method, layer.dtype) for layer in fusable}) == 1:
         return [Prepared(fuse(fusable)), *(Prepared() for _ in fusable[1:])]
     return [Prepared(fuse([layer])) if _is_fusable(layer) else layer for layer in layers]
@@ -190,14 +195,20 @@ def fuse_layer(layer: Layer, *, copy_kernels: bool = True) -> Layer:
     return fuse_layers([layer], copy_kernels=copy_kernels)[0]
 
 
-def fuse_stack(blocks: Block) -> Block:
-    """Prepare stacked modules [L, ...] for a single pass, without copying their kernels."""
+def fuse_stack(blocks: Block, *, copy_kernels: bool) -> Block:
+    """Prepare stacked modules [L, ...]; see `fuse_layers`."""
 
     def fuse(block: Block) -> Block:
-        block.fuse_projections(copy_kernels=False)
+        block.fuse_projections(copy_kernels=copy_kernels)
         return block
 
     return jax.vmap(fuse)(blocks)
+
+
+def has_quantized_kernels(module: nnx.Module) -> bool:
+    """Return whether a kernel is quantized: a copy in the compute dtype would take more memory."""
+    leaves = jax.tree.leaves(module, is_leaf=lambda leaf: isinstance(leaf, QuantizedKernel))
+    return any(isinstance(leaf, QuantizedKernel) for leaf in leaves)
 
 
 def _call_fused(
@@ -230,7 +241,10 @@ def _call_shared(
     for layer_z, kernel, up, bias in zip(
         zs, shared.kernels, shared.ups, shared.biases, strict=True
     ):
-        y = base_plus_low_rank(x, layer_z, kernel, up)
+        if up is None:
+            y = jnp.matmul(jnp.concatenate([x, layer_z], axis=-1), cast(jax.Array, kernel))
+        else:
+            y = base_plus_low_rank(x, layer_z, kernel, up)
         ys.append(y if bias is None else y + bias)
     return ys, aux
 
@@ -322,6 +336,18 @@ def _bottleneck_spec(
     params = jax.tree.map(stack, *packed)
     out_sizes = tuple(layer.kernel_matrices().shape[1] for layer in layers)
     return BottleneckSpec(kernel, downs[0].shape[1], out_sizes), params
+
+
+def _with_copied_kernels(layers: Sequence[Dense]) -> FusedLayers | SharedProjection:
+    shapes = [layer.kernel_matrices().shape for layer in layers]
+    if sum(d_out for _, d_out in shapes) <= MAX_FUSED_WIDTH * shapes[0][0]:
+        return _fused_layers(layers)
+    kernels, downs, ups, biases = _matrices(layers)
+    joined = [jnp.concatenate(pair) for pair in zip(kernels, ups, strict=True)]
+    down = pad_columns(jnp.concatenate(downs, axis=1))
+    return SharedProjection(
+        *_bottleneck_spec(layers, downs), down, [None] * len(layers), joined, biases
+    )
 
 
 def _shared_projection(layers: Sequence[Dense]) -> SharedProjection:

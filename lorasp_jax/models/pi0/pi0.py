@@ -24,6 +24,7 @@ from lorasp_jax.models.backbone import Backbone, suffix_mask_and_positions
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig, VisionConfig
 from lorasp_jax.models.inputs import OPENPI, OPENPI_PI05, OURS_PI05
 from lorasp_jax.models.observation import Observation
+from lorasp_jax.models.transformer.depth import split_layers
 from lorasp_jax.models.transformer.experts import AdaptiveExpert, Expert, KeysValues, LanguageExpert
 from lorasp_jax.models.transformer.layers import (
     LayerAux,
@@ -114,9 +115,13 @@ class Prefix(NamedTuple):
         out: `[B, P, D]` output of the language expert.
     """
 
-    cache: KeysValues
+    cache: KeysValues | list[KeysValues]
     valid: jax.Array
     out: jax.Array
+
+    def by_layer(self) -> Prefix:
+        """Split the cache into a list of layers, so that a loop of flow steps slices nothing."""
+        return self._replace(cache=split_layers(self.cache))
 
 
 class Pi0(Backbone):

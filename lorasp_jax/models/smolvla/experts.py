@@ -140,8 +140,8 @@ class ActionExpert(nnx.Module):
         x: jax.Array,
         position: jax.Array,
         mask: jax.Array,
-        cache: KeysValues,
-        cross: KeysValues,
+        cache: KeysValues | list[KeysValues],
+        cross: KeysValues | list[KeysValues],
         *,
         token_mask: jax.Array,
     ) -> tuple[jax.Array, LayerAux]:

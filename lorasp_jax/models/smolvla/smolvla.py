@@ -21,6 +21,7 @@ from lorasp_jax.models.config import BackboneConfig, ExpertConfig, VisionConfig
 from lorasp_jax.models.inputs import LEROBOT_SMOLVLA
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.smolvla.experts import ActionExpert, SmolLM2
+from lorasp_jax.models.transformer.depth import split_layers
 from lorasp_jax.models.transformer.experts import KeysValues
 from lorasp_jax.models.transformer.layers import (
     LayerAux,
@@ -114,9 +115,13 @@ class Prefix(NamedTuple):
         valid: `[B, P]` bool, False for padding and missing cameras.
     """
 
-    cache: KeysValues
-    cross: KeysValues
+    cache: KeysValues | list[KeysValues]
+    cross: KeysValues | list[KeysValues]
     valid: jax.Array
+
+    def by_layer(self) -> Prefix:
+        """Split cache and cross into lists, so that a loop of flow steps slices nothing."""
+        return self._replace(cache=split_layers(self.cache), cross=split_layers(self.cross))
 
 
 class SmolVLA(Backbone):

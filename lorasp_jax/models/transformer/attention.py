@@ -1,10 +1,13 @@
 """Grouped-query attention with masks and fp32 softmax."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from lorasp_jax.kernels.cached_attention import HEAD_DIMS as CACHED_HEAD_DIMS
+from lorasp_jax.kernels.cached_attention import KeysValues, cached_attention
 from lorasp_jax.kernels.platform import platform
 from lorasp_jax.kernels.short_attention import (
     HEAD_DIMS,
@@ -24,17 +27,27 @@ KEY_MULTIPLE, MIN_PADDED_KEYS = 128, 512
 """Without cuDNN, masked attention pads `MIN_PADDED_KEYS` or more keys to a multiple of
 `KEY_MULTIPLE`."""
 
+MAX_QUERY_ELEMENTS = 400_000
+"""Maximum size of q for `kernels.cached_attention`: three observations for pi0, eight for SmolVLA.
+With eight, it takes 37 instead of 26 us for pi0, and 12 instead of 18 us for SmolVLA (H100)."""
+
 CUDNN_MULTIPLE = 8
 """With a mask, cuDNN needs query and key counts divisible by 8 (16-byte alignment of the mask)."""
 
 
-def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) -> jax.Array:
+def attention(
+    q: jax.Array,
+    k: jax.Array,
+    v: jax.Array,
+    mask: jax.Array | None,
+    cache: KeysValues | None = None,
+) -> jax.Array:
     """Grouped-query attention with fp32 softmax; 16-bit floats on GPUs use faster kernels.
 
-    These are cuDNN for long inputs, and `kernels.short_attention` for few keys. cuDNN is faster
-    with numbers of keys than with a mask: forward and backward pass of a layer of pi0's language
-    model take 2.8 instead of 5.0 ms (H200, bf16, batch size 32, 816 tokens, 8 heads of 256, one key
-    head).
+    These are cuDNN for many queries, `kernels.short_attention` for few keys, and, without gradient,
+    `kernels.cached_attention` for few queries. cuDNN is faster with numbers of keys than with a
+    mask: forward and backward pass of a layer of pi0's language model take 2.8 instead of 5.0 ms
+    (H200, bf16, batch size 32, 816 tokens, 8 heads of 256, one key head).
 
     cuDNN accumulates gradients in nondeterministic order: two runs differ by rounding errors.
     Neither kernel has a forward-mode or second derivative.
@@ -46,10 +59,43 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) 
         mask: `[B, T, S]` bool; or `[B]` int32, if all queries attend to the first mask[b] keys; or
             None to attend to all keys. A query without keys attends to all of them equally, but
             with cuDNN and `[B]` to the first one.
+        cache: keys and values that precede k and v, or None. S of the mask counts both.
 
     Returns:
         `[B, T, N H]`.
     """
+    if mask is not None and _use_cached_attention(q, k, mask):
+        return _few_queries(q, (k, v), cache, mask)
+    return _concatenated(q, (k, v), cache, mask)
+
+
+@jax.custom_vjp
+def _few_queries(
+    q: jax.Array, own: KeysValues, cache: KeysValues | None, mask: jax.Array
+) -> jax.Array:
+    return (
+        cached_attention(q, None, own, mask)
+        if cache is None
+        else cached_attention(q, own, cache, mask)
+    )
+
+
+def _few_queries_forward(*arrays: Any) -> tuple[jax.Array, Any]:
+    return jax.vjp(_concatenated, *arrays)
+
+
+def _few_queries_backward(vjp: Any, dy: jax.Array) -> tuple:
+    return vjp(dy)
+
+
+_few_queries.defvjp(_few_queries_forward, _few_queries_backward)
+
+
+def _concatenated(
+    q: jax.Array, own: KeysValues, cache: KeysValues | None, mask: jax.Array | None
+) -> jax.Array:
+    """`attention` with the cached keys and values in front of the queries' own."""
+    k, v = own if cache is None else map(_join, cache, own)
     batch, tokens, heads, size = q.shape
     if _use_cudnn(q, k, mask):
         return _cudnn_attention(q, k, v, mask)[:, :tokens].reshape(batch, tokens, heads * size)
@@ -66,6 +112,10 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) 
         logits = jnp.where(mask[:, None, :, None, :], logits, MASKED)
     weights = jax.nn.softmax(logits, axis=-1).astype(v.dtype)
     return jnp.einsum("BKTGS,BSKH->BTKGH", weights, v).reshape(batch, tokens, heads * size)
+
+
+def _join(cached: jax.Array, own: jax.Array) -> jax.Array:
+    return jnp.concatenate([cached, own], axis=1)
 
 
 def _pad_keys(
@@ -89,7 +139,16 @@ def _use_cudnn(q: jax.Array, k: jax.Array, mask: jax.Array | None) -> bool:
     return jax.default_backend() == "gpu" and half_precision and supported and large
 
 
-def _use_short_attention(q: jax.Array, k: jax.Array) -> bool:
+def _use_cached_attention(q: jax.Array, k: jax.Array, mask: jax.Array) -> bool:
+    """Whether the kernel supports these arrays, and no kernel with a gradient does."""
+    keys = jax.ShapeDtypeStruct((len(k), mask.shape[-1], *k.shape[2:]), k.dtype)
+    half_precision = q.dtype in (jnp.bfloat16, jnp.float16)
+    few = q.shape[1] < CUDNN_MIN_QUERIES and q.size <= MAX_QUERY_ELEMENTS and mask.ndim == 3
+    supported = half_precision and q.shape[3] in CACHED_HEAD_DIMS
+    return platform() == "gpu" and few and supported and not _use_short_attention(q, keys)
+
+
+def _use_short_attention(q: jax.Array, k: jax.Array | jax.ShapeDtypeStruct) -> bool:
     """Whether the kernel supports these arrays, on all GPUs since Ampere."""
     head_dim, keys = q.shape[3], k.shape[1]
     half_precision = q.dtype in (jnp.bfloat16, jnp.float16)

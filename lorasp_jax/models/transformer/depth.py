@@ -38,7 +38,8 @@ def scan_depth(
         blocks: from `stack` or `unstack`.
         call: (block, x, the layer's slice of `per_layer`) -> (x, per-layer output).
         x: `[B, T, D]`.
-        per_layer: pytree with a leading axis L, or None.
+        per_layer: pytree with a leading axis L, or None. With `unstack`ed blocks, it may be a tuple
+            of such pytrees and of results of `split_layers`.
         remat: rematerialization policy; see `BackboneConfig.remat`.
         unroll: unroll the loop over layers instead of using `lax.scan`.
 
@@ -63,7 +64,7 @@ def scan_depth(
         if unstacked
         else _lazy_slices(*state)
     )
-    layer_inputs = [None] * len(layer_params) if per_layer is None else _split_layers(per_layer)
+    layer_inputs = [None] * len(layer_params) if per_layer is None else _by_layer(per_layer)
     layer, outputs = jax.jit(layer, inline=True), []  # trace the layer once
     for params, inputs in zip(layer_params, layer_inputs, strict=True):
         x, output = layer(x, (params, inputs))
@@ -71,7 +72,14 @@ def scan_depth(
     return x, jax.tree.map(lambda *layers: jnp.stack(layers), *outputs)
 
 
-def _split_layers(stacked: Any) -> list[Any]:
+def _by_layer(inputs: Any) -> list[Any]:
+    """Return the inputs of each layer; see `per_layer` of `scan_depth`."""
+    if isinstance(inputs, tuple):
+        return list(zip(*map(_by_layer, inputs), strict=True))
+    return inputs if isinstance(inputs, list) else split_layers(inputs)
+
+
+def split_layers(stacked: Any) -> list[Any]:
     """Split arrays [L, ...] into layers, so that the backward pass concatenates their gradients.
 
     With indexing, the backward pass would add L zero-padded gradients.
@@ -127,11 +135,11 @@ def _(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
 def _lazy_slices(trained: Any, frozen: Any) -> list[_LayerSlice]:
     """Slice arrays [L, ...] lazily, one slice per layer."""
     depth = len(jax.tree.leaves((trained, frozen))[0])
-    sinks = _split_layers(trained) or [trained] * depth  # no slices if no array is trainable
+    sinks = split_layers(trained) or [trained] * depth  # no slices if no array is trainable
     return [_LayerSlice(trained, frozen, np.int32(i), sink) for i, sink in enumerate(sinks)]
 
 
 def unstack(blocks: nnx.Module) -> nnx.List[Any]:
     """Split stacked blocks into a list, so that a loop around `scan_depth` slices no weights."""
     graphdef, state = nnx.split(blocks)
-    return nnx.List([nnx.merge(graphdef, layer) for layer in _split_layers(state)])
+    return nnx.List([nnx.merge(graphdef, layer) for layer in split_layers(state)])

@@ -10,11 +10,11 @@ import math
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from flax import nnx
 
 from lorasp_jax.adapters.layers.prepared import Layer, fuse_layer, fuse_layers
 from lorasp_jax.dense import Dense
+from lorasp_jax.kernels.cached_attention import KeysValues
 from lorasp_jax.kernels.rematerialization import save_for_backward
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig
 from lorasp_jax.models.transformer.attention import attention
@@ -29,9 +29,6 @@ from lorasp_jax.models.transformer.layers import (
     rope,
     rope_table,
 )
-
-KeysValues = tuple[jax.Array, jax.Array]
-"""Keys after RoPE, and values; both are `[B, S, K, H]`, or `[L, B, S, K, H]` for all layers."""
 
 
 class ExpertBlock(nnx.Module):
@@ -110,11 +107,8 @@ class ExpertBlock(nnx.Module):
         projected, aux = apply_to_shared_input(h, token_mask, **qkv)
         q, k, v = (y.reshape(*x.shape[:2], -1, self.head_dim) for y in projected)
         q, k = rope(q, table, scale=self.head_dim**-0.5), rope(k, table)
-        keys, values = k, v = save_for_backward(k), save_for_backward(v)
-        if cache is not None:
-            keys = jnp.concatenate([cache[0], k], axis=1)
-            values = jnp.concatenate([cache[1], v], axis=1)
-        attended = attention(q, keys, values, mask)
+        k, v = save_for_backward(k), save_for_backward(v)
+        attended = attention(q, k, v, mask, cache)
         x, mlp_aux = self.output_and_mlp(x, attended, token_mask, gate, condition)
         return x, ((k, v), aux | nest_aux("input_layernorm", norm_aux) | mlp_aux)
 
@@ -157,7 +151,7 @@ class Expert(nnx.Module):
         x: jax.Array,
         position: jax.Array,
         mask: jax.Array,
-        cache: KeysValues | None = None,
+        cache: KeysValues | list[KeysValues] | None = None,
         *,
         token_mask: jax.Array,
         condition: jax.Array | None = None,

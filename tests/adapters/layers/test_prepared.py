@@ -81,13 +81,26 @@ def test_fused_layers_match_the_original_ones(name):
     )
 
 
+def test_wide_layers_match_the_original_ones(monkeypatch):
+    """They join x and z instead of adding z U in another pass."""
+    monkeypatch.setattr(prepared, "MAX_FUSED_WIDTH", 1)
+    model, x = adapted(METHODS["lora_sp"], "float32"), jnp.sin(jnp.arange(96.0)).reshape(2, 6, 8)
+    fused = prepare(model)
+    arrays = fused.first.fused.get_value()
+    assert isinstance(arrays, prepared.SharedProjection)
+    assert [kernel.shape[0] for kernel in arrays.kernels] == [8 + METHODS["lora_sp"].rank] * 2
+    run = jax.jit(lambda model, x: model(x))
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-4)
+    jax.tree.map(close, run(fused, x), run(model, x))
+
+
 @pytest.mark.parametrize("name", mostly_slow(FUSABLE, ["lora_sp"]))
 def test_fused_stack_matches_the_original_one(name):
     """Check inputs with fewer and with more rows than features."""
     model = adapted(METHODS[name], "float32")
     stack = jax.tree.map(lambda leaf: jnp.stack([leaf, 0.5 * leaf]), model)
     run = jax.jit(jax.vmap(lambda model, x: model(x), in_axes=(0, None)))
-    fused = prepared.fuse_stack(stack)
+    fused = prepared.fuse_stack(stack, copy_kernels=False)
     for rows in (4, 12):
         x = jnp.sin(jnp.arange(8.0 * rows)).reshape(1, rows, 8)
         (expected, aux), (actual, actual_aux) = run(stack, x), run(fused, x)
@@ -105,7 +118,7 @@ def test_adapters_of_a_stack_are_cast_before_the_loop():
         (loop,) = (e for e in jax.make_jaxpr(run)(x, stack).eqns if e.primitive.name == "scan")
         return str(loop.params["jaxpr"]).count(primitive)
 
-    fused = prepared.fuse_stack(stack)
+    fused = prepared.fuse_stack(stack, copy_kernels=False)
     casts = [in_loop("convert_element_type", one) for one in (stack, fused)]
     assert casts[0] - casts[1] >= 6  # P and U of three layers
     assert in_loop("optimization_barrier", fused) == 2  # one for each input
@@ -244,3 +257,13 @@ def test_sampling_follows_the_velocity(backbone, adapted):
     for _ in range(2):
         np.testing.assert_allclose(sample(model.sampler()), expected, rtol=1e-4, atol=1e-5)
     assert traced == [Sampler]  # samplers of one model share a compiled function
+    once = Sampler.from_model(model, once=True)
+    np.testing.assert_allclose(sample(once), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_a_sampler_keeps_the_kernels_of_its_prefix_quantized():
+    model = trained((".*_proj", METHODS["lora"]), seed=1, net=random_backbone(pi0.Config.dummy()))
+    quantized = quantize(model, [("(vision|language)/.*", "int8")]).model
+    size = lambda tree: sum(w.size for w in jax.tree.leaves(tree) if w.dtype == jnp.int8)  # noqa: E731
+    codes = size((quantized.vision, quantized.language))
+    assert size(Sampler.from_model(quantized).weights) == codes > 0
