@@ -62,12 +62,13 @@ def test_short_videos_hold_their_last_image_and_success_gets_a_border(script):
     assert frames[-1].getpixel(above)[:3] == (0, 0, 0)
 
 
-def test_the_latency_figure_and_table_show_what_was_measured(script, tmp_path):
+@pytest.mark.parametrize("run", ["SmolVLA small", "π0 small"])
+def test_the_latency_figure_and_tables_show_what_was_measured(script, tmp_path, run):
     script("latency").main(tmp_path / "latency.svg")
     assert (tmp_path / "latency.svg").stat().st_size > 50_000
-    curves = json.loads((ROOT / "docs/latency.json").read_text())["SmolVLA small"]["curves"]
+    curves = json.loads((ROOT / "docs/latency.json").read_text())[run]["curves"]
     page = (ROOT / "docs/latency.md").read_text()
-    table = page.partition("| SmolVLA small, success")[2].partition("\n\n")[0]
+    table = page.partition(f"| {run}, success")[2].partition("\n\n")[0]
     rows = re.findall(r"^\| `(\w+)` \| (.*) \| ([\d, ]+) \|$", table, re.M)
     assert [name for name, *_ in rows] == [*latency.COLORS]
     for name, success, jerk in rows:

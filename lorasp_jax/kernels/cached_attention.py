@@ -44,7 +44,8 @@ class Launch(NamedTuple):
 
 
 NARROW, WIDE = Launch(32, 64, 4, 4), Launch(32, 128, 8, 8)
-"""Launch parameters for heads of up to 128 dimensions, and for wider ones."""
+"""Launch parameters for heads of up to 128 dimensions, and for wider ones: the fastest of about ten
+each on an H200, for SmolVLA and pi0."""
 
 
 class _Size(NamedTuple):
