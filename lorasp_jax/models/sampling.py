@@ -47,6 +47,8 @@ class Sampler:
     """Samples action chunks from a backbone, with input-independent results precomputed once.
 
     A sampler copies most of the weights; drop all references to the backbone to free the originals.
+    Quantized weights stay so in the vision tower and the language model, which run once per call.
+    Those of the action expert are dequantized.
     The weights are a flat list, because a jitted call with a module of about a thousand arrays has
     too much dispatch latency for some control loops.
     """

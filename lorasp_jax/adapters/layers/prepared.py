@@ -168,20 +168,18 @@ def fuse_layers(layers: Sequence[Layer], *, copy_kernels: bool = True) -> list[L
     A single (unstacked) adapted `Dense` can be fused if it has an explicit dtype, and its method
     computes exactly x W + z U and does not need x P in fp32. If all layers can be fused and agree
     on method and dtype, they are fused together. Otherwise each fusable layer is fused alone, and
-    the others are returned unchanged. Several layers without adapters are fused if `copy_kernels`
-    is true, none is quantized, and all have the same explicit dtype.
+    the others are returned unchanged. Several layers without adapters, or a quantized one, are
+    fused if `copy_kernels` is true and all have the same explicit dtype.
 
     Args:
       layers: layers in call order.
-      copy_kernels: whether to copy W into the fused input matrix; best for layers that are called
-        repeatedly.
+      copy_kernels: whether to copy W into the fused input matrix, dequantized; best for layers that
+        are called repeatedly.
     """
     plain = [layer for layer in layers if _is_plain(layer)]
-    if (
-        copy_kernels
-        and len(layers) == len(plain) > 1
-        and len({layer.dtype for layer in plain}) == 1
-    ):
+    pays = len(layers) > 1 or any(map(_is_quantized, plain))
+    same = len(plain) == len(layers) and len({layer.dtype for layer in plain}) == 1
+    if copy_kernels and pays and same:
         return [Prepared(_fused_kernels(plain)), *(Prepared() for _ in plain[1:])]
     fusable = [layer for layer in layers if _is_fusable(layer)]
     fuse = _with_copied_kernels if copy_kernels else _shared_projection
@@ -300,10 +298,14 @@ def _is_fusable(layer: Layer) -> TypeGuard[Dense]:
 
 
 def _is_plain(layer: Layer) -> TypeGuard[Dense]:
-    """Whether the layer has neither an adapter nor a quantized kernel, and an explicit dtype."""
+    """Whether the layer has a single matrix, no adapter and an explicit dtype."""
     if type(layer) is not Dense or layer.adapter is not None or layer.dtype is None:
         return False
-    return isinstance(layer.kernel_matrices(), jax.Array) and layer.kernel_matrices().ndim == 2
+    return len(layer.kernel_matrices().shape) == 2  # quantized kernels have no ndim
+
+
+def _is_quantized(layer: Dense) -> bool:
+    return isinstance(layer.kernel_matrices(), QuantizedKernel)
 
 
 def _matrices(

@@ -197,12 +197,22 @@ def test_layers_without_adapters_share_one_matmul(dtype):
     assert jax.tree.structure(actual_aux) == jax.tree.structure(aux)
 
 
-def test_layers_without_adapters_are_not_fused_if_that_would_copy_or_dequantize():
+@pytest.mark.parametrize("kind", ["float8", "int8", "nf4"])
+def test_quantized_layers_without_adapters_are_dequantized_once(kind):
+    model, x = (
+        quantize(Net("float32"), [(".*", kind)]).model,
+        jnp.sin(jnp.arange(48.0)).reshape(6, 8),
+    )
+    expected, fused = model(x)[0], prepare(model)
+    assert type(fused.first) is type(fused.third) is prepared.Prepared
+    assert {leaf.dtype for leaf in jax.tree.leaves(nnx.state(fused))} == {jnp.dtype("float32")}
+    np.testing.assert_allclose(fused(x)[0], expected, rtol=1e-5, atol=1e-5)
+
+
+def test_layers_without_adapters_are_not_fused_if_that_would_copy():
     model = Net("float32")
     model.fuse_projections(copy_kernels=False)
     assert type(model.first) is Dense
-    quantized = prepare(quantize(Net("float32"), [(".*", "int8")]).model)
-    assert type(quantized.first) is Dense
     mixed = Net("float32")
     mixed.second.dtype = "bfloat16"
     assert type(prepare(mixed).first) is Dense
