@@ -18,7 +18,7 @@ from jax.experimental import pallas as pl
 from lorasp_jax.kernels.row_sharding import by_rows
 
 KeysValues = tuple[jax.Array, jax.Array]
-"""Keys and values, `[B, S, K, H]` each."""
+"""Keys and values, `[B, S, K, H]` each, or `[L, B, S, K, H]` for all layers."""
 
 HEAD_DIMS = (16, 32, 64, 128, 256)
 """Supported head sizes."""
@@ -43,9 +43,9 @@ class Launch(NamedTuple):
     """Stages of the software pipeline over keys."""
 
 
-NARROW, WIDE = Launch(32, 64, 4, 4), Launch(32, 128, 8, 8)
-"""Launch parameters for heads of up to 128 dimensions, and for wider ones: the fastest of about ten
-each on an H200, for SmolVLA and pi0."""
+NARROW, WIDE, MAX_NARROW = Launch(32, 64, 4, 4), Launch(32, 128, 8, 8), 128
+"""Launch parameters for heads of up to MAX_NARROW dimensions, and for wider ones: the fastest of
+about ten each on an H200, for SmolVLA and pi0. They take 43 and 148 KiB of shared memory."""
 
 
 class _Size(NamedTuple):
@@ -87,7 +87,8 @@ def cached_attention(
         q: `[B, T, N, H]`, already scaled, 16-bit float on a GPU; H must be in `HEAD_DIMS`.
         own: keys and values of the T queries' tokens, or None.
         cache: keys and values that precede `own`; each of the K key heads serves N / K query heads.
-        mask: `[B, T, S]` bool, where S counts both. A query without keys attends to all equally.
+        mask: `[B or 1, T or 1, S]` bool, where S counts both. A query without keys attends to all
+            equally.
         launch: launch parameters; None: by head size.
         interpret: run without a GPU, slowly.
 
@@ -95,7 +96,7 @@ def cached_attention(
         `[B, T, N H]`.
     """
     batch, tokens, heads, dim = q.shape
-    launch = launch or (NARROW if dim <= 128 else WIDE)
+    launch = launch or (NARROW if dim <= MAX_NARROW else WIDE)
     cached, kv_heads = cache[0].shape[1:3]
     num_own = 0 if own is None else tokens
     cached_blocks, own_blocks = (pl.cdiv(count, launch.keys) for count in (cached, num_own))
@@ -104,8 +105,9 @@ def cached_attention(
     size = _Size(heads, kv_heads, cached, num_own, cached_blocks, blocks, per_program)
     # XLA computes all that belongs to these tokens, with RoPE, in one kernel.
     tokens_array = q if own is None else jnp.concatenate([q, *own], axis=2)
+    mask = jnp.broadcast_to(mask, (batch, tokens, mask.shape[-1])).astype(jnp.int8)
     call = functools.partial(_call, launch, size, interpret)
-    y, top, total = by_rows(call, [], [tokens_array, mask.astype(jnp.int8), *cache])[0]
+    y, top, total = by_rows(call, [], [tokens_array, mask, *cache])[0]
     return _combine(y, top, total).astype(q.dtype).reshape(batch, tokens, heads * dim)
 
 
@@ -194,9 +196,9 @@ def _kernel(
 ) -> None:
     """Attend from one block of rows to some blocks of keys (online softmax)."""
     batch, group, dim = pl.program_id(2), size.heads // size.kv_heads, y_ref.shape[-1]
-    kv_head, split = (f(pl.program_id(1), size.splits) for f in (jax.lax.div, jax.lax.rem))
+    kv_head, split = pl.program_id(1) // size.splits, pl.program_id(1) % size.splits
     row = pl.program_id(0) * launch.rows + jnp.arange(launch.rows)
-    token, head = jax.lax.div(row, group), kv_head * group + jax.lax.rem(row, group)
+    token, head = row // group, kv_head * group + row % group
     exists = token < tokens_ref.shape[1]
     q_at = (batch, token[:, None], head[:, None], jnp.arange(dim)[None])
     q = _load(tokens_ref, q_at, exists[:, None])

@@ -25,3 +25,15 @@ def multiplies_float8() -> bool:
         return device.platform == "cuda"
     capability = getattr(jax.devices()[0], "compute_capability", "0")  # AMD's reads gfx942
     return capability.replace(".", "").isdigit() and float(capability) >= 8.9
+
+
+def has_large_shared_memory() -> bool:
+    """Return whether `platform()` is an NVIDIA GPU with 160 KiB of shared memory per block or more.
+
+    Those are A100, H100, B200 and their relatives; others have 99 KiB (CUDA C++ Programming Guide,
+    technical specifications per compute capability). An abstract device is taken for a large one.
+    """
+    device = jax.sharding.get_abstract_mesh().abstract_device
+    if device is not None:
+        return device.platform == "cuda"
+    return getattr(jax.devices()[0], "compute_capability", "0") in ("8.0", "9.0", "10.0", "10.3")

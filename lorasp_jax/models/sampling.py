@@ -18,6 +18,14 @@ from lorasp_jax.models.transformer.layers import LayerAux, ModelAux, merge_actio
 from lorasp_jax.peft import Method
 
 
+class Prefix(Protocol):
+    """An encoded observation."""
+
+    def by_layer(self) -> Any:
+        """Return the same for `run_suffix`, with all that is stacked over layers split."""
+        ...
+
+
 class FlowModel(prepared.FusableModule, Protocol):
     """Backbone interface that a sampler requires; see `backbone.Backbone`."""
 
@@ -26,7 +34,7 @@ class FlowModel(prepared.FusableModule, Protocol):
     language: Any
     action: Any
 
-    def run_prefix(self, obs: Observation) -> tuple[Any, ModelAux]:
+    def run_prefix(self, obs: Observation) -> tuple[Prefix, ModelAux]:
         """Encode the observation."""
         ...
 
@@ -146,8 +154,12 @@ def _prefix_model(model: FlowModel, once: bool) -> FlowModel:
     """Copy a model for the prefix, blocks unstacked so that an outer loop slices no weights."""
     model = nnx.merge(*nnx.split(model))
     for tower in (model.vision, model.language):
-        copy_kernels = not once and not prepared.has_quantized_kernels(tower.blocks)
-        tower.blocks = unstack(prepared.fuse_stack(tower.blocks, copy_kernels=copy_kernels))
+        if once or prepared.has_quantized_kernels(tower.blocks):
+            tower.blocks = unstack(prepared.fuse_stack(tower.blocks))
+            continue
+        tower.blocks = unstack(tower.blocks)
+        for block in tower.blocks:
+            block.fuse_projections()
     return model
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from lorasp_jax.kernels.cached_attention import Launch, cached_attention
 from lorasp_jax.models.transformer import attention
+from lorasp_jax.training.cost import flops
 
 BATCH, TOKENS, KV_HEADS, GROUP, DIM = 2, 5, 2, 3, 16
 LAUNCHES = {
@@ -30,7 +31,7 @@ def inputs(cached, own, dtype=jnp.float32):
     return q, own_pair, cache, mask.at[:, :, -1].set(True)
 
 
-@pytest.mark.parametrize("launch", LAUNCHES.values(), ids=LAUNCHES)
+@pytest.mark.parametrize("launch", [*LAUNCHES.values(), None], ids=[*LAUNCHES, "default"])
 @pytest.mark.parametrize(("cached", "own"), [(20, TOKENS), (32, TOKENS), (37, 0), (32, 0)])
 def test_matches_attention_over_concatenated_keys(cached, own, launch):
     arrays = inputs(cached, own)
@@ -38,6 +39,15 @@ def test_matches_attention_over_concatenated_keys(cached, own, launch):
     q, own_pair, cache, mask = arrays
     pairs = (cache, None) if own_pair is None else (own_pair, cache)
     np.testing.assert_allclose(actual, attention._concatenated(q, *pairs, mask), atol=1e-5)
+
+
+def test_matches_in_half_precision():
+    arrays = inputs(20, 5, jnp.float16)
+    actual = cached_attention(*arrays, launch=LAUNCHES["splits"], interpret=True)
+    exact = jax.tree.map(lambda a: a.astype(jnp.float32) if a.dtype == jnp.float16 else a, arrays)
+    q, own, cache, mask = exact
+    assert actual.dtype == jnp.float16
+    np.testing.assert_allclose(actual, attention._concatenated(q, own, cache, mask), atol=2e-3)
 
 
 def test_a_query_without_keys_attends_to_all_of_them_equally():
@@ -80,10 +90,76 @@ def test_attention_uses_the_kernel_only_without_gradient(interpreted):
     assert len(interpreted) == 1
 
 
-def test_a_batch_can_be_mapped(interpreted):
+@pytest.mark.parametrize("shared", [(), ("cache",), ("cache", "mask")], ids=str)
+def test_a_batch_can_be_mapped(interpreted, shared):
     q, (k, v), cache, mask = inputs(20, 5, jnp.bfloat16)
+    if "cache" in shared:
+        cache = jax.tree.map(lambda a: a[:1].repeat(BATCH, 0), cache)
+    if "mask" in shared:
+        mask = mask[:1].repeat(BATCH, 0)
     expected = attention.attention(q, k, v, mask, cache)
-    one = lambda *arrays: attention.attention(*(a[None] for a in arrays[:4]), arrays[4])[0]  # noqa: E731
-    lifted = jax.tree.map(lambda a: a[:, None], cache)
-    actual = jax.vmap(one)(q, k, v, mask, lifted)
-    np.testing.assert_array_equal(actual, expected)
+    lift = lambda name, a: a[:1] if name in shared else a[:, None]  # noqa: E731
+    arrays = (q[:, None], k[:, None], v[:, None], lift("mask", mask))
+    lifted = jax.tree.map(lambda a: lift("cache", a), cache)
+    axes = (0, 0, 0, None if "mask" in shared else 0, None if "cache" in shared else 0)
+    actual = jax.vmap(attention.attention, in_axes=axes)(*arrays, lifted)
+    np.testing.assert_array_equal(actual[:, 0], expected)
+
+
+def test_a_mask_may_be_shared_by_batch_and_queries():
+    q, own, cache, mask = inputs(20, 5)
+    call = functools.partial(cached_attention, launch=LAUNCHES["splits"], interpret=True)
+    one = mask[:1, :1]
+    expected = call(q, own, cache, jnp.broadcast_to(one, mask.shape))
+    np.testing.assert_array_equal(call(q, own, cache, one), expected)
+
+
+def on_gpu():
+    device = jax.sharding.AbstractDevice("NVIDIA H200", num_cores=None, platform="cuda")
+    return jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), (), abstract_device=device))
+
+
+def published(name):
+    """Shapes of q, own and cached keys and values, and the mask, at published sizes."""
+    tokens, heads, kv_heads, dim, cached = {
+        "pi0": (51, 8, 1, 256, 816),
+        "pi05": (50, 8, 1, 256, 968),
+        "smolvla": (50, 15, 5, 64, 177),
+    }[name]
+    shape = lambda *s: jax.ShapeDtypeStruct(s, "bfloat16")  # noqa: E731
+    q, own, cache = (
+        shape(1, t, n, dim) for t, n in ((tokens, heads), (tokens, kv_heads), (cached, kv_heads))
+    )
+    mask = jax.ShapeDtypeStruct((1, tokens, cached + tokens), bool)
+    return q, own, own, mask, (cache, cache)
+
+
+@pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
+@pytest.mark.parametrize("x64", [False, True])
+@pytest.mark.parametrize("name", ["pi0", "pi05", "smolvla"])
+def test_lowers_for_a_gpu_to_one_kernel(name, x64):
+    arrays = published(name)
+    with on_gpu(), jax.enable_x64(x64):
+        traced = jax.jit(attention.attention).trace(*arrays)
+        text = traced.lower(lowering_platforms=("cuda",)).as_text()
+        assert text.count("custom_call @__gpu$xla.gpu.triton") == 1
+
+
+def test_many_queries_and_small_gpus_do_not_use_the_kernel(monkeypatch):
+    q, k, _, mask, _ = published("pi0")
+    many = jax.ShapeDtypeStruct((8, *q.shape[1:]), q.dtype)
+    narrow = published("smolvla")
+    with on_gpu():
+        assert attention._use_cached_attention(q, k, mask)
+        assert not attention._use_cached_attention(many, k, mask)
+        monkeypatch.setattr(attention, "has_large_shared_memory", lambda: False)
+        assert not attention._use_cached_attention(q, k, mask)
+        assert attention._use_cached_attention(narrow[0], narrow[1], narrow[3])
+
+
+def test_flops_are_those_of_xla():
+    arrays = published("smolvla")
+    expected = flops.count(attention.attention, *arrays)
+    with on_gpu():
+        assert "cached_attention" in str(jax.make_jaxpr(attention.attention)(*arrays))
+        assert flops.count(attention.attention, *arrays) == expected > 0

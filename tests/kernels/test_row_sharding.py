@@ -9,6 +9,8 @@ import pytest
 from jax.sharding import NamedSharding, PartitionSpec
 
 from lorasp_jax.kernels import rowwise_kernel as kernels
+from lorasp_jax.kernels.cached_attention import Launch as CachedLaunch
+from lorasp_jax.kernels.cached_attention import cached_attention
 from lorasp_jax.kernels.row_sharding import by_rows
 from lorasp_jax.kernels.short_attention import Launch, short_attention
 from lorasp_jax.training.distributed import mesh as meshes
@@ -111,3 +113,20 @@ def test_short_attention(batch):
     if batch == 8:
         assert "all-gather" not in compiled.as_text()
     jax.tree.map(close, compiled(shard(q), shard(mask)), gradients(q, mask))
+
+
+def test_cached_attention():
+    """Attention on a sharded batch, whose cached keys are sharded, too."""
+    q = jax.random.normal(jax.random.key(0), (8, 5, 2, 16))
+    mask = jnp.ones((8, 5, 16), bool).at[:, :, ::3].set(False)
+
+    @jax.jit
+    def attend(q, mask):
+        own, cached = jnp.sin(q[:, :, :1]), jnp.cos(jnp.tile(q[:, :, :1], (1, 3, 1, 1))[:, :11])
+        launch = CachedLaunch(16, 16, 2, 1)
+        arrays = q, (own, own + 1), (cached, cached - 1), mask
+        return cached_attention(*arrays, launch=launch, interpret=True)
+
+    compiled = attend.lower(shard(q), shard(mask)).compile()
+    assert "all-gather" not in compiled.as_text()
+    close(compiled(shard(q), shard(mask)), attend(q, mask))

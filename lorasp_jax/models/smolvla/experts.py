@@ -14,7 +14,7 @@ from flax import nnx
 from lorasp_jax.adapters.layers.prepared import fuse_layer
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig
 from lorasp_jax.models.transformer.attention import attention
-from lorasp_jax.models.transformer.depth import scan_depth, stack
+from lorasp_jax.models.transformer.depth import ByLayer, scan_depth, stack
 from lorasp_jax.models.transformer.experts import ExpertBlock, KeysValues, LanguageExpert
 from lorasp_jax.models.transformer.layers import (
     LayerAux,
@@ -140,8 +140,8 @@ class ActionExpert(nnx.Module):
         x: jax.Array,
         position: jax.Array,
         mask: jax.Array,
-        cache: KeysValues | list[KeysValues],
-        cross: KeysValues | list[KeysValues],
+        cache: KeysValues | ByLayer,
+        cross: KeysValues | ByLayer,
         *,
         token_mask: jax.Array,
     ) -> tuple[jax.Array, LayerAux]:

@@ -21,7 +21,7 @@ from lorasp_jax.models.config import BackboneConfig, ExpertConfig, VisionConfig
 from lorasp_jax.models.inputs import LEROBOT_SMOLVLA
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.smolvla.experts import ActionExpert, SmolLM2
-from lorasp_jax.models.transformer.depth import split_layers
+from lorasp_jax.models.transformer.depth import ByLayer, split_layers
 from lorasp_jax.models.transformer.experts import KeysValues
 from lorasp_jax.models.transformer.layers import (
     LayerAux,
@@ -115,13 +115,15 @@ class Prefix(NamedTuple):
         valid: `[B, P]` bool, False for padding and missing cameras.
     """
 
-    cache: KeysValues | list[KeysValues]
-    cross: KeysValues | list[KeysValues]
+    cache: KeysValues | ByLayer
+    cross: KeysValues | ByLayer
     valid: jax.Array
 
     def by_layer(self) -> Prefix:
-        """Split cache and cross into lists, so that a loop of flow steps slices nothing."""
-        return self._replace(cache=split_layers(self.cache), cross=split_layers(self.cross))
+        """Split cache and cross into layers, so that a loop of flow steps slices nothing."""
+        return self._replace(
+            cache=ByLayer(split_layers(self.cache)), cross=ByLayer(split_layers(self.cross))
+        )
 
 
 class SmolVLA(Backbone):

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from lorasp_jax.kernels.cached_attention import HEAD_DIMS as CACHED_HEAD_DIMS
-from lorasp_jax.kernels.cached_attention import KeysValues, cached_attention
-from lorasp_jax.kernels.platform import platform
+from lorasp_jax.kernels.cached_attention import MAX_NARROW, KeysValues, cached_attention
+from lorasp_jax.kernels.platform import has_large_shared_memory, platform
 from lorasp_jax.kernels.short_attention import (
     HEAD_DIMS,
     MAX_KEY_ELEMENTS,
@@ -51,7 +51,7 @@ def attention(
     (H200, bf16, batch size 32, 816 tokens, 8 heads of 256, one key head).
 
     cuDNN accumulates gradients in nondeterministic order: two runs differ by rounding errors.
-    Neither kernel has a forward-mode or second derivative.
+    None of them has a forward-mode derivative, and the first two have no second derivative.
 
     Args:
         q: `[B, T, N, H]`, already scaled.
@@ -74,11 +74,8 @@ def attention(
 def _few_queries(
     q: jax.Array, own: KeysValues, cache: KeysValues | None, mask: jax.Array
 ) -> jax.Array:
-    return (
-        cached_attention(q, None, own, mask)
-        if cache is None
-        else cached_attention(q, own, cache, mask)
-    )
+    before, last = (own, None) if cache is None else (cache, own)
+    return cached_attention(q, last, before, mask)
 
 
 def _few_queries_forward(*arrays: Any) -> tuple[jax.Array, Any]:
@@ -143,10 +140,11 @@ def _use_cudnn(q: jax.Array, k: jax.Array, mask: jax.Array | None) -> bool:
 def _use_cached_attention(q: jax.Array, k: jax.Array, mask: jax.Array) -> bool:
     """Whether the kernel supports these arrays, and no kernel with a gradient does."""
     keys = jax.ShapeDtypeStruct((len(k), mask.shape[-1], *k.shape[2:]), k.dtype)
-    half_precision = q.dtype in (jnp.bfloat16, jnp.float16)
+    dim, half_precision = q.shape[3], q.dtype in (jnp.bfloat16, jnp.float16)
     few = q.shape[1] < CUDNN_MIN_QUERIES and q.size <= MAX_QUERY_ELEMENTS and mask.ndim == 3
-    supported = half_precision and q.shape[3] in CACHED_HEAD_DIMS
-    return platform() == "gpu" and few and supported and not _use_short_attention(q, keys)
+    fits = dim in CACHED_HEAD_DIMS and (dim <= MAX_NARROW or has_large_shared_memory())
+    chosen = platform() == "gpu" and half_precision and few and fits
+    return chosen and not _use_short_attention(q, keys)
 
 
 def _use_short_attention(q: jax.Array, k: jax.Array | jax.ShapeDtypeStruct) -> bool:

@@ -38,8 +38,8 @@ def scan_depth(
         blocks: from `stack` or `unstack`.
         call: (block, x, the layer's slice of `per_layer`) -> (x, per-layer output).
         x: `[B, T, D]`.
-        per_layer: pytree with a leading axis L, or None. With `unstack`ed blocks, it may be a tuple
-            of such pytrees and of results of `split_layers`.
+        per_layer: pytree of arrays with a leading axis L, or None. With `unstack`ed blocks, any
+            part of it may be a `ByLayer`.
         remat: rematerialization policy; see `BackboneConfig.remat`.
         unroll: unroll the loop over layers instead of using `lax.scan`.
 
@@ -72,11 +72,17 @@ def scan_depth(
     return x, jax.tree.map(lambda *layers: jnp.stack(layers), *outputs)
 
 
+class ByLayer(NamedTuple):
+    """Inputs of each layer, for a loop around `scan_depth` that slices nothing."""
+
+    layers: list[Any]
+
+
 def _by_layer(inputs: Any) -> list[Any]:
-    """Return the inputs of each layer; see `per_layer` of `scan_depth`."""
-    if isinstance(inputs, tuple):
-        return list(zip(*map(_by_layer, inputs), strict=True))
-    return inputs if isinstance(inputs, list) else split_layers(inputs)
+    """Split inputs into those of each layer."""
+    parts, structure = jax.tree.flatten(inputs, is_leaf=lambda node: isinstance(node, ByLayer))
+    split = [part.layers if isinstance(part, ByLayer) else split_layers(part) for part in parts]
+    return [jax.tree.unflatten(structure, layer) for layer in zip(*split, strict=True)]
 
 
 def split_layers(stacked: Any) -> list[Any]:

@@ -18,7 +18,7 @@ from lorasp_jax.kernels.cached_attention import KeysValues
 from lorasp_jax.kernels.rematerialization import save_for_backward
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig
 from lorasp_jax.models.transformer.attention import attention
-from lorasp_jax.models.transformer.depth import scan_depth, stack
+from lorasp_jax.models.transformer.depth import ByLayer, scan_depth, stack
 from lorasp_jax.models.transformer.layers import (
     AdaptiveRMSNorm,
     LayerAux,
@@ -151,7 +151,7 @@ class Expert(nnx.Module):
         x: jax.Array,
         position: jax.Array,
         mask: jax.Array,
-        cache: KeysValues | list[KeysValues] | None = None,
+        cache: KeysValues | ByLayer | None = None,
         *,
         token_mask: jax.Array,
         condition: jax.Array | None = None,

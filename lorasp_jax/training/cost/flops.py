@@ -65,6 +65,10 @@ def _equation_flops(equation: Any) -> float:
         # Only the outputs always have the axes of jax.vmap. The first one has the shape of q.
         size, keys = equation.outvars[0].aval.size, equation.invars[1].aval.shape[-3]
         return float(_SHORT_ATTENTION[params["name"]] * size * keys)
+    if name == "pallas_call" and params.get("name") == "cached_attention":
+        # The first output [B, P, T, N, H] has a part for each of P programs that share the keys.
+        output, mask = equation.outvars[0].aval, equation.invars[1].aval
+        return 4.0 * output.size / output.shape[-4] * mask.shape[-1]
     if name == "cond":
         return max(_jaxpr_flops(branch.jaxpr) for branch in params["branches"])
     if name == "while":  # the number of iterations is unknown: count one

@@ -14,6 +14,7 @@ from lorasp_jax.dense import Dense
 from lorasp_jax.models import pi0, smolvla
 from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.models.transformer.layers import apply_to_shared_input
+from lorasp_jax.peft import LoRASP
 from tests.cases import mostly_slow
 from tests.models.random_models import observation, random_backbone
 from tests.nets import METHODS, trained
@@ -81,14 +82,16 @@ def test_fused_layers_match_the_original_ones(name):
     )
 
 
-def test_wide_layers_match_the_original_ones(monkeypatch):
-    """They join x and z instead of adding z U in another pass."""
-    monkeypatch.setattr(prepared, "MAX_FUSED_WIDTH", 1)
-    model, x = adapted(METHODS["lora_sp"], "float32"), jnp.sin(jnp.arange(96.0)).reshape(2, 6, 8)
+@pytest.mark.parametrize("rank", [4, 13])
+def test_wide_layers_match_the_original_ones(monkeypatch, rank):
+    """They join x and z instead of adding z U in another pass; [W; U] is aligned for GPUs."""
+    monkeypatch.setattr(prepared, "MAX_FUSED_OUTPUTS", 1)
+    model = adapted(LoRASP(rank=rank, hidden_width=4), "float32")
+    x = jnp.sin(jnp.arange(96.0)).reshape(2, 6, 8)
     fused = prepare(model)
     arrays = fused.first.fused.get_value()
     assert isinstance(arrays, prepared.SharedProjection)
-    assert [kernel.shape[0] for kernel in arrays.kernels] == [8 + METHODS["lora_sp"].rank] * 2
+    assert [kernel.shape[0] for kernel in arrays.kernels] == [8 + rank + -rank % 8] * 2
     run = jax.jit(lambda model, x: model(x))
     close = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-4)
     jax.tree.map(close, run(fused, x), run(model, x))
@@ -100,7 +103,7 @@ def test_fused_stack_matches_the_original_one(name):
     model = adapted(METHODS[name], "float32")
     stack = jax.tree.map(lambda leaf: jnp.stack([leaf, 0.5 * leaf]), model)
     run = jax.jit(jax.vmap(lambda model, x: model(x), in_axes=(0, None)))
-    fused = prepared.fuse_stack(stack, copy_kernels=False)
+    fused = prepared.fuse_stack(stack)
     for rows in (4, 12):
         x = jnp.sin(jnp.arange(8.0 * rows)).reshape(1, rows, 8)
         (expected, aux), (actual, actual_aux) = run(stack, x), run(fused, x)
@@ -118,7 +121,7 @@ def test_adapters_of_a_stack_are_cast_before_the_loop():
         (loop,) = (e for e in jax.make_jaxpr(run)(x, stack).eqns if e.primitive.name == "scan")
         return str(loop.params["jaxpr"]).count(primitive)
 
-    fused = prepared.fuse_stack(stack, copy_kernels=False)
+    fused = prepared.fuse_stack(stack)
     casts = [in_loop("convert_element_type", one) for one in (stack, fused)]
     assert casts[0] - casts[1] >= 6  # P and U of three layers
     assert in_loop("optimization_barrier", fused) == 2  # one for each input

@@ -9,7 +9,13 @@ from flax import nnx
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.dense import AdapterParam, Dense
 from lorasp_jax.kernels.rematerialization import save_for_backward
-from lorasp_jax.models.transformer.depth import scan_depth, stack
+from lorasp_jax.models.transformer.depth import (
+    ByLayer,
+    scan_depth,
+    split_layers,
+    stack,
+    unstack,
+)
 from lorasp_jax.peft import LoRA
 from tests.nets import METHODS, trained
 from tests.peft.lora_sp.test_method import WithFusedKernel
@@ -136,3 +142,22 @@ def test_the_fused_kernel_runs_once_forward_and_once_backward():
         return count + sum(calls(j) for j in nested if hasattr(j, "eqns"))
 
     assert calls(jax.make_jaxpr(jax.grad(loss))(adapters).jaxpr) == 2
+
+
+def test_inputs_of_unstacked_layers_may_be_split_before():
+    """In any part of a pytree."""
+    blocks = unstack(Net().blocks)
+    x = jnp.sin(jnp.arange(TOKENS * WIDTH)).reshape(1, TOKENS, WIDTH)
+    scales, shifts = jnp.arange(1.0, 1 + DEPTH), {"by": [jnp.arange(2.0 * DEPTH).reshape(DEPTH, 2)]}
+
+    def run(per_layer):
+        call = lambda block, x, inputs: (block(x) * inputs[0], inputs[1]["by"][0].sum())  # noqa: E731
+        return scan_depth(blocks, call, x, per_layer)
+
+    expected = run((scales, shifts, None))
+    for parts in ((True, False), (False, True), (True, True)):
+        split = [
+            ByLayer(split_layers(value)) if is_split else value
+            for value, is_split in zip((scales, shifts), parts, strict=True)
+        ]
+        jax.tree.map(np.testing.assert_array_equal, run((*split, None)), expected)
