@@ -8,13 +8,13 @@ results in a second kernel.
 """
 
 import functools
-import math
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.experimental import pallas as pl
 
+from lorasp_jax.kernels.blocks import LOG2_E, MASKED, load, matmul, store
 from lorasp_jax.kernels.row_sharding import by_rows
 
 KeysValues = tuple[jax.Array, jax.Array]
@@ -22,10 +22,6 @@ KeysValues = tuple[jax.Array, jax.Array]
 
 HEAD_DIMS = (16, 32, 64, 128, 256)
 """Supported head sizes."""
-
-_MASKED = -1e38
-"""Logit of a masked key. Finite, so that a fully masked row gets a uniform softmax, not NaN."""
-_LOG2_E = math.log2(math.e)
 
 
 class Launch(NamedTuple):
@@ -175,10 +171,10 @@ class _Keys(NamedTuple):
 
         def own() -> list[jax.Array]:
             heads = (size.heads + head, size.heads + size.kv_heads + head)
-            return [_load(tokens_ref, (batch, index, h, column), exist) for h in heads]
+            return [load(tokens_ref, (batch, index, h, column), exist) for h in heads]
 
         def cached() -> list[jax.Array]:
-            return [_load(ref, (batch, index, head, column), exist) for ref in cache_refs]
+            return [load(ref, (batch, index, head, column), exist) for ref in cache_refs]
 
         return jax.lax.cond(self.is_own, own, cached) if size.own else cached()
 
@@ -201,45 +197,26 @@ def _kernel(
     token, head = row // group, kv_head * group + row % group
     exists = token < tokens_ref.shape[1]
     q_at = (batch, token[:, None], head[:, None], jnp.arange(dim)[None])
-    q = _load(tokens_ref, q_at, exists[:, None])
+    q = load(tokens_ref, q_at, exists[:, None])
 
     def block(i: Any, state: tuple) -> tuple:
         top, total, y = state
         keys = _Keys.at(size, split * size.per_program + i, launch.keys)
         k, v = keys.load(size, tokens_ref, (keys_ref, values_ref), batch, kv_head)
         mask_at = (batch, token[:, None], (keys.first + keys.index)[None])
-        is_attended = _load(mask_ref, mask_at, exists[:, None] & keys.exist[None]) != 0
-        logits = jnp.where(is_attended, _matmul(q, k, 1) * _LOG2_E, _MASKED)
+        is_attended = load(mask_ref, mask_at, exists[:, None] & keys.exist[None]) != 0
+        logits = jnp.where(is_attended, matmul(q, k, (1, 1)) * LOG2_E, MASKED)
         logits = jnp.where(keys.exist[None], logits, -jnp.inf)
         new_top = jnp.maximum(top, logits.max(1))
         weights, rescale = jnp.exp2(logits - new_top[:, None]), jnp.exp2(top - new_top)
-        y = rescale[:, None] * y + _matmul(weights.astype(v.dtype), v, 0)
+        y = rescale[:, None] * y + matmul(weights.astype(v.dtype), v, (1, 0))
         return new_top, rescale * total + weights.sum(1), y
 
     zeros = jnp.zeros(launch.rows, jnp.float32)
-    state = (zeros + 2 * _MASKED, zeros, jnp.zeros((launch.rows, dim), jnp.float32))
+    state = (zeros + 2 * MASKED, zeros, jnp.zeros((launch.rows, dim), jnp.float32))
     count = jnp.minimum(size.blocks - split * size.per_program, size.per_program)
     top, total, y = jax.lax.fori_loop(0, count, block, state)
     at = (batch, split, token, head)
-    _store(top_ref, at, top, exists)
-    _store(total_ref, at, total, exists)
-    _store(y_ref, (batch, split, *q_at[1:]), y, exists[:, None])
-
-
-def _load(ref: Any, at: tuple, exists: jax.Array) -> jax.Array:
-    from jax.experimental.pallas import triton
-
-    return triton.load(ref.at[at], mask=exists, other=0)
-
-
-def _store(ref: Any, at: tuple, values: jax.Array, exists: jax.Array) -> None:
-    from jax.experimental.pallas import triton
-
-    triton.store(ref.at[at], values, mask=exists)
-
-
-def _matmul(a: jax.Array, b: jax.Array, contracted: int) -> jax.Array:
-    """Multiply a's last axis with an axis of b, in fp32."""
-    return jax.lax.dot_general(
-        a, b, (((1,), (contracted,)), ((), ())), preferred_element_type=jnp.float32
-    )
+    store(top_ref, at, top, exists)
+    store(total_ref, at, total, exists)
+    store(y_ref, (batch, split, *q_at[1:]), y, exists[:, None])

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jax.experimental import pallas as pl
 
+from lorasp_jax.kernels.blocks import LOG2_E, MASKED, load, matmul, store
 from lorasp_jax.kernels.rematerialization import save_for_backward
 from lorasp_jax.kernels.row_sharding import by_rows
 
@@ -50,10 +51,6 @@ class Launch(NamedTuple):
 FORWARD = Launch(rows=64, keys=128, warps=4)
 BACKWARD = Launch(rows=64, keys=64, warps=4)
 """Launch parameters of the two passes."""
-
-_MASKED = -1e38
-"""Logit of a masked key. Finite, so that a fully masked row gets a uniform softmax, not NaN."""
-_LOG2_E = math.log2(math.e)
 
 
 class _Static(NamedTuple):
@@ -180,14 +177,12 @@ class _Block(NamedTuple):
     def load(self, ref: Any) -> jax.Array:
         """Load [n] or [n, H]; padding is 0."""
         at, exist = self._of(ref)
-        return _load(ref, at, exist)
+        return load(ref, at, exist)
 
     def store(self, ref: Any, values: jax.Array) -> None:
         """Store all but the padding, in the dtype of the array."""
-        from jax.experimental.pallas import triton
-
         at, exist = self._of(ref)
-        triton.store(ref.at[at], values.astype(ref.dtype), mask=exist)
+        store(ref, at, values, exist)
 
     def _of(self, ref: Any) -> tuple[tuple, jax.Array | None]:
         """Return index and existence of all elements in this array."""
@@ -233,16 +228,16 @@ def _forward_kernel(launch: Launch, q_ref: Any, k_ref: Any, v_ref: Any, *others:
     q = rows.load(q_ref)
     logits = []
     for keys in chunks:
-        x = _matmul(q, keys.load(k_ref), (1, 1)) * _LOG2_E
+        x = matmul(q, keys.load(k_ref), (1, 1)) * LOG2_E
         for ref in mask_ref:
-            x = jnp.where(_load_mask(ref, rows, keys), x, _MASKED)
+            x = jnp.where(_load_mask(ref, rows, keys), x, MASKED)
         logits.append(x if keys.exist is None else jnp.where(keys.exist[None], x, -jnp.inf))
     top = functools.reduce(jnp.maximum, [x.max(1) for x in logits])
     total, y = jnp.zeros_like(top), jnp.zeros(q.shape, jnp.float32)
     for keys, x in zip(chunks, logits, strict=True):
         weights = jnp.exp2(x - top[:, None])
         total += weights.sum(1)
-        y += _matmul(weights.astype(v_ref.dtype), keys.load(v_ref), (1, 0))
+        y += matmul(weights.astype(v_ref.dtype), keys.load(v_ref), (1, 0))
     rows.store(y_ref, y / total[:, None])
     rows.store(log_sum_ref, top + jnp.log2(total))
 
@@ -259,24 +254,24 @@ def _backward_kernel(launch: Launch, q_ref: Any, k_ref: Any, v_ref: Any, *others
         rows = program.rows(i, q_ref.shape)
         q, dy, log_sum = (rows.load(ref) for ref in (q_ref, dy_ref, log_sum_ref))
         # Masked logits are constants, so a fully masked row gets no gradient of q. Its log_sum is
-        # rounded to _MASKED, which would make its weights 1 instead of 1 / S.
-        some = log_sum > _MASKED / 2
+        # rounded to MASKED, which would make its weights 1 instead of 1 / S.
+        some = log_sum > MASKED / 2
         masked = jnp.where(some, -jnp.inf, -math.log2(num_keys))[:, None]
         if mask_ref:
             q = jnp.where(some[:, None], q, jnp.zeros_like(q))
         mean = (dy.astype(jnp.float32) * rows.load(y_ref).astype(jnp.float32)).sum(1)
         dq, results = jnp.zeros(q.shape, jnp.float32), []
         for keys, (k, v), (dk, dv) in zip(chunks, loaded, sums, strict=True):
-            log_weights = _matmul(q, k, (1, 1)) * _LOG2_E - log_sum[:, None]
+            log_weights = matmul(q, k, (1, 1)) * LOG2_E - log_sum[:, None]
             for ref in mask_ref:
                 log_weights = jnp.where(_load_mask(ref, rows, keys), log_weights, masked)
             if keys.exist is not None:
                 log_weights = jnp.where(keys.exist[None], log_weights, -jnp.inf)
             weights = jnp.exp2(log_weights)
-            dx = (weights * (_matmul(dy, v, (1, 1)) - mean[:, None])).astype(q.dtype)
-            dq += _matmul(dx, k, (1, 0))
-            dv += _matmul(weights.astype(dy.dtype), dy, (0, 0))
-            results.append((dk + _matmul(dx, q, (0, 0)), dv))
+            dx = (weights * (matmul(dy, v, (1, 1)) - mean[:, None])).astype(q.dtype)
+            dq += matmul(dx, k, (1, 0))
+            dv += matmul(weights.astype(dy.dtype), dy, (0, 0))
+            results.append((dk + matmul(dx, q, (0, 0)), dv))
         rows.store(dq_ref, jnp.where(some[:, None], dq, 0) if mask_ref else dq)
         return results
 
@@ -287,22 +282,10 @@ def _backward_kernel(launch: Launch, q_ref: Any, k_ref: Any, v_ref: Any, *others
         keys.store(dv_ref, dv)
 
 
-def _matmul(a: jax.Array, b: jax.Array, contracted: tuple[int, int]) -> jax.Array:
-    """Multiply matrices over one axis of each, in fp32."""
-    axes = (contracted[:1], contracted[1:]), ((), ())
-    return jax.lax.dot_general(a, b, axes, preferred_element_type=jnp.float32)
-
-
 def _load_mask(ref: Any, rows: _Block, keys: _Block) -> jax.Array:
     """Load bool [rows, keys] from `[B, T, S]`; padding is False."""
     (batch, token, *_), (_, key, _) = rows.at, keys.at
     exist = jnp.asarray(rows.exist)[:, None]
     if keys.exist is not None:
         exist &= keys.exist[None]
-    return _load(ref, (batch, token[:, None], key[None]), exist) != 0
-
-
-def _load(ref: Any, at: tuple, exist: jax.Array | None) -> jax.Array:
-    from jax.experimental.pallas import triton
-
-    return triton.load(ref.at[at], mask=exist, other=None if exist is None else 0)
+    return load(ref, (batch, token[:, None], key[None]), exist) != 0
