@@ -20,20 +20,22 @@ def multiplies_float8() -> bool:
 
     An abstract device does not tell its age; a GPU is taken for such a one.
     """
-    device = jax.sharding.get_abstract_mesh().abstract_device
-    if device is not None:
-        return device.platform == "cuda"
-    capability = getattr(jax.devices()[0], "compute_capability", "0")  # AMD's reads gfx942
-    return capability.replace(".", "").isdigit() and float(capability) >= 8.9
+    return _compute_capability() >= 8.9
 
 
 def has_large_shared_memory() -> bool:
     """Return whether `platform()` is an NVIDIA GPU with 160 KiB of shared memory per block or more.
 
     Those are A100, H100, B200 and their relatives; others have 99 KiB (CUDA C++ Programming Guide,
-    technical specifications per compute capability). An abstract device is taken for a large one.
+    technical specifications per compute capability). An abstract GPU is taken for such a one.
     """
+    return _compute_capability() in (8.0, 9.0, 10.0, 10.3)
+
+
+def _compute_capability() -> float:
+    """Return that of an NVIDIA GPU, Hopper's 9.0 for an abstract one, and 0 for other devices."""
     device = jax.sharding.get_abstract_mesh().abstract_device
     if device is not None:
-        return device.platform == "cuda"
-    return getattr(jax.devices()[0], "compute_capability", "0") in ("8.0", "9.0", "10.0", "10.3")
+        return 9.0 if device.platform == "cuda" else 0.0
+    capability = getattr(jax.devices()[0], "compute_capability", "0")  # AMD's reads gfx942
+    return float(capability) if capability.replace(".", "").isdigit() else 0.0

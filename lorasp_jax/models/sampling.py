@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Iterator
 from typing import Any, Protocol, Self, cast
 
 import jax
@@ -127,27 +128,27 @@ class Sampler:
         if noise is None:
             shape = (obs.state.shape[0], self.config.chunk, self.config.action_dim)
             noise = jax.random.normal(key, shape)
-        graphdefs, tree = self.structure
-        states = jax.tree.unflatten(tree, self.weights)
-        prefix_model, suffix_model = map(nnx.merge, graphdefs, states)
+        prefix_model, suffix_model = self._models()
         encoded, aux = prefix_model.run_prefix(obs)
-        encoded = encoded.by_layer()
-        sample = flow_matching.sample
+        encoded, sample = encoded.by_layer(), flow_matching.sample
         if prefix is not None:
             condition = {"prefix": prefix, "length": prefix_length, "guidance": guidance}
             sample = functools.partial(real_time_chunking.sample, overlap=overlap, **condition)
-        actions, action_aux = sample(
-            lambda x_t, t: suffix_model.run_suffix(encoded, obs, x_t, t),
-            noise,
-            num_steps=num_steps,
-            slots=slots,
-        )
-        if not return_aux:
-            return actions
-        prefix_action_aux = jax.tree.map(
-            lambda a: jnp.broadcast_to(a, (num_steps, *a.shape)), aux.get("action", {})
-        )
-        return actions, merge_action_aux({**aux, "action": prefix_action_aux}, action_aux)
+        velocity = lambda x_t, t: suffix_model.run_suffix(encoded, obs, x_t, t)  # noqa: E731
+        actions, action_aux = sample(velocity, noise, num_steps=num_steps, slots=slots)
+        return (actions, _with_steps(aux, action_aux, num_steps)) if return_aux else actions
+
+    def _models(self) -> Iterator[FlowModel]:
+        """Rebuild the modules of the prefix and of the flow steps."""
+        graphdefs, tree = self.structure
+        return map(nnx.merge, graphdefs, jax.tree.unflatten(tree, self.weights))
+
+
+def _with_steps(aux: ModelAux, action_aux: LayerAux, num_steps: int) -> ModelAux:
+    """Merge the flow steps' aux into the prefix's, whose action layers get an axis of steps."""
+    once = aux.get("action", {})
+    each_step = jax.tree.map(lambda a: jnp.broadcast_to(a, (num_steps, *a.shape)), once)
+    return merge_action_aux({**aux, "action": each_step}, action_aux)
 
 
 def _prefix_model(model: FlowModel, once: bool) -> FlowModel:

@@ -146,15 +146,15 @@ def test_lowers_for_a_gpu_to_one_kernel(name, x64):
 
 
 def test_many_queries_and_small_gpus_do_not_use_the_kernel(monkeypatch):
-    q, k, _, mask, _ = published("pi0")
+    q, _, _, mask, _ = published("pi0")
     many = jax.ShapeDtypeStruct((8, *q.shape[1:]), q.dtype)
     narrow = published("smolvla")
     with on_gpu():
-        assert attention._use_cached_attention(q, k, mask)
-        assert not attention._use_cached_attention(many, k, mask)
+        assert attention._use_cached_attention(q, mask)
+        assert not attention._use_cached_attention(many, mask)
         monkeypatch.setattr(attention, "has_large_shared_memory", lambda: False)
-        assert not attention._use_cached_attention(q, k, mask)
-        assert attention._use_cached_attention(narrow[0], narrow[1], narrow[3])
+        assert not attention._use_cached_attention(q, mask)
+        assert attention._use_cached_attention(narrow[0], narrow[3])
 
 
 def test_flops_are_those_of_xla():

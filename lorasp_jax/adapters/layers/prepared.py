@@ -29,7 +29,6 @@ from typing import (
     TypeAlias,
     TypeGuard,
     TypeVar,
-    cast,
     runtime_checkable,
 )
 
@@ -240,8 +239,7 @@ def _call_shared(
         zs, shared.kernels, shared.ups, shared.biases, strict=True
     ):
         if up is None:
-            joined = pad_columns(jnp.concatenate([x, layer_z], axis=-1))
-            y = jnp.matmul(joined, cast(jax.Array, kernel))
+            y = pad_columns(jnp.concatenate([x, layer_z], axis=-1)) @ kernel.astype(x.dtype)
         else:
             y = base_plus_low_rank(x, layer_z, kernel, up)
         ys.append(y if bias is None else y + bias)
@@ -342,23 +340,20 @@ def _bottleneck_spec(
 
 
 def _with_copied_kernels(layers: Sequence[Dense]) -> FusedLayers | SharedProjection:
-    if sum(layer.kernel_matrices().shape[1] for layer in layers) <= MAX_FUSED_OUTPUTS:
-        return _fused_layers(layers)
-    kernels, downs, ups, biases = _matrices(layers)
-    joined = [pad_columns(jnp.concatenate(pair).T).T for pair in zip(kernels, ups, strict=True)]
-    down = pad_columns(jnp.concatenate(downs, axis=1))
-    return SharedProjection(
-        *_bottleneck_spec(layers, downs), down, [None] * len(layers), joined, biases
-    )
+    is_wide = sum(layer.kernel_matrices().shape[1] for layer in layers) > MAX_FUSED_OUTPUTS
+    return _shared_projection(layers, join=True) if is_wide else _fused_layers(layers)
 
 
-def _shared_projection(layers: Sequence[Dense]) -> SharedProjection:
+def _shared_projection(layers: Sequence[Dense], *, join: bool = False) -> SharedProjection:
+    """Concatenate only the P of all layers; with `join`, also W and U of each layer."""
     dense, downs, ups, biases = _matrices(layers)
-    stored = [layer.kernel_matrices() for layer in layers]
-    pairs = zip(stored, dense, strict=True)
+    down, spec = pad_columns(jnp.concatenate(downs, axis=1)), _bottleneck_spec(layers, downs)
+    if join:
+        joined = [pad_columns(jnp.concatenate(pair).T).T for pair in zip(dense, ups, strict=True)]
+        return SharedProjection(*spec, down, [None] * len(ups), joined, biases)
+    pairs = zip((layer.kernel_matrices() for layer in layers), dense, strict=True)
     kernels = [k if isinstance(k, QuantizedKernel) else w for k, w in pairs]
-    down = pad_columns(jnp.concatenate(downs, axis=1))
-    return SharedProjection(*_bottleneck_spec(layers, downs), down, ups, kernels, biases)
+    return SharedProjection(*spec, down, ups, kernels, biases)
 
 
 def _fused_layers(layers: Sequence[Dense]) -> FusedLayers:

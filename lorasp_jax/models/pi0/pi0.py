@@ -24,7 +24,7 @@ from lorasp_jax.models.backbone import Backbone, suffix_mask_and_positions
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig, VisionConfig
 from lorasp_jax.models.inputs import OPENPI, OPENPI_PI05, OURS_PI05
 from lorasp_jax.models.observation import Observation
-from lorasp_jax.models.transformer.depth import ByLayer, split_layers
+from lorasp_jax.models.transformer.depth import ByLayer
 from lorasp_jax.models.transformer.experts import AdaptiveExpert, Expert, KeysValues, LanguageExpert
 from lorasp_jax.models.transformer.layers import (
     LayerAux,
@@ -121,7 +121,7 @@ class Prefix(NamedTuple):
 
     def by_layer(self) -> Prefix:
         """Split the cache into layers, so that a loop of flow steps slices nothing."""
-        return self._replace(cache=ByLayer(split_layers(self.cache)))
+        return self._replace(cache=ByLayer.of(self.cache))
 
 
 class Pi0(Backbone):

@@ -21,7 +21,7 @@ from lorasp_jax.models.config import BackboneConfig, ExpertConfig, VisionConfig
 from lorasp_jax.models.inputs import LEROBOT_SMOLVLA
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.smolvla.experts import ActionExpert, SmolLM2
-from lorasp_jax.models.transformer.depth import ByLayer, split_layers
+from lorasp_jax.models.transformer.depth import ByLayer
 from lorasp_jax.models.transformer.experts import KeysValues
 from lorasp_jax.models.transformer.layers import (
     LayerAux,
@@ -121,9 +121,7 @@ class Prefix(NamedTuple):
 
     def by_layer(self) -> Prefix:
         """Split cache and cross into layers, so that a loop of flow steps slices nothing."""
-        return self._replace(
-            cache=ByLayer(split_layers(self.cache)), cross=ByLayer(split_layers(self.cross))
-        )
+        return self._replace(cache=ByLayer.of(self.cache), cross=ByLayer.of(self.cross))
 
 
 class SmolVLA(Backbone):

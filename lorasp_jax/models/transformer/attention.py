@@ -65,7 +65,7 @@ def attention(
     Returns:
         `[B, T, N H]`.
     """
-    if mask is not None and _use_cached_attention(q, k, mask):
+    if mask is not None and _use_cached_attention(q, mask):
         return _few_queries(q, (k, v), cache, mask)
     return _concatenated(q, (k, v), cache, mask)
 
@@ -100,7 +100,7 @@ def _concatenated(
     if mask is not None and mask.ndim == 1:
         first = jnp.arange(k.shape[1]) < mask[:, None]
         mask = jnp.broadcast_to(first[:, None], (batch, tokens, k.shape[1]))
-    if _use_short_attention(q, k):
+    if _use_short_attention(q, k.shape[1]):
         return short_attention(q, k, v, mask)
     k, v, mask = _pad_keys(k, v, mask)
     # For K = 1, this axis order needs no transposes of q, the weights or the result.
@@ -137,19 +137,18 @@ def _use_cudnn(q: jax.Array, k: jax.Array, mask: jax.Array | None) -> bool:
     return jax.default_backend() == "gpu" and half_precision and supported and large
 
 
-def _use_cached_attention(q: jax.Array, k: jax.Array, mask: jax.Array) -> bool:
+def _use_cached_attention(q: jax.Array, mask: jax.Array) -> bool:
     """Whether the kernel supports these arrays, and no kernel with a gradient does."""
-    keys = jax.ShapeDtypeStruct((len(k), mask.shape[-1], *k.shape[2:]), k.dtype)
     dim, half_precision = q.shape[3], q.dtype in (jnp.bfloat16, jnp.float16)
     few = q.shape[1] < CUDNN_MIN_QUERIES and q.size <= MAX_QUERY_ELEMENTS and mask.ndim == 3
     fits = dim in CACHED_HEAD_DIMS and (dim <= MAX_NARROW or has_large_shared_memory())
     chosen = platform() == "gpu" and half_precision and few and fits
-    return chosen and not _use_short_attention(q, keys)
+    return chosen and not _use_short_attention(q, mask.shape[-1])
 
 
-def _use_short_attention(q: jax.Array, k: jax.Array | jax.ShapeDtypeStruct) -> bool:
-    """Whether the kernel supports these arrays, on all GPUs since Ampere."""
-    head_dim, keys = q.shape[3], k.shape[1]
+def _use_short_attention(q: jax.Array, keys: int) -> bool:
+    """Whether the kernel supports q and this number of keys, on all GPUs since Ampere."""
+    head_dim = q.shape[3]
     half_precision = q.dtype in (jnp.bfloat16, jnp.float16)
     few = keys <= MAX_KEYS and keys * head_dim <= MAX_KEY_ELEMENTS
     return platform() == "gpu" and half_precision and head_dim in HEAD_DIMS and few

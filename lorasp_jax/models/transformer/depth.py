@@ -77,15 +77,20 @@ class ByLayer(NamedTuple):
 
     layers: list[Any]
 
+    @classmethod
+    def of(cls, stacked: Any) -> "ByLayer":
+        """Split arrays with a leading axis L."""
+        return cls(_split_layers(stacked))
+
 
 def _by_layer(inputs: Any) -> list[Any]:
     """Split inputs into those of each layer."""
     parts, structure = jax.tree.flatten(inputs, is_leaf=lambda node: isinstance(node, ByLayer))
-    split = [part.layers if isinstance(part, ByLayer) else split_layers(part) for part in parts]
+    split = [part.layers if isinstance(part, ByLayer) else _split_layers(part) for part in parts]
     return [jax.tree.unflatten(structure, layer) for layer in zip(*split, strict=True)]
 
 
-def split_layers(stacked: Any) -> list[Any]:
+def _split_layers(stacked: Any) -> list[Any]:
     """Split arrays [L, ...] into layers, so that the backward pass concatenates their gradients.
 
     With indexing, the backward pass would add L zero-padded gradients.
@@ -141,11 +146,11 @@ def _(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
 def _lazy_slices(trained: Any, frozen: Any) -> list[_LayerSlice]:
     """Slice arrays [L, ...] lazily, one slice per layer."""
     depth = len(jax.tree.leaves((trained, frozen))[0])
-    sinks = split_layers(trained) or [trained] * depth  # no slices if no array is trainable
+    sinks = _split_layers(trained) or [trained] * depth  # no slices if no array is trainable
     return [_LayerSlice(trained, frozen, np.int32(i), sink) for i, sink in enumerate(sinks)]
 
 
 def unstack(blocks: nnx.Module) -> nnx.List[Any]:
     """Split stacked blocks into a list, so that a loop around `scan_depth` slices no weights."""
     graphdef, state = nnx.split(blocks)
-    return nnx.List([nnx.merge(graphdef, layer) for layer in split_layers(state)])
+    return nnx.List([nnx.merge(graphdef, layer) for layer in _split_layers(state)])

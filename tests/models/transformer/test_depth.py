@@ -12,7 +12,6 @@ from lorasp_jax.kernels.rematerialization import save_for_backward
 from lorasp_jax.models.transformer.depth import (
     ByLayer,
     scan_depth,
-    split_layers,
     stack,
     unstack,
 )
@@ -157,7 +156,7 @@ def test_inputs_of_unstacked_layers_may_be_split_before():
     expected = run((scales, shifts, None))
     for parts in ((True, False), (False, True), (True, True)):
         split = [
-            ByLayer(split_layers(value)) if is_split else value
+            ByLayer.of(value) if is_split else value
             for value, is_split in zip((scales, shifts), parts, strict=True)
         ]
         jax.tree.map(np.testing.assert_array_equal, run((*split, None)), expected)
