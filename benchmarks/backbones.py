@@ -133,7 +133,7 @@ class Step:
         )
         out = state, replicated
         jitted = jax.jit(step, donate_argnums=0, in_shardings=self._shardings, out_shardings=out)
-        options = (compilation.step_options() or {}) | (options or {})
+        options = (compilation.step_options(mesh.size) or {}) | (options or {})
         self.compiled = jitted.lower(*shapes).compile(options)
 
     def load(self, adapters: Any, frozen: Any, batch: Any = None) -> "Step":

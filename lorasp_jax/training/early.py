@@ -14,7 +14,7 @@ from lorasp_jax.config import Config
 from lorasp_jax.data.batches import flatten
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor
-from lorasp_jax.training import compilation, loop, setup
+from lorasp_jax.training import loop, setup
 from lorasp_jax.training.cost.preflight import nbytes
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.optim import make_optimizer
@@ -36,7 +36,7 @@ def compile_steps(run: Run, built: setup.RunSetup, batches: Any) -> Any:
     """Compile the training program for batches of these shapes, from `data_shapes`."""
     with messages.announce("the training step"):
         lowered = _lower(run, built, batches)
-        return lowered.compile(compiler_options=compilation.step_options())
+        return lowered.compile()
 
 
 def blank_policy(run: Run, built: setup.RunSetup) -> Policy:

@@ -15,6 +15,7 @@ from lorasp_jax.config import Config, OptimConfig
 from lorasp_jax.data.batches import Raw, encode
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor
+from lorasp_jax.training import compilation
 from lorasp_jax.training.checkpoint import Checkpoints
 from lorasp_jax.training.demonstrations import fresh_demonstrations
 from lorasp_jax.training.distributed import mesh as meshes
@@ -163,6 +164,7 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
         jax.jit,
         donate_argnames="state",
         out_shardings=(shardings, meshes.replicated(mesh)),
+        compiler_options=compilation.step_options(mesh.size),
     )
     def scan(frozen: Frozen, batches: Raw, state: TrainState, key: jax.Array) -> Any:
         return jax.lax.scan(lambda state, raw: body(state, raw, frozen, key), state, batches)

@@ -17,7 +17,6 @@ from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Raw, Steps, fit_to_size, flatten
 from lorasp_jax.data.checked_images import load_images
 from lorasp_jax.data.stream import Stream
-from lorasp_jax.training import compilation
 from lorasp_jax.training.cost import flops, preflight
 from lorasp_jax.training.cost.speed import Speed
 from lorasp_jax.training.demonstrations import in_thread
@@ -61,7 +60,7 @@ class Stepper:
         key = jax.random.key(0)
         with messages.announce("the training step"):
             lowered = self._jitted.lower(self._frozen, self._windows.shapes(size), state, key)
-            return lowered.compile(compiler_options=compilation.step_options())
+            return lowered.compile()
 
     def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
         """Run `count` steps; metrics have a leading axis over steps."""

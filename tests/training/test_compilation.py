@@ -4,13 +4,14 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from lorasp_jax.training import compilation
+from lorasp_jax.training import compilation, loop
+from tests.runs import make_run
 
 
 @pytest.fixture
 def on_gpu(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    return compilation.step_options()
+    return compilation.step_options(1)
 
 
 def test_xla_knows_the_options_for_gpus(on_gpu):
@@ -23,4 +24,18 @@ def test_xla_knows_the_options_for_gpus(on_gpu):
 def test_they_are_for_gpus_alone(on_gpu, monkeypatch):
     assert on_gpu["xla_gpu_enable_triton_gemm"] is False
     monkeypatch.undo()
-    assert not any("gpu" in name for name in compilation.step_options() or {})
+    assert not any("gpu" in name for name in compilation.step_options(1) or {})
+
+
+def test_only_one_gpu_runs_without_the_scheduler_that_hides_transfers(on_gpu):
+    scheduler = "xla_gpu_enable_latency_hiding_scheduler"
+    assert on_gpu[scheduler] is False
+    assert scheduler not in compilation.step_options(2)
+
+
+def test_a_training_program_is_compiled_with_its_options(monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr(compilation, "step_options", lambda n: asked.append(n) or {"no_such": 1})
+    with pytest.raises(jax.errors.JaxRuntimeError, match="no_such"):
+        loop.train(make_run(tmp_path))
+    assert asked == [1]
