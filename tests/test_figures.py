@@ -7,6 +7,7 @@ import re
 import numpy as np
 import pytest
 
+from lorasp_jax.evaluation.intervals import wilson_interval
 from lorasp_jax.evaluation.latency import figure as latency
 from tests import ROOT
 
@@ -78,3 +79,47 @@ def test_the_latency_figure_and_tables_show_what_was_measured(script, tmp_path, 
             "{:.1f} ({:.0f}-{:.0f})".format(p["success"], *p["ci95"]) for p in shown
         ]
         assert jerk.split(", ") == [f"{p['jerk']:.0f}" for p in shown]
+
+
+def test_the_float8_figure_and_table_show_what_was_measured(script, tmp_path):
+    script("float8").main(tmp_path / "float8.svg")
+    assert (tmp_path / "float8.svg").stat().st_size > 20_000
+    found = json.loads((ROOT / "docs/float8.json").read_text())["small"]
+    page = (ROOT / "docs/benchmarks.md").read_text()
+    table = page.partition("| π0 small, bf16 | float8 |")[2].partition("\n\n")[0]
+    rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", table, re.M)
+    assert {task for task, _ in rows} == {*found["pi0"]["bf16"][0]["successes"]}
+    for task, cells in rows:
+        counts = [
+            sum(run["successes"][task] for run in found[backbone][kind])
+            for backbone in ("pi0", "smolvla")
+            for kind in ("bf16", "float8")
+        ]
+        bounds = [wilson_interval(count, 768) for count in counts]
+        assert cells.split(" | ") == [
+            f"{100 * count / 768:.1f} ({100 * low:.0f}-{100 * high:.0f})"
+            for count, (low, high) in zip(counts, bounds, strict=True)
+        ]
+
+
+def test_the_table_of_other_programs_shows_what_was_measured():
+    found = json.loads((ROOT / "docs/peers.json").read_text())["tables"]
+    page = (ROOT / "docs/benchmarks.md").read_text()
+    table = page.partition("| work | program |")[2].partition("\n\n")[0]
+    shown = re.findall(r"\| ([\d.]+) \| ([\d.]+) GiB \|$", table, re.M)
+    variants = [
+        ("pi0-train", "ours", "LoRA-SP"),
+        ("pi0-train", "ours", "openpi's LoRA"),
+        ("pi0-train", "openpi", "LoRA"),
+        ("smolvla-train", "ours", "LoRA-SP"),
+        ("smolvla-train", "ours", "LoRA"),
+        ("smolvla-train", "lerobot", "LoRA, autocast"),
+        ("smolvla-expert", "ours", "expert only"),
+        ("smolvla-expert", "lerobot", "expert only"),
+    ]
+    measured = []
+    for name, *variant in variants:
+        rows = [row for row in found[name] if [row["program"], row["variant"]] == variant]
+        rate = 32e3 / np.mean([row["ms"] for row in rows])
+        measured.append((f"{rate:.1f}", f"{rows[0]['GiB']:.1f}"))
+    assert shown == measured
