@@ -126,7 +126,7 @@ def test_prepare(tmp_path, monkeypatch):
     np.testing.assert_allclose(known["mean"][slots], expected.action.mean(0), atol=1e-6)
     small = 2**21
     monkeypatch.setattr(
-        preflight, "choose_remat", lambda *_: ("none", preflight.Memory(*5 * [0.0]))
+        preflight, "choose_remat", lambda *_: ("none", preflight.Memory(*6 * [0.0]))
     )
     assert not prepare(tmp_path, monkeypatch, "removed, but cached", small).streams
     (tmp_path / "dataset.json").unlink()

@@ -91,7 +91,7 @@ def _memory_table(built: setup.RunSetup, held: int, batches: Any, analysis: Any)
     for part in resident:
         add(f"  {part}", estimate[part])
     add("arguments", arguments, compiled[0])
-    for part in ("gradients", "activations"):
+    for part in ("gradients", "activations", "recomputation"):
         add(f"  {part}", estimate[part])
     add("  headroom", headroom)
     add("temporary", temporaries + headroom, compiled[1])

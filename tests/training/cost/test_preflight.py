@@ -50,6 +50,12 @@ def test_activations_grow_with_the_batch_and_shrink_with_remat(memory):
     assert twice.activations == pytest.approx(2 * none, rel=0.1)
 
 
+def test_only_rematerialization_recomputes(memory):
+    none, products, narrow, full = (memory[remat].recomputation for remat in preflight.REMATS)
+    assert none == 0
+    assert 0 < products <= narrow <= full
+
+
 def test_gradient_accumulation_and_ema(memory):
     none = memory["none"]
     optim = dataclasses.replace(CONFIG.optim, accumulate=4, ema=0.5)
@@ -79,11 +85,24 @@ def test_a_run_that_cannot_fit_suggests_a_batch_that_does(memory):
     assert preflight.choose_remat(smaller, TINY, available)[0] == "full"
 
 
+def test_on_a_gpu_it_suggests_to_use_all_of_the_memory(memory, monkeypatch):
+    name = "XLA_PYTHON_CLIENT_MEM_FRACTION"
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.delenv(name, raising=False)
+    with pytest.raises(ValueError, match=f"{name}=0.95, because JAX leaves a quarter"):
+        preflight.choose_remat(CONFIG, TINY, memory["full"].base)
+    monkeypatch.setenv(name, "0.9")
+    with pytest.raises(ValueError, match="needs about") as caught:
+        preflight.choose_remat(CONFIG, TINY, memory["full"].base)
+    assert name not in str(caught.value)
+
+
 def test_the_suggested_batch_is_a_multiple_of_the_micro_batches(memory, monkeypatch):
     monkeypatch.setattr(preflight, "estimate_memory", lambda *_: memory["full"])
     optim = OptimConfig(batch_size=64, accumulate=4)
     config = dataclasses.replace(CONFIG, optim=optim, model=ModelConfig(remat="full"))
-    fixed = memory["full"].peak - preflight.HEADROOM * memory["full"].activations
+    grows = memory["full"].activations + memory["full"].recomputation
+    fixed = memory["full"].peak - preflight.HEADROOM * grows
     with pytest.raises(ValueError, match="needs about") as caught:
         preflight.choose_remat(config, TINY, 0.75 * memory["full"].peak + 0.25 * fixed)
     assert f"--optim.batch-size {48 // (4 * jax.device_count()) * 4 * jax.device_count()}," in str(

@@ -1,0 +1,125 @@
+"""Estimate the memory for recomputing a layer in the backward pass, from a jaxpr.
+
+With rematerialization, the backward pass of a layer first repeats its forward pass. What it holds
+meanwhile is freed before the next layer, so one layer at a time adds to what was saved.
+
+Matmuls, kernels and loops store their results, and read their operands from memory. All else is
+fused: it stores only what one of them reads. Memory that fusion frees or duplicates is not modeled.
+"""
+
+import collections
+import itertools
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+_STORING = {
+    "concatenate",
+    "cond",
+    "conv_general_dilated",
+    "dot_general",
+    "dot_product_attention_bwd_wrapper",
+    "dot_product_attention_fwd_wrapper",
+    "gather",
+    "pallas_call",
+    "scan",
+    "scatter-add",
+    "sort",
+    "while",
+}
+"""Primitives whose operands and results are in memory."""
+
+
+class _Operation(NamedTuple):
+    """An equation without inner functions; values are numbered."""
+
+    name: str
+    inputs: list[int]
+    outputs: list[int]
+
+
+def largest(gradient: Any) -> int:
+    """Return the most bytes that a layer takes to recompute, from the jaxpr of a gradient.
+
+    The jaxpr is closed, as from `jax.make_jaxpr`. Without rematerialization, the result is 0.
+    """
+    return max(map(_peak, _recomputed(gradient.jaxpr)), default=0)
+
+
+def _recomputed(jaxpr: Any) -> Iterator[Any]:
+    """Yield the backward passes that recompute: the bodies of differentiated `jax.checkpoint`s."""
+    for equation in jaxpr.eqns:
+        if equation.params.get("differentiated"):
+            yield equation.params["jaxpr"]
+        else:
+            for inner in _bodies(equation):
+                yield from _recomputed(inner)
+
+
+def _bodies(equation: Any) -> list[Any]:
+    """Return the jaxprs of an equation."""
+    values = [getattr(value, "jaxpr", value) for value in equation.params.values()]
+    return [value for value in values if hasattr(value, "eqns")]
+
+
+def _peak(jaxpr: Any) -> int:
+    """Return the most bytes that are stored at once, without arguments and results."""
+    sizes, operations, results = _flatten(jaxpr)
+    read = {v for op in operations if op.name in _STORING for v in op.inputs}
+    made = {v for op in operations for v in op.outputs if op.name in _STORING or v in read}
+    stored = made - results - _accumulated(operations)
+    last: dict[int, int] = {}
+    for time, op in reversed([*enumerate(operations)]):
+        fused = not any(v in stored for v in op.outputs)
+        until = max([last.get(v, time) for v in op.outputs if fused], default=time)
+        for value in op.inputs:
+            last[value] = max(last.get(value, 0), until)
+    changes: collections.Counter[int] = collections.Counter()
+    for time, op in enumerate(operations):
+        for value in stored.intersection(op.outputs):
+            changes[time] += sizes[value]
+            changes[last.get(value, time) + 1] -= sizes[value]
+    return max(itertools.accumulate(changes[time] for time in range(len(operations))), default=0)
+
+
+def _accumulated(operations: Sequence[_Operation]) -> set[int]:
+    """Return the products that are only added to another one, which a matmul does in place."""
+    products = {v for op in operations if op.name == "dot_general" for v in op.outputs}
+    uses = collections.Counter(v for op in operations for v in op.inputs)
+    sums = [op.inputs for op in operations if op.name in ("add", "add_any")]
+    return {
+        pair[1]
+        for pair in sums
+        if len({*pair} & products) == 2 and uses[pair[0]] == uses[pair[1]] == 1
+    }
+
+
+def _flatten(jaxpr: Any) -> tuple[list[int], list[_Operation], set[int]]:
+    """Inline called functions; return the bytes of each value, the operations and the results."""
+    sizes: list[int] = []
+    operations: list[_Operation] = []
+
+    def new(variable: Any) -> int:
+        dtype = getattr(variable.aval, "dtype", None)
+        sizes.append(variable.aval.size * dtype.itemsize if dtype is not None else 0)
+        return len(sizes) - 1
+
+    def visit(jaxpr: Any, arguments: Sequence[int | None]) -> list[int | None]:
+        values = dict(zip(jaxpr.invars, arguments, strict=True))
+        values |= {variable: new(variable) for variable in jaxpr.constvars}
+
+        def read(atoms: Sequence[Any]) -> list[int | None]:
+            return [None if hasattr(atom, "val") else values[atom] for atom in atoms]  # literals
+
+        for equation in jaxpr.eqns:
+            name, inputs, bodies = equation.primitive.name, read(equation.invars), _bodies(equation)
+            if len(bodies) == 1 and name not in _STORING:
+                outputs = visit(bodies[0], inputs)
+            else:
+                outputs = [new(variable) for variable in equation.outvars]
+                known = [value for value in inputs if value is not None]
+                operations.append(_Operation(name, known, outputs))
+            values |= zip(equation.outvars, outputs, strict=True)
+        return read(jaxpr.outvars)
+
+    results = visit(jaxpr, [new(variable) for variable in jaxpr.invars])
+    return sizes, operations, {value for value in results if value is not None}
