@@ -93,6 +93,14 @@ def _accumulated(operations: Sequence[_Operation]) -> set[int]:
     }
 
 
+def _is_called(equation: Any, bodies: Sequence[Any]) -> bool:
+    """Return whether an equation passes its operands to one jaxpr and returns its results."""
+    if len(bodies) != 1:
+        return False
+    pairs = (equation.invars, bodies[0].invars), (equation.outvars, bodies[0].outvars)
+    return all(len(outer) == len(inner) for outer, inner in pairs)
+
+
 def _flatten(jaxpr: Any) -> tuple[list[int], list[_Operation], set[int]]:
     """Inline called functions; return the bytes of each value, the operations and the results."""
     sizes: list[int] = []
@@ -112,7 +120,7 @@ def _flatten(jaxpr: Any) -> tuple[list[int], list[_Operation], set[int]]:
 
         for equation in jaxpr.eqns:
             name, inputs, bodies = equation.primitive.name, read(equation.invars), _bodies(equation)
-            if len(bodies) == 1 and name not in _STORING:
+            if name not in _STORING and _is_called(equation, bodies):
                 outputs = visit(bodies[0], inputs)
             else:
                 outputs = [new(variable) for variable in equation.outvars]
