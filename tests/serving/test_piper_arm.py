@@ -191,6 +191,19 @@ def test_the_grippers_effort_is_capped():
         PiperArm(channel(), bus="virtual", effort=5000)
 
 
+def test_the_gripper_frame_has_the_effort(bench, monkeypatch):
+    efforts, unpack = [], frames.unpack_gripper
+
+    def spy(data):
+        efforts.append(unpack(data)[1])
+        return unpack(data)
+
+    monkeypatch.setattr(frames, "unpack_gripper", spy)
+    arm, fake, clock = ready(bench)
+    drive(arm, clock, fake.world.pose, 5)
+    assert set(efforts) == {1000}  # the default, below MAX_EFFORT
+
+
 def test_nan_never_reaches_the_bus(bench):
     arm, fake, clock = ready(bench)
     sent = fake.commands

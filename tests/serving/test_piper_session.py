@@ -1,6 +1,7 @@
 """The control loop on the fake arm, through the unmodified piper_sdk: execution."""
 
 import json
+import signal
 import types
 
 import numpy as np
@@ -12,6 +13,7 @@ from lorasp_jax.serving.fake_piper.demonstrator import Demonstrator
 from lorasp_jax.serving.piper import session as sessions
 from lorasp_jax.serving.piper.asking import InThread
 from lorasp_jax.serving.piper.log import Log
+from lorasp_jax.serving.piper.options import stop_on_signals
 from lorasp_jax.serving.piper.session import PERIOD, Settings
 from tests.serving.benches import Bench
 from tests.serving.piper_runs import ARM_STEP, Run, Turning, assert_safe
@@ -150,6 +152,25 @@ def test_stop_brakes_and_holds_without_resting(bench):
     moved = bench.world.pose - start
     assert 0.1 < moved[0] < 0.25
     assert bench.fake.unsafe == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_brake_and_hold(bench, number):
+    handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
+    run = Run(bench, Turning())
+    run.at = {0.5: lambda: signal.raise_signal(number)}
+    start = bench.world.pose
+    try:
+        stop_on_signals(run.session)
+        assert run(30.0) is None
+    finally:
+        for each, handler in handlers.items():
+            signal.signal(each, handler)
+    assert run.session.stopped
+    assert bench.clock.now() < 3.0
+    bench.wait(0.5)
+    assert 0.1 < bench.world.pose[0] - start[0] < 0.25
+    assert_safe(run)
 
 
 def test_a_dry_run_sends_nothing(world):
