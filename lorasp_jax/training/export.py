@@ -118,8 +118,8 @@ def load_policy(
         The policy; `Policy.sample` takes indices into `processor.prompts.instructions`.
 
     Raises:
-        ValueError: the run is not finished, its files are corrupt, or the base is missing or
-            differs from the one used in training.
+        ValueError: there is no such folder, the run is not finished, its files are corrupt, or the
+            base is missing or differs from the one used in training.
     """
     folder = Path(folder)
     metadata, path, is_full = _read_metadata(folder)
@@ -149,13 +149,15 @@ def describe(folder: str | os.PathLike[str]) -> dict[str, Any]:
     """Return what a finished run recorded about its policy: robot, tasks, periods, processor.
 
     Raises:
-        ValueError: the run is not finished, or its files are corrupt.
+        ValueError: there is no such folder, the run is not finished, or its files are corrupt.
     """
     return _read_metadata(Path(folder))[0]
 
 
 def _read_metadata(folder: Path) -> tuple[dict[str, Any], Path, bool]:
     """Return a run's metadata, their file, and whether the run trained its base."""
+    if not folder.is_dir():
+        raise ValueError(f"there is no folder {folder}")
     is_full = (folder / BASE).is_dir()
     path = folder / BASE / TRAINING if is_full else folder / native.DESCRIPTION
     if not path.is_file():

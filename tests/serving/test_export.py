@@ -71,6 +71,7 @@ def test_refusals(run, tmp_path, capsys):
     for words, sentence in (
         ((run, "--out", tmp_path / "policy"), "already exists: choose another path"),
         ((tmp_path / "unfinished", "--out", tmp_path / "new"), "no run has finished there"),
+        ((tmp_path / "nowhere", "--out", tmp_path / "new"), f"is no folder {tmp_path / 'nowhere'}"),
         ((run, "--out", tmp_path / "new", "--max-batch", 0), "largest batch must be at least 1"),
         ((run, "--out", tmp_path / "new", "--num-steps", 0), "flow steps must be at least 1"),
     ):
