@@ -91,7 +91,8 @@ def test_only_servers_that_continue_chunks_are_told_how_far_the_arm_is(execution
     [
         (["--task", "juggle"], "unknown task 'juggle'"),
         (["--latency", "0.2"], "--latency must be 0 to 0.15 s"),
-        (["--episodes", "0"], "--episodes must be at least 1"),
+        (["--episodes", "0"], "--episodes must be at least 1, got 0"),
+        (["--thinking", "-1"], "--thinking must be at least 0 s, got -1.0"),
         (["--speed", "9"], "at most 3 rad/s, got 9.0"),
         (["--ahead", "5"], "ahead must be 0 to 4"),
     ],
@@ -113,7 +114,10 @@ def test_the_real_arm_needs_a_task_cameras_and_a_bus(server, film, capsys):
     assert "pass --task or --prompt" in capsys.readouterr().err
     words += ["--task", "press"]
     assert real(words) == 2
-    assert "cameras are needed for side, wrist: pass --camera side=" in capsys.readouterr().err
+    expected = "for side, wrist: pass --camera side=SOURCE --camera wrist=SOURCE, such as"
+    assert expected in capsys.readouterr().err
+    assert real([*words, "--camera", f"side={film}"]) == 2
+    assert "for side, wrist: pass --camera wrist=SOURCE, such as" in capsys.readouterr().err
     words += ["--camera", f"side={film}", "--camera", "wrist=/dev/video_nowhere"]
     assert real(words) == 2
     assert "cannot open camera wrist" in capsys.readouterr().err
@@ -122,6 +126,12 @@ def test_the_real_arm_needs_a_task_cameras_and_a_bus(server, film, capsys):
     assert "cannot open can_nowhere" in capsys.readouterr().err
     assert real([*words, "--camera", "side"]) == 2
     assert "--camera must be NAME=SOURCE" in capsys.readouterr().err
+
+
+def test_the_real_arm_is_not_on_a_virtual_bus(capsys):
+    with pytest.raises(SystemExit):
+        real(["--task", "press", "--bus", "virtual"])
+    assert "--bus: invalid choice: 'virtual'" in capsys.readouterr().err
 
 
 class LinkedArm(PiperArm):

@@ -72,8 +72,10 @@ def parser(program: str) -> argparse.ArgumentParser:
 def _run(options: argparse.Namespace, console: Console) -> None:
     if not 0 <= options.latency <= _LARGEST_LATENCY:
         raise ValueError(f"--latency must be 0 to {_LARGEST_LATENCY} s, got {options.latency}")
-    if options.episodes < 1 or options.thinking < 0:
-        raise ValueError("--episodes must be at least 1, and --thinking at least 0")
+    if options.episodes < 1:
+        raise ValueError(f"--episodes must be at least 1, got {options.episodes}")
+    if options.thinking < 0:
+        raise ValueError(f"--thinking must be at least 0 s, got {options.thinking}")
     shared.task(options.task)
     shared.limits(options)
     shared.settings(options, "")

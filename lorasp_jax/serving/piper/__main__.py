@@ -51,7 +51,8 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--image-size", type=int, default=224, help="of recorded pictures [px] (default: 224)")
     add = parser.add_argument_group("robot").add_argument
     add("--can", default="can0", help="CAN interface (default: %(default)s)")
-    add("--bus", default="socketcan", help="its kind: socketcan or slcan (default: %(default)s)")
+    add("--bus", choices=("socketcan", "slcan"), default="socketcan", help="its kind "
+        "(default: %(default)s)")  # fmt: skip
     add("--camera", action="append", default=[], metavar="NAME=SOURCE", help="such as "
         "side=/dev/video0; once for each of the policy's cameras")  # fmt: skip
     shared.add_shared(parser)
@@ -146,8 +147,10 @@ def _cameras(options: argparse.Namespace, server: shared.Server | None) -> OpenC
     sources = dict(_pair(text) for text in options.camera)
     needed = server.metadata.get("cameras", []) if server else list(sources)[:1] or ["side"]
     if missing := [name for name in needed if name not in sources]:
-        example = f"--camera {missing[0]}=/dev/video0"
-        raise ValueError(f"cameras are needed for {', '.join(needed)}: pass {example}")
+        examples = " ".join(f"--camera {name}=SOURCE" for name in missing)
+        raise ValueError(
+            f"cameras are needed for {', '.join(needed)}: pass {examples}, such as /dev/video0"
+        )
     return OpenCameras(sources)
 
 
