@@ -12,7 +12,7 @@ import asyncio
 import ssl
 import threading
 import time
-from collections.abc import Coroutine, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from typing import Any, Self, TypeVar
 
 from websockets.asyncio.client import ClientConnection, connect
@@ -23,6 +23,8 @@ from lorasp_jax.serving import wire
 T = TypeVar("T")
 RETRY_EVERY = 0.2
 """Time between attempts to connect [s]."""
+SILENCE = 3.0
+"""Time without a server after which a waiting client says so [s]; our choice."""
 
 
 class PolicyError(RuntimeError):
@@ -52,6 +54,7 @@ class PolicyClient:
         certificate: str = "",
         timeout: float = 10.0,
         wait: float = 0.0,
+        say: Callable[[str], None] = lambda _: None,
     ) -> None:
         """Connect to a server.
 
@@ -61,6 +64,7 @@ class PolicyClient:
             certificate: path of a PEM file to trust in addition to the system's certificates.
             timeout: how long to wait for the connection and for each reply [s].
             wait: how long to try again if there is no server yet [s].
+            say: called once, in another thread, with a sentence if that takes long.
 
         Raises:
             ServerGone: there is no server at this address, it requires another token, or its
@@ -82,7 +86,7 @@ class PolicyClient:
         self._thread.start()
         self._socket: ClientConnection | None = None
         try:
-            self._socket = self._run(self._connect(time.monotonic() + wait))
+            self._socket = self._run(self._connect(wait, say))
             self.metadata: dict[str, Any] = self._exchange(None, timeout)
         except BaseException:
             self.close()
@@ -138,14 +142,19 @@ class PolicyClient:
         """Run a coroutine in the connection's thread."""
         return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result()
 
-    async def _connect(self, deadline: float) -> ClientConnection:
-        """Connect, trying again until the deadline while the address refuses connections."""
+    async def _connect(self, wait: float, say: Callable[[str], None]) -> ClientConnection:
+        """Connect, trying again for some time while the address refuses connections."""
+        start, said = time.monotonic(), False
         while True:
             try:
                 return await connect(self.address, **self._options)
             except ConnectionRefusedError as error:
-                if time.monotonic() > deadline:
+                waited = time.monotonic() - start
+                if waited > wait:
                     raise ServerGone(f"no policy server at {self.address}: {error}") from error
+                if waited > SILENCE and not said:
+                    say(f"no server there yet: trying for up to {wait:g} s")
+                    said = True
                 await asyncio.sleep(RETRY_EVERY)
             except InvalidStatus as error:
                 code, body = error.response.status_code, error.response.body or b""

@@ -45,6 +45,14 @@ def test_waiting_for_a_server(free_port):
             assert client.metadata["action_dim"] == 7
 
 
+def test_a_waiting_client_says_so_once(free_port, monkeypatch):
+    monkeypatch.setattr("lorasp_jax.serving.client.SILENCE", 0.3)
+    said = []
+    with pytest.raises(ServerGone):
+        PolicyClient(f"ws://127.0.0.1:{free_port}", wait=1.5, say=said.append)
+    assert said == ["no server there yet: trying for up to 1.5 s"]
+
+
 def test_a_late_reply_is_never_taken_for_the_next_one():
     policy = StandIn()
     with serving(policy) as server, connect(server) as client:

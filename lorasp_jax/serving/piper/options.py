@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import functools
 import importlib
 import signal
 import time
@@ -134,6 +135,7 @@ def policy(options: argparse.Namespace) -> Iterator[Server]:
     """
     token = options.token_file.read_text().strip() if options.token_file else ""
     secret = {"token": token, "certificate": options.certificate}
-    print(f"connecting to {options.server}", flush=True)
-    with PolicyClient(options.server, wait=_WAIT, **secret) as client:
+    say = functools.partial(print, flush=True)
+    say(f"connecting to {options.server}")
+    with PolicyClient(options.server, wait=_WAIT, say=say, **secret) as client:
         yield Server(client)
