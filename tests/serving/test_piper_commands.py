@@ -73,6 +73,19 @@ def test_a_served_policy_on_the_fake_arm(server, tmp_path, capsys, monkeypatch, 
     assert server.policy.last_request.prompt
 
 
+@pytest.mark.parametrize(
+    ("known", "warned"),
+    [(press.TASK.instructions, False), (("pour it", "tip it"), True), ((), False)],
+)
+def test_a_policy_of_another_task_is_warned_of(known, warned, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(press, "TASK", dataclasses.replace(press.TASK, time_limit=0.1))
+    with serving(Still(dataclasses.replace(SPEC, instructions=known))) as server:
+        assert fake(["--server", server.address, "--log", str(tmp_path / "log")]) == 0
+    before = capsys.readouterr().out.partition("episode 0")[0]
+    expected = f"warning: the policy was not trained for {press.TASK.instructions[0]!r}, "
+    assert (expected in before) == ("warning" in before) == warned
+
+
 @pytest.mark.parametrize("execution", ["naive", "guided"])
 def test_only_servers_that_continue_chunks_are_told_how_far_the_arm_is(execution):
     policy = Still(dataclasses.replace(SPEC, execution=execution))
@@ -169,10 +182,14 @@ def test_the_real_command_with_an_arm_on_the_bus(server, linked, tmp_path, monke
     assert open_source(tmp_path / "data").num_steps >= 5
 
 
-def test_a_dry_run_of_the_real_command(server, linked, tmp_path, capsys):
-    words = ["--server", server.address, *linked, "--seconds", "0.5", "--dry-run"]
-    assert real([*words, "--log", str(tmp_path)]) == 0
-    assert "would command" in capsys.readouterr().out
+def test_a_dry_run_of_the_real_command(linked, tmp_path, capsys):
+    policy = Still(dataclasses.replace(SPEC, instructions=("pour it",)))
+    with serving(policy) as server:
+        words = ["--server", server.address, *linked, "--seconds", "0.5", "--dry-run"]
+        assert real([*words, "--log", str(tmp_path)]) == 0
+    before, command, _ = capsys.readouterr().out.partition("would command")
+    assert command
+    assert before.count("the policy was not trained for 'press the red button', but for") == 1
 
 
 def test_teaching_with_the_real_command(linked, tmp_path, monkeypatch, capsys):

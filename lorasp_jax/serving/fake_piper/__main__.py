@@ -85,6 +85,8 @@ def _run(options: argparse.Namespace, console: Console) -> None:
         size = (server and server.metadata.get("image_size")) or options.image_size
         world = World(options.task, image_size=size)
         world.reset(options.seed)
+        if server:
+            server.warn([options.prompt] if options.prompt else world.env.instructions)
         with _bench(options, world) as bench, _recorder(options, world, size) as recorder:
             bench.arm.connect()
             films = _episodes(options, bench, server, (log, recorder), console)

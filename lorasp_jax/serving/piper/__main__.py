@@ -74,6 +74,8 @@ def _run(options: argparse.Namespace) -> int:
         server = None if options.teach else stack.enter_context(shared.policy(options))
         cameras = _cameras(options, server)
         stack.callback(cameras.close)
+        if server:
+            server.warn([prompt])
         recorder = _recorder(options, task, prompt, stack)
         arm = _arm(options)
         stack.callback(arm.close)

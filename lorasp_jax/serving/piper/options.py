@@ -6,7 +6,7 @@ import functools
 import importlib
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +104,16 @@ class Server:
     def metadata(self) -> dict[str, Any]:
         """The server's description of its policy."""
         return self._client.metadata
+
+    def warn(self, prompts: Sequence[str]) -> None:
+        """Warn if a prompt is new to the policy, as far as the server says what is not."""
+        known = self.metadata.get("instructions")  # openpi's servers do not say it
+        if isinstance(known, list) and known and (new := [p for p in prompts if p not in known]):
+            print(
+                f"warning: the policy was not trained for {new[0]!r}, but for requests such as "
+                f"{known[0]!r}",
+                flush=True,
+            )
 
     def reset(self) -> None:
         """Begin an episode with the next question."""
