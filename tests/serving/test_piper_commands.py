@@ -73,6 +73,34 @@ def test_a_served_policy_on_the_fake_arm(server, tmp_path, capsys, monkeypatch, 
     assert server.policy.last_request.prompt
 
 
+class Leaving(Still):
+    """Refuses the request number `last`, from 0, after which the server closes the connection."""
+
+    def prepare(self, request, index):
+        if index[1] == self.last:
+            raise ValueError("the policy has left")
+        return super().prepare(request, index)
+
+
+@pytest.mark.parametrize(
+    ("last", "before"), [(1, "no episode was judged"), (4, "before, 0 of 2 succeeded (0% to 66%)")]
+)
+def test_a_server_that_leaves_ends_the_run(last, before, tmp_path, monkeypatch, capsys):
+    """An episode of 0.7 s asks twice."""
+    monkeypatch.setattr(press, "TASK", dataclasses.replace(press.TASK, time_limit=0.7))
+    policy = Leaving()
+    policy.last = last
+    words = ["--log", str(tmp_path / "log"), "--video", str(tmp_path / "film.mp4")]
+    with serving(policy) as server:
+        assert fake(["--server", server.address, "--episodes", "8", *words]) == 2
+    printed = capsys.readouterr()
+    episode = last // 2
+    assert f"stopped in episode {episode}, as the policy has left; {before}" in printed.err
+    assert printed.out.count(": failure") == episode
+    assert "succeeded" not in printed.out
+    assert (tmp_path / "film.mp4").stat().st_size > 1000
+
+
 @pytest.mark.parametrize(
     ("known", "warned"),
     [(press.TASK.instructions, False), (("pour it", "tip it"), True), ((), False)],

@@ -16,6 +16,7 @@ from envs.compilation import cache
 from envs.datasets.locks import locked
 from envs.rendering.video import side_by_side, write_video
 from lorasp_jax.evaluation.intervals import wilson_interval
+from lorasp_jax.serving.client import ServerGone
 from lorasp_jax.serving.fake_piper.demonstrator import Demonstrator
 from lorasp_jax.serving.fake_piper.firmware import PERIOD, FakePiper
 from lorasp_jax.serving.fake_piper.timing import Lockstep, RealTime
@@ -87,24 +88,28 @@ def _run(options: argparse.Namespace, console: Console) -> None:
         world.reset(options.seed)
         if server:
             server.warn([options.prompt] if options.prompt else world.env.instructions)
-        with _bench(options, world) as bench, _recorder(options, world, size) as recorder:
+        with (
+            _video(options.video) as film,
+            _bench(options, world) as bench,
+            _recorder(options, world, size) as recorder,
+        ):
             bench.arm.connect()
-            films = _episodes(options, bench, server, (log, recorder), console)
-    if options.video:
-        options.video.parent.mkdir(parents=True, exist_ok=True)
-        write_video(options.video, np.stack(films), _VIDEO_RATE)
+            _episodes(options, bench, server, (log, recorder, film), console)
 
 
 def _episodes(
     options: argparse.Namespace, bench: "Bench", server: Any, records: tuple, console: Console
-) -> list[np.ndarray]:
-    """Run and count episodes; return the pictures of a video."""
-    films, wins, (log, recorder) = [], 0, records
+) -> None:
+    """Run and count episodes.
+
+    Raises:
+        ServerGone: the connection to the server ended; an episode that it cut short is not counted.
+    """
+    wins, (log, recorder, film) = 0, records
     for episode in range(options.episodes):
         bench.reset(options.seed + episode)
         log.line(bench.clock.now(), episode=episode)
         session = _session(options, bench, server, options.seed + episode, records, console)
-        film = films if options.video else None
         world = bench.fake.world
         problem = session.run(world.env.task.time_limit, _judge(world, film))
         wins += world.success
@@ -112,13 +117,31 @@ def _episodes(
             recorder.keep()
         elif recorder:
             recorder.discard()
+        if server and server.ended and not (world.success or session.stopped):
+            before = f"before, {_result(wins, episode)}" if episode else "no episode was judged"
+            raise ServerGone(f"stopped in episode {episode}, as {server.ended}; {before}")
         outcome = "success" if world.success else f"failure: {problem}" if problem else "failure"
         console.print(f"episode {episode}: {outcome}", markup=False, highlight=False)
         if session.stopped:
             raise KeyboardInterrupt
-    low, high = wilson_interval(wins, options.episodes)
-    console.print(f"{wins} of {options.episodes} succeeded ({low:.0%} to {high:.0%})")
-    return films
+    console.print(_result(wins, options.episodes))
+
+
+def _result(wins: int, episodes: int) -> str:
+    low, high = wilson_interval(wins, episodes)
+    return f"{wins} of {episodes} succeeded ({low:.0%} to {high:.0%})"
+
+
+@contextmanager
+def _video(path: Path | None) -> Iterator[list[np.ndarray] | None]:
+    """Collect pictures, and write what there is of them however the episodes end."""
+    film: list[np.ndarray] = []
+    try:
+        yield film if path else None
+    finally:
+        if path and film:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_video(path, np.stack(film), _VIDEO_RATE)
 
 
 def _session(
@@ -137,7 +160,7 @@ def _session(
     ask = server or Demonstrator(world, clock, seed)
     asker = InThread(ask) if options.realtime else InTurn(ask, clock, options.thinking)
     settings = shared.settings(options, world.instruction)
-    log, recorder = records
+    log, recorder, _ = records
     if recorder:
         recorder.say(settings.prompt)
     more = {"log": log, "recorder": recorder, "say": console.print}

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from envs import names
-from lorasp_jax.serving.client import PolicyClient, PolicyError
+from lorasp_jax.serving.client import PolicyClient, PolicyError, ServerGone
 from lorasp_jax.serving.pictures import to_square
 from lorasp_jax.serving.piper.asking import Observation
 from lorasp_jax.serving.piper.log import Log
@@ -91,11 +91,16 @@ def stop_on_signals(session: Session | Lesson) -> None:
 
 
 class Server:
-    """A policy server as the function that a session asks."""
+    """A policy server as the function that a session asks.
+
+    Attributes:
+        ended: why the connection has ended, in a sentence; None while it has not.
+    """
 
     def __init__(self, client: PolicyClient) -> None:
         """Wrap a connection."""
         self._client = client
+        self.ended: str | None = None
         self._size = client.metadata.get("image_size")
         continues = client.metadata.get("execution", "naive") != "naive"
         self._unknown = () if continues else _CONTINUATION
@@ -129,7 +134,11 @@ class Server:
         if isinstance(self._size, int) and self._size > 0:
             pictures = {name: to_square(name, x, self._size) for name, x in pictures.items()}
         known = {key: x for key, x in observation.items() if key not in self._unknown}
-        reply = self._client.infer({**known, "image": pictures})
+        try:
+            reply = self._client.infer({**known, "image": pictures})
+        except (ServerGone, PolicyError) as error:
+            self.ended = self.ended or str(error)
+            raise
         if "actions" not in reply:
             raise PolicyError(f"the server's reply has no actions, only {', '.join(reply)}")
         return reply["actions"]
