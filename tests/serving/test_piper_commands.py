@@ -114,6 +114,18 @@ def test_a_policy_of_another_task_is_warned_of(known, warned, monkeypatch, tmp_p
     assert (expected in before) == ("warning" in before) == warned
 
 
+def test_an_adapter_of_the_server_can_be_chosen():
+    policy = Still(adapters=("a", "b"))
+    state, picture = np.zeros(7, np.float32), np.zeros((48, 64, 3), np.uint8)
+    question = {"image": {"side": picture, "wrist": picture}, "state": state, "prompt": "go"}
+    with serving(policy) as server, PolicyClient(server.address) as client:
+        options.Server(client)(question)
+        options.Server(client, "b")(question)
+        with pytest.raises(ValueError, match="the server has no adapter 'c', but a, b"):
+            options.Server(client, "c")
+    assert [name for name, _ in policy.batches] == ["a", "b"]
+
+
 @pytest.mark.parametrize("execution", ["naive", "guided"])
 def test_only_servers_that_continue_chunks_are_told_how_far_the_arm_is(execution):
     policy = Still(dataclasses.replace(SPEC, execution=execution))

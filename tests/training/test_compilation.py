@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+from envs.compilation import fast_cpu
 from lorasp_jax.training import compilation, loop
 from tests.runs import make_run
 
@@ -25,6 +26,11 @@ def test_they_are_for_gpus_alone(on_gpu, monkeypatch):
     assert on_gpu["xla_gpu_enable_triton_gemm"] is False
     monkeypatch.undo()
     assert not any("gpu" in name for name in compilation.step_options(1) or {})
+
+
+def test_on_a_cpu_they_leave_out_those_for_simulation(monkeypatch):
+    monkeypatch.setattr(fast_cpu, "without_simulation", lambda: {"a": True})
+    assert compilation.step_options(1) == {"a": True}
 
 
 def test_only_one_gpu_runs_without_the_scheduler_that_hides_transfers(on_gpu):

@@ -3,13 +3,11 @@
 import dataclasses
 import os
 import signal
-from unittest.mock import Mock
 
 import jax
 import numpy as np
 import pytest
 
-from envs.compilation import fast_cpu
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.training.loop import RunError, train
 from lorasp_jax.training.run import Callback
@@ -89,14 +87,6 @@ def test_signal_handlers_are_restored(tmp_path):
     assert second["size"] == last["size"] != first["size"] > 0
     assert signal.getsignal(signal.SIGTERM) == before
     assert jax.device_count() == 8
-
-
-def test_steps_are_compiled_without_options_for_simulation(monkeypatch):
-    jitted, options = Mock(), Mock()
-    monkeypatch.setattr(fast_cpu, "without_simulation", options)
-    Stepper(jitted, None, Mock(), Mock()).compile(Mock(), 3).result()
-    compiled = jitted.lower.return_value.compile
-    compiled.assert_called_once_with(compiler_options=options.return_value)
 
 
 @pytest.mark.slow

@@ -31,6 +31,8 @@ def add_shared(parser: argparse.ArgumentParser) -> None:
     add("--server", default="ws://127.0.0.1:8000", help="address (default: %(default)s)")
     add("--token-file", type=Path, metavar="FILE", help="file with the server's token")
     add("--certificate", default="", metavar="FILE", help="PEM file to trust, for wss://")
+    add("--adapter", default="", metavar="NAME", help="one of the server's adapters; default: its "
+        "first")  # fmt: skip
     add("--prompt", default="", help="the request in words; default: one of the task's")
     add = parser.add_argument_group("execution").add_argument
     add("--execute", type=int, default=5, help="actions of each chunk (default: %(default)s)")
@@ -97,8 +99,13 @@ class Server:
         ended: why the connection has ended, in a sentence; None while it has not.
     """
 
-    def __init__(self, client: PolicyClient) -> None:
-        """Wrap a connection."""
+    def __init__(self, client: PolicyClient, adapter: str = "") -> None:
+        """Wrap a connection; raise ValueError if the server has no adapter of this name."""
+        known = client.metadata.get("adapters", [])  # openpi's servers do not choose
+        if adapter and adapter not in known:
+            there = ", ".join(map(str, known)) or "none to choose from"
+            raise ValueError(f"the server has no adapter {adapter!r}, but {there}")
+        self._choice = {"adapter": adapter} if adapter else {}
         self._client = client
         self.ended: str | None = None
         self._size = client.metadata.get("image_size")
@@ -135,7 +142,7 @@ class Server:
             pictures = {name: to_square(name, x, self._size) for name, x in pictures.items()}
         known = {key: x for key, x in observation.items() if key not in self._unknown}
         try:
-            reply = self._client.infer({**known, "image": pictures})
+            reply = self._client.infer({**known, **self._choice, "image": pictures})
         except (ServerGone, PolicyError) as error:
             self.ended = self.ended or str(error)
             raise
@@ -157,4 +164,4 @@ def policy(options: argparse.Namespace) -> Iterator[Server]:
     say = functools.partial(print, flush=True)
     say(f"connecting to {options.server}")
     with PolicyClient(options.server, wait=_WAIT, say=say, **secret) as client:
-        yield Server(client)
+        yield Server(client, options.adapter)
