@@ -47,6 +47,12 @@ def peak() -> float | None:
     return next((value for name, value in PEAK.items() if kind.startswith(name)), None)
 
 
+def bodies(equation: Any) -> list[Any]:
+    """Return the jaxprs among the parameters of an equation, such as the body of a loop."""
+    values = [getattr(value, "jaxpr", value) for value in equation.params.values()]
+    return [value for value in values if hasattr(value, "eqns")]
+
+
 def _jaxpr_flops(jaxpr: Any) -> float:
     return sum(_equation_flops(equation) for equation in jaxpr.eqns)
 
@@ -73,6 +79,5 @@ def _equation_flops(equation: Any) -> float:
         return max(_jaxpr_flops(branch.jaxpr) for branch in params["branches"])
     if name == "while":  # the number of iterations is unknown: count one
         return _jaxpr_flops(params["body_jaxpr"].jaxpr)
-    inner = [getattr(value, "jaxpr", value) for value in params.values()]
-    once = sum(_jaxpr_flops(jaxpr) for jaxpr in inner if hasattr(jaxpr, "eqns"))
+    once = sum(map(_jaxpr_flops, bodies(equation)))
     return once * (params["length"] if name == "scan" else 1)

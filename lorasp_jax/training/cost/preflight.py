@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from flax import nnx
 
 from lorasp_jax.adapters import adaptation
@@ -122,11 +123,14 @@ def estimate_memory(config: Config, backbone: BackboneConfig) -> Memory:
 
     init = functools.partial(init_state, optimizer=optimizer, ema=config.optim.ema > 0)
 
-    def vjp(adapters: Any, frozen: Any, batch: Batch) -> Any:
-        return jax.vjp(lambda a: step.loss(a, frozen, batch), adapters, has_aux=True)[1]
+    def passes(adapters: Any, frozen: Any, batch: Batch) -> Any:
+        loss, vjp, _ = jax.vjp(lambda a: step.loss(a, frozen, batch), adapters, has_aux=True)
+        return vjp, None if backbone.remat == "none" else vjp(jnp.ones_like(loss))
 
-    jaxpr = jax.make_jaxpr(vjp)(step.adapters, step.frozen, step.batch).jaxpr
-    residuals = {id(v): v.aval for v in jaxpr.outvars}
+    arrays = step.adapters, step.frozen, step.batch
+    closed, (saved, _) = jax.make_jaxpr(passes, return_shape=True)(*arrays)
+    jaxpr = closed.jaxpr
+    residuals = {id(v): v.aval for v in jaxpr.outvars[: len(jax.tree.leaves(saved))]}
     for variable in (*jaxpr.invars, *jaxpr.constvars):  # inputs are counted separately
         residuals.pop(id(variable), None)
     local_bytes = functools.partial(meshes.bytes_on_device, fsdp=config.fsdp)
@@ -138,14 +142,8 @@ def estimate_memory(config: Config, backbone: BackboneConfig) -> Memory:
         optimizer=local_bytes(jax.eval_shape(init, step.adapters)) - adapters,
         activations=nbytes(list(residuals.values()))
         + nbytes(abstract_batch(backbone, local_batch)),
-        recomputation=0 if backbone.remat == "none" else _recomputation(step),
+        recomputation=working_set.largest(jaxpr),
     )
-
-
-def _recomputation(step: AbstractStep) -> int:
-    """Return the bytes that recomputing a layer takes, the largest of all layers."""
-    gradient = jax.grad(step.loss, has_aux=True)
-    return working_set.largest(jax.make_jaxpr(gradient)(step.adapters, step.frozen, step.batch))
 
 
 def adapted_model(config: Config, backbone: BackboneConfig, key: jax.Array) -> Backbone:

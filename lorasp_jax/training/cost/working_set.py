@@ -12,6 +12,8 @@ import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
+from lorasp_jax.training.cost.flops import bodies
+
 _STORING = {
     "concatenate",
     "cond",
@@ -37,12 +39,12 @@ class _Operation(NamedTuple):
     outputs: list[int]
 
 
-def largest(gradient: Any) -> int:
+def largest(jaxpr: Any) -> int:
     """Return the most bytes that a layer takes to recompute, from the jaxpr of a gradient.
 
-    The jaxpr is closed, as from `jax.make_jaxpr`. Without rematerialization, the result is 0.
+    Without rematerialization, the result is 0.
     """
-    return max(map(_peak, _recomputed(gradient.jaxpr)), default=0)
+    return max(map(_peak, _recomputed(jaxpr)), default=0)
 
 
 def _recomputed(jaxpr: Any) -> Iterator[Any]:
@@ -51,14 +53,8 @@ def _recomputed(jaxpr: Any) -> Iterator[Any]:
         if equation.params.get("differentiated"):
             yield equation.params["jaxpr"]
         else:
-            for inner in _bodies(equation):
+            for inner in bodies(equation):
                 yield from _recomputed(inner)
-
-
-def _bodies(equation: Any) -> list[Any]:
-    """Return the jaxprs of an equation."""
-    values = [getattr(value, "jaxpr", value) for value in equation.params.values()]
-    return [value for value in values if hasattr(value, "eqns")]
 
 
 def _peak(jaxpr: Any) -> int:
@@ -93,12 +89,12 @@ def _accumulated(operations: Sequence[_Operation]) -> set[int]:
     }
 
 
-def _is_called(equation: Any, bodies: Sequence[Any]) -> bool:
+def _is_called(equation: Any, inner: Sequence[Any]) -> bool:
     """Return whether an equation passes its operands to one jaxpr and returns its results."""
-    if len(bodies) != 1:
+    if len(inner) != 1:
         return False
-    pairs = (equation.invars, bodies[0].invars), (equation.outvars, bodies[0].outvars)
-    return all(len(outer) == len(inner) for outer, inner in pairs)
+    pairs = (equation.invars, inner[0].invars), (equation.outvars, inner[0].outvars)
+    return all(len(outside) == len(inside) for outside, inside in pairs)
 
 
 def _flatten(jaxpr: Any) -> tuple[list[int], list[_Operation], set[int]]:
@@ -119,9 +115,9 @@ def _flatten(jaxpr: Any) -> tuple[list[int], list[_Operation], set[int]]:
             return [None if hasattr(atom, "val") else values[atom] for atom in atoms]  # literals
 
         for equation in jaxpr.eqns:
-            name, inputs, bodies = equation.primitive.name, read(equation.invars), _bodies(equation)
-            if name not in _STORING and _is_called(equation, bodies):
-                outputs = visit(bodies[0], inputs)
+            name, inputs, inner = equation.primitive.name, read(equation.invars), bodies(equation)
+            if name not in _STORING and _is_called(equation, inner):
+                outputs = visit(inner[0], inputs)
             else:
                 outputs = [new(variable) for variable in equation.outvars]
                 known = [value for value in inputs if value is not None]
