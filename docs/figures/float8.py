@@ -5,24 +5,16 @@ Reads docs/float8.json, writes float8.svg next to this file.
 
 import json
 from pathlib import Path
-from typing import Any
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
+
+from lorasp_jax.evaluation.figure_style import STYLE
 
 HERE = Path(__file__).parent
 COLORS = {"bf16": "#4269d0", "float8": "#ff725c"}
 SKIPPED = 20
 """The first 1/20 of the steps is not shown; the loss falls too fast there."""
-STYLE: Any = {
-    "font.size": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.alpha": 0.25,
-    "svg.fonttype": "path",
-    "svg.hashsalt": "lorasp_jax",
-}
 
 
 @mpl.rc_context(STYLE)

@@ -7,18 +7,12 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
+from lorasp_jax.evaluation.figure_style import STYLE
+
 COLORS = {"vision": "#4269d0", "language": "#efb118", "action": "#3ca951", "before": "#9498a0"}
 """Color of each tower in every figure; results before training are gray."""
 
-_STYLE: Any = {
-    "font.size": 10,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.alpha": 0.25,
-    "svg.fonttype": "path",
-    "svg.hashsalt": "lorasp_jax",
-}
+_STYLE = STYLE | {"font.size": 10}
 
 _BARS = {"before": (-0.18, "before"), "after": (0.18, "vision")}
 """Offset of each bar, and key of its color in `COLORS`."""

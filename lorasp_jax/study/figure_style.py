@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from lorasp_jax.evaluation.figure_style import STYLE
 from lorasp_jax.study.book import Book
 
 INKS = {"light": "#1f2328", "dark": "#e6edf3"}
@@ -28,12 +29,11 @@ def svgs(draw: Callable[[Book], Figure], book: Book) -> dict[str, str]:
     """
     ink = INKS["light"]
     style: Any = {
+        **STYLE,
         **{f"{name}.color": ink for name in ("text", "xtick", "ytick", "lines")},
         **{"axes.labelcolor": ink, "axes.titlecolor": ink, "axes.edgecolor": SOFT},
-        **{"axes.spines.top": False, "axes.spines.right": False, "font.size": 9},
-        **{"axes.titlesize": 10, "axes.grid": True, "grid.alpha": 0.25, "grid.color": SOFT},
+        **{"axes.titlesize": 10, "grid.color": SOFT},
         **{"axes.facecolor": "none", "legend.frameon": False},
-        **{"svg.fonttype": "path", "svg.hashsalt": "lorasp_jax"},
     }
     buffer = io.StringIO()
     with mpl.rc_context(style):

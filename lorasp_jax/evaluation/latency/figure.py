@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from envs.datasets.writing import atomic_file
+from lorasp_jax.evaluation.figure_style import STYLE
 from lorasp_jax.evaluation.intervals import wilson_interval
 
 COLORS = {
@@ -23,18 +24,9 @@ ROWS = {
     "action_delta": "action delta [rad]",
     "jerk": "jerk [rad/s³]",
 }
-_STYLE: Any = {
-    "font.size": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.alpha": 0.25,
-    "svg.fonttype": "path",
-    "svg.hashsalt": "lorasp_jax",
-}
 
 
-@mpl.rc_context(_STYLE)
+@mpl.rc_context(STYLE)
 def write(path: Path, runs: Sequence[tuple[str, dict[str, Any]]]) -> None:
     """Draw success and smoothness, averaged over tasks, and write them as SVG.
 
