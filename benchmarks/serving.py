@@ -37,6 +37,7 @@ class Waiting:
     def __init__(self, image_size: int, cameras: int, seconds: float) -> None:
         names = tuple(f"camera{i}" for i in range(cameras))
         self.spec, self._seconds = PolicySpec(names, image_size, 7, 50), seconds
+        self.instructions = {"base": self.spec.instructions}
 
     def prepare(self, request: Request, index: tuple[int, int]) -> np.ndarray:
         """Return the state."""

@@ -12,7 +12,7 @@ import asyncio
 import queue
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -41,6 +41,11 @@ class BatchPolicy(Protocol):
     @property
     def adapters(self) -> tuple[str, ...]:
         """Names of the adapters that a request may choose; the first is the default."""
+        ...
+
+    @property
+    def instructions(self) -> Mapping[str, Sequence[str]]:
+        """The instructions that each adapter was trained with."""
         ...
 
     @property

@@ -52,6 +52,11 @@ class ExportedPolicies:
         """Names of the policies; the first is the default."""
         return tuple(self._policies)
 
+    @property
+    def instructions(self) -> dict[str, tuple[str, ...]]:
+        """The instructions that each policy was trained with."""
+        return {name: spec.instructions for name, spec in self._specs.items()}
+
     def warm_up(self, progress: Callable[[str, int], None] = lambda *_: None) -> None:
         """Compile and run every program; `progress` is told of each before it starts."""
         picture = np.zeros((self.spec.image_size, self.spec.image_size, 3), np.uint8)

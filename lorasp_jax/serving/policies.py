@@ -98,6 +98,11 @@ class CompiledPolicies:
         """Names of the policies; the first is the default."""
         return tuple(self._policies)
 
+    @property
+    def instructions(self) -> dict[str, tuple[str, ...]]:
+        """The instructions that each policy was trained with."""
+        return {name: spec.instructions for name, spec in self._specs.items()}
+
     def warm_up(self, progress: Callable[[str, int], None] = lambda *_: None) -> None:
         """Compile and run every program; `progress` is told of each before it starts."""
         spec = self.spec

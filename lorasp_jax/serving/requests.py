@@ -150,7 +150,7 @@ def choose_prompt(request: Request, default: str, spec: PolicySpec) -> str:
 
 
 def common_spec(specs: Mapping[str, PolicySpec]) -> PolicySpec:
-    """Return the spec of all policies, with the instructions of each.
+    """Return what all policies need, without their instructions.
 
     Raises:
         ValueError: they need different observations.
@@ -163,8 +163,7 @@ def common_spec(specs: Mapping[str, PolicySpec]) -> PolicySpec:
                 raise ValueError(
                     f"{first} and {name} cannot be served together: their {key} is {a} and {b}"
                 )
-    instructions = dict.fromkeys(text for spec in specs.values() for text in spec.instructions)
-    return dataclasses.replace(expected, instructions=tuple(instructions))
+    return dataclasses.replace(expected, instructions=())
 
 
 def parse(message: Any, spec: PolicySpec) -> Request:

@@ -188,7 +188,7 @@ def describe(policy: BatchPolicy) -> dict[str, Any]:
         "action_dim": spec.state_dim,
         "action_horizon": spec.chunk,
         "adapters": list(policy.adapters),
-        "instructions": list(spec.instructions),
+        "instructions": {name: list(texts) for name, texts in policy.instructions.items()},
         "execution": spec.execution,
     }
 

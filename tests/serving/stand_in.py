@@ -24,6 +24,7 @@ class StandIn:
 
     def __init__(self, spec=SPEC, *, sizes=(1, 2, 4, 8), seconds=0.0, adapters=("base",)):
         self.spec, self.sizes, self.seconds, self.adapters = spec, sizes, seconds, adapters
+        self.instructions = dict.fromkeys(adapters, spec.instructions)
         self.gate, self.failure = threading.Event(), None
         self.batches, self.indices = [], []
         self.gate.set()

@@ -39,6 +39,7 @@ def test_actions_are_those_of_the_compiled_policies(policies):
     served = ExportedPolicies(policies, seed=3)
     expected = compiled({"base": make_policy(), "other": make_policy(seed=1)}, seed=3)
     assert served.spec == expected.spec
+    assert served.instructions == expected.instructions
     assert (served.adapters, served.sizes) == (("base", "other"), (1,))
     sent = request(served.spec, absent=["wrist"])
     for adapter in served.adapters:

@@ -114,6 +114,16 @@ def test_a_policy_of_another_task_is_warned_of(known, warned, monkeypatch, tmp_p
     assert (expected in before) == ("warning" in before) == warned
 
 
+@pytest.mark.parametrize("adapter", ["", "pour", "press"])
+def test_an_adapter_of_another_task_is_warned_of(adapter, capsys):
+    policy = Still(adapters=("pour", "press"))
+    policy.instructions = {"pour": ("pour it", "tip it"), "press": ("press it",)}
+    with serving(policy) as server, PolicyClient(server.address) as client:
+        options.Server(client, adapter).warn(["tip it", "press it"])
+    new, known = ("tip it", "press it") if adapter == "press" else ("press it", "pour it")
+    assert f"not trained for {new!r}, but for requests such as {known!r}" in capsys.readouterr().out
+
+
 def test_an_adapter_of_the_server_can_be_chosen():
     policy = Still(adapters=("a", "b"))
     state, picture = np.zeros(7, np.float32), np.zeros((48, 64, 3), np.uint8)

@@ -74,6 +74,12 @@ def test_actions_are_those_of_the_policy(served):
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
+def test_each_policy_has_its_own_instructions():
+    known = {"a": ("open the pot",), "b": INSTRUCTIONS}
+    policies = {name: make_policy(instructions=texts) for name, texts in known.items()}
+    assert compiled(policies).instructions == known
+
+
 def test_a_row_does_not_depend_on_the_others_of_its_batch(served):
     a, b = request(served.spec, 0), request(served.spec, 1, prompt=INSTRUCTIONS[0])
     together = actions(served, a, b)

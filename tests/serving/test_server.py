@@ -39,6 +39,7 @@ def test_the_server_speaks_first(server):
         assert client.metadata["cameras"] == ["side", "wrist"]
         assert (client.metadata["action_horizon"], client.metadata["action_dim"]) == (10, 7)
         assert client.metadata["adapters"] == ["base", "pour"]
+        assert client.metadata["instructions"] == {"base": [], "pour": []}
 
 
 def test_replies(server):

@@ -106,6 +106,9 @@ class Server:
             there = ", ".join(map(str, known)) or "none to choose from"
             raise ValueError(f"the server has no adapter {adapter!r}, but {there}")
         self._choice = {"adapter": adapter} if adapter else {}
+        trained = client.metadata.get("instructions")  # openpi's servers do not say it
+        answering = adapter or next(iter(known), "")
+        self._instructions = trained.get(answering, []) if isinstance(trained, dict) else []
         self._client = client
         self.ended: str | None = None
         self._size = client.metadata.get("image_size")
@@ -119,8 +122,8 @@ class Server:
 
     def warn(self, prompts: Sequence[str]) -> None:
         """Warn if a prompt is new to the policy, as far as the server says what is not."""
-        known = self.metadata.get("instructions")  # openpi's servers do not say it
-        if isinstance(known, list) and known and (new := [p for p in prompts if p not in known]):
+        known = self._instructions
+        if known and (new := [p for p in prompts if p not in known]):
             print(
                 f"warning: the policy was not trained for {new[0]!r}, but for requests such as "
                 f"{known[0]!r}",
