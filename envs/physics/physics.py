@@ -77,7 +77,8 @@ class Physics:
             ValueError: the backend is unknown or not installed.
         """
         _check_backend(backend)
-        self.model, self.backend = model, backend
+        self.model: mujoco.MjModel = model
+        self.backend: str = backend
         mjx = _mjx()
         device = jax.local_devices()[0]  # MJX's default is the first device of all processes
         self._model = mjx.put_model(model, impl="jax", device=device)

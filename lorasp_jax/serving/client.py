@@ -70,7 +70,8 @@ class PolicyClient:
             ServerGone: there is no server at this address, it requires another token, or its
                 certificate is not trusted.
         """
-        self.address, self._timeout, self._reset = address, timeout, False
+        self.address: str = address
+        self._timeout, self._reset = timeout, False
         context = ssl.create_default_context(cafile=certificate or None)
         self._options: dict[str, Any] = {
             "additional_headers": {"Authorization": f"Api-Key {token}"} if token else {},

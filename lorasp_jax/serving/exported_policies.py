@@ -39,12 +39,12 @@ class ExportedPolicies:
         """
         self._policies = dict(policies)
         self._specs = {name: _spec(policy) for name, policy in policies.items()}
-        self.spec = dataclasses.replace(common_spec(self._specs), execution=execution)
-        self.metadata = _common_metadata(policies)
+        self.spec: PolicySpec = dataclasses.replace(common_spec(self._specs), execution=execution)
+        self.metadata: dict[str, Any] = _common_metadata(policies)
         _check_execution(policies, execution)
         self._prompt, key = prompt, jax.random.key(seed)
         sizes = [set(policy.description.batch_sizes) for policy in policies.values()]
-        self.sizes = tuple(sorted(set.intersection(*sizes)))
+        self.sizes: tuple[int, ...] = tuple(sorted(set.intersection(*sizes)))
         self._noise = jax.jit(functools.partial(draw, key), static_argnames="shape")
 
     @property

@@ -83,7 +83,7 @@ class CompiledPolicies:
             ValueError: the policies need different observations.
         """
         self._specs = {name: spec_of(policy) for name, policy in policies.items()}
-        self.spec = dataclasses.replace(common_spec(self._specs), execution=execution)
+        self.spec: PolicySpec = dataclasses.replace(common_spec(self._specs), execution=execution)
         self._guidance = np.float32(guidance) if execution == "guided" else None
         self._prompt, self._key, self._num_steps = prompt, jax.random.key(seed), num_steps
         self._tables = {name: policy.processor.prompts for name, policy in policies.items()}
@@ -91,7 +91,7 @@ class CompiledPolicies:
         self._words = dict(words)
         self._tokens = functools.lru_cache(CACHED_PROMPTS)(self._tokenize)
         self._sample = jax.jit(_sample, static_argnames=("num_steps", "continues"))
-        self.sizes = batch_sizes(max_batch)
+        self.sizes: tuple[int, ...] = batch_sizes(max_batch)
 
     @property
     def adapters(self) -> tuple[str, ...]:

@@ -50,7 +50,7 @@ class PolicyServer:
             metadata: more entries for the metadata frame.
             token: if not empty, clients must send it in the header "Authorization: Api-Key TOKEN".
         """
-        self.metrics = Metrics()
+        self.metrics: Metrics = Metrics()
         self._policy, self._token = policy, token
         self._batcher = Batcher(policy, self.metrics, _log_failure)
         self._metadata = wire.pack(describe(policy) | dict(metadata or {}))

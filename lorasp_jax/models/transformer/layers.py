@@ -38,7 +38,7 @@ class RMSNorm(nnx.Module):
         offset: float = 1.0,
         param_dtype: Any = jnp.float32,
     ) -> None:
-        self.scale = nnx.Param(jnp.full((width,), 1 - offset, param_dtype))
+        self.scale: nnx.Param[jax.Array] = nnx.Param(jnp.full((width,), 1 - offset, param_dtype))
         self.eps = eps
         self.offset = offset
 
@@ -102,8 +102,8 @@ class LayerNorm(nnx.Module):
     """(x - mean) / sqrt(variance + eps) * scale + bias, computed in fp32, returned in x's dtype."""
 
     def __init__(self, width: int, *, eps: float = 1e-6, param_dtype: Any = jnp.float32) -> None:
-        self.scale = nnx.Param(jnp.ones((width,), param_dtype))
-        self.bias = nnx.Param(jnp.zeros((width,), param_dtype))
+        self.scale: nnx.Param[jax.Array] = nnx.Param(jnp.ones((width,), param_dtype))
+        self.bias: nnx.Param[jax.Array] = nnx.Param(jnp.zeros((width,), param_dtype))
         self.eps = eps
 
     def __call__(self, x: jax.Array) -> jax.Array:

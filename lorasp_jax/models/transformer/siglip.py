@@ -18,13 +18,13 @@ class VisionBlock(nnx.Module):
     def __init__(self, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
         width, mlp = config.vision.width, config.vision.mlp
         options = {"dtype": config.dtype, "param_dtype": config.param_dtype, "rngs": rngs}
-        self.heads = config.vision.heads
-        self.layer_norm1 = LayerNorm(width, param_dtype=config.param_dtype)
+        self.heads: int = config.vision.heads
+        self.layer_norm1: LayerNorm = LayerNorm(width, param_dtype=config.param_dtype)
         self.q_proj: Layer = Dense(width, width, **options)
         self.k_proj: Layer = Dense(width, width, **options)
         self.v_proj: Layer = Dense(width, width, **options)
         self.out_proj: Layer = Dense(width, width, **options)
-        self.layer_norm2 = LayerNorm(width, param_dtype=config.param_dtype)
+        self.layer_norm2: LayerNorm = LayerNorm(width, param_dtype=config.param_dtype)
         self.fc1: Layer = Dense(width, mlp, **options)
         self.fc2: Layer = Dense(mlp, width, **options)
 

@@ -57,7 +57,7 @@ class World:
         Raises:
             ValueError: the task is unknown.
         """
-        self.env = envs.make(task, robot="piper", num_envs=1, image_size=image_size)
+        self.env: envs.Env = envs.make(task, robot="piper", num_envs=1, image_size=image_size)
         self._physics = physics or Physics()
         self._render = jax.jit(self.env.render)
         self._check = jax.jit(functools.partial(_check, self.env))
