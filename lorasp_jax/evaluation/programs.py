@@ -81,7 +81,7 @@ class Worlds:
         prompts = rows[np.asarray(self.state.info["instruction"])]
         self._prompts = jax.device_put(prompts, self._place)
 
-    def predict(self, call: int, *, denoise_steps: int, **previous: Any) -> tuple[jax.Array, tuple]:
+    def predict(self, call: int, *, denoise_steps: int, **previous: Any) -> tuple[jax.Array, Any]:
         """Observe the worlds and sample a chunk in each; see `rollout.predict`."""
         observation, done = _observe(self._env, self.state), self.state.done
         inputs = (self._sample_key, np.int32(call), observation, self._prompts, done)

@@ -11,14 +11,14 @@ MASKED = -1e38
 LOG2_E = math.log2(math.e)
 
 
-def load(ref: Any, at: tuple, exist: jax.Array | None) -> jax.Array:
+def load(ref: Any, at: tuple[Any, ...], exist: jax.Array | None) -> jax.Array:
     """Load the elements at an index; those that do not exist are 0. None: all exist."""
     from jax.experimental.pallas import triton  # absent from builds without NVIDIA support
 
     return triton.load(ref.at[at], mask=exist, other=None if exist is None else 0)
 
 
-def store(ref: Any, at: tuple, values: jax.Array, exist: jax.Array | None) -> None:
+def store(ref: Any, at: tuple[Any, ...], values: jax.Array, exist: jax.Array | None) -> None:
     """Store values that exist, in the dtype of the array. None: all exist."""
     from jax.experimental.pallas import triton
 

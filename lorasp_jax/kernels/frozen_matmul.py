@@ -33,9 +33,13 @@ MIN_WIDTH, MIN_PRODUCTS = 1024, 2**34
 """Least columns of the result, and least multiplications T I O, for a product in float8."""
 
 
-@jax.custom_vjp
 def frozen_matmul(x: jax.Array, kernel: Kernel) -> jax.Array:
     """Compute x W, [..., O], in the dtype of x [..., I]. W [I, O] receives no gradient."""
+    return _frozen_matmul(x, kernel)
+
+
+@jax.custom_vjp
+def _frozen_matmul(x: jax.Array, kernel: Kernel) -> jax.Array:
     return matmul(x, kernel)
 
 
@@ -93,4 +97,4 @@ def _backward(kernel: Kernel, g: jax.Array) -> tuple[jax.Array, None]:
     return matmul_transposed(g, kernel), None
 
 
-frozen_matmul.defvjp(_forward, _backward)
+_frozen_matmul.defvjp(_forward, _backward)

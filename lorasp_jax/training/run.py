@@ -45,7 +45,7 @@ class Run:
     streams: bool = False
     devices: Sequence[Any] | None = None
     simulated: bool = True
-    programs: dict[Any, Callable] = field(default_factory=dict)
+    programs: dict[Any, Callable[..., Any]] = field(default_factory=dict)
     policy: Policy = field(init=False)
     seconds: dict[str, float] = field(init=False)
 

@@ -79,7 +79,8 @@ class FakePiper:
             seed: of the noise.
         """
         self.world, self.faults, self.time = world, Faults(), 1.0
-        self.commands, self.unsafe, self.hand = 0, [], None
+        self.unsafe: list[str] = []
+        self.commands, self.hand = 0, None
         self._latency, self._noise = latency, noise
         self._random = np.random.default_rng(seed)
         self._bus = can.Bus(channel, interface="virtual", preserve_timestamps=True)
