@@ -58,6 +58,9 @@ def enable() -> None:
         jax.config.update("jax_compilation_cache_dir", folder)
     # Below JAX's default of 1 s: initializing adapters compiles dozens of small programs.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    # Triton kernels carry the call stack in which they were first traced, and JAX does not strip it
+    # from its keys: a program's key would depend on what other threads have traced before.
+    jax.config.update("jax_traceback_in_locations_limit", 0)
     _compat.use_file_cache(WholeFiles)
     _end_turns()
 

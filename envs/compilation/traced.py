@@ -48,48 +48,61 @@ _VERSIONED = ("jax", "jaxlib", "mujoco", "mujoco-mjx")
 _CHECKSUM = hashlib.sha256().digest_size  # bytes at the start of a file
 
 
-def cached(function: Callable[..., Any], files: Sequence[str] = ()) -> Callable[..., Any]:
+class cached:
     """Apply `jax.jit(..., static_argnums=0)`, tracing once for all processes on a machine.
 
     Programs are cached only if JAX's compilation cache is a local folder, environment and task come
     with this package, and every argument is on one of JAX's default devices. Programs that use Warp
     are not cached, since they contain memory addresses. The result is thread-safe, but cannot be
     vmapped.
-
-    Args:
-        function: a function that takes an `Env` and pytrees of arrays, and returns arrays in
-            `State`, `Poses`, dicts, lists and tuples.
-        files: source files outside this package on which the program depends.
     """
-    jitted, sources = fast_cpu.jit(function, static_argnums=0), _sources(tuple(files))
-    traced: WeakKeyDictionary[Env, set[Any]] = WeakKeyDictionary()
 
-    @functools.lru_cache(maxsize=32)
-    def program(*key: Any) -> Callable[..., Any]:
-        exported = _load_or_trace(function, sources, *key)
+    def __init__(self, function: Callable[..., Any], files: Sequence[str] = ()) -> None:
+        """Create the program.
 
-        @functools.wraps(function)  # programs are named after functions
+        Args:
+            function: a function that takes an `Env` and pytrees of arrays, and returns arrays in
+                `State`, `Poses`, dicts, lists and tuples.
+            files: source files outside this package on which the program depends.
+        """
+        functools.update_wrapper(self, function)
+        self._function, self._sources = function, _sources(tuple(files))
+        self._jitted = fast_cpu.jit(function, static_argnums=0)
+        self._traced: WeakKeyDictionary[Env, set[Any]] = WeakKeyDictionary()
+        self._exported = functools.lru_cache(maxsize=32)(self._load_or_trace)
+
+    def __call__(self, env: Env, *arguments: Any) -> Any:
+        """Run the program."""
+        leaves, tree = jax.tree.flatten(arguments)
+        key = tree, tuple(map(_kind, leaves)), _settings()
+        if _is_cacheable(env, leaves):
+            with _TRACING:
+                run = self._exported(env, *key)
+            return run(*leaves)
+        with _TRACING:
+            known = self._traced.setdefault(env, set())
+            if key not in known:
+                self._jitted.lower(env, *arguments)  # the call below reuses this trace
+                known.add(key)
+        return self._jitted(env, *arguments)
+
+    def lower(self, env: Env, *arguments: Any) -> jax.stages.Lowered:
+        """Trace and lower the program for arrays or shapes, like `jax.jit(...).lower`."""
+        leaves, tree = jax.tree.flatten(arguments)
+        with _TRACING:
+            if _is_cacheable(env, leaves):
+                run = self._exported(env, tree, tuple(map(_kind, leaves)), _settings())
+                return run.lower(*leaves)
+            return self._jitted.lower(env, *arguments)
+
+    def _load_or_trace(self, *key: Any) -> Callable[..., Any]:
+        exported = _load_or_trace(self._function, self._sources, *key)
+
+        @functools.wraps(self._function)  # programs are named after functions
         def call_exported(*leaves: Any) -> Any:
             return exported.call(*leaves)
 
         return fast_cpu.jit(call_exported)
-
-    @functools.wraps(function)
-    def call(env: Env, *arguments: Any) -> Any:
-        leaves, tree = jax.tree.flatten(arguments)
-        kinds, settings = tuple(map(_kind, leaves)), _settings()
-        if _is_cacheable(env) and _is_default_device() and all(map(_is_on_default_device, leaves)):
-            with _TRACING:
-                run = program(env, tree, kinds, settings)
-            return run(*leaves)
-        with _TRACING:
-            known = traced.setdefault(env, set())
-            if (tree, kinds, settings) not in known:
-                jitted.lower(env, *arguments)  # the call below reuses this trace
-                known.add((tree, kinds, settings))
-        return jitted(env, *arguments)
-
-    return call
 
 
 def _load_or_trace(
@@ -144,10 +157,12 @@ def digest(env: Env) -> str:
     return digest.hexdigest()
 
 
-def _is_cacheable(env: Env) -> bool:
+def _is_cacheable(env: Env, leaves: Sequence[Any] = ()) -> bool:
     folder = jax.config.jax_compilation_cache_dir
     return (
-        folder is not None
+        _is_default_device()
+        and all(map(_is_on_default_device, leaves))
+        and folder is not None
         and "://" not in folder
         and type(env) is Env  # a subclass may have other programs
         and env.physics.backend == "jax"

@@ -67,7 +67,8 @@ class Evaluation(Callback):
     def compile_early(self, run: Run, built: RunSetup) -> None:
         """Compile the rollouts of a run, whose demonstrations other threads may be collecting.
 
-        One policy call per task compiles everything. Warp is not thread-safe and compiles later.
+        A policy call per task finds what is left to compile. Warp is not thread-safe and compiles
+        later.
         """
         if built.source or physics.default_backend() == "warp":
             return
@@ -76,6 +77,7 @@ class Evaluation(Callback):
         def compile_task(task: str) -> None:
             with messages.announce(f"the evaluation of {task}"):
                 env, rollout = self._compile_rollout(run.config, task)
+                rollout.compile(policy)
                 jax.block_until_ready(rollout(policy, jax.random.key(0), calls=1))
             self._rollouts[task] = env, rollout
 

@@ -7,6 +7,7 @@ again for each task, and the physics again for each method.
 import dataclasses
 import functools
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -28,32 +29,66 @@ from lorasp_jax.policies.processor import Processor, RawObservation
 from lorasp_jax.training.distributed import mesh as meshes
 
 
+@dataclasses.dataclass(frozen=True)
+class SplitRollout:
+    """A function like a jitted `make_rollout`, with equal results up to rounding.
+
+    One program samples a policy's chunk; it is shared by all environments with as many worlds and
+    equal cameras. Three programs reset, render and step the environment; they are shared by all
+    policies. Several threads may call the function.
+    """
+
+    env: Env
+    execute_steps: int
+    denoise_steps: int
+    ranges: Randomization | None
+
+    def __call__(self, policy: Policy, key: jax.Array, calls: int | None = None) -> Rollout:
+        """Run `env.num_envs` episodes of `calls` policy calls, by default of the most they need."""
+        most = num_calls(self.env, policy, self.execute_steps)
+        worlds = Worlds(self.env, policy, key, self.ranges)
+        records = []
+        for call in range(calls or most):
+            actions, ranks = worlds.predict(call, denoise_steps=self.denoise_steps)
+            records.append((worlds.act(actions, self.execute_steps), *ranks))
+        state, records = jax.device_get((worlds.state, records))
+        return as_rollout(state, *jax.tree.map(lambda *values: np.stack(values), *records))
+
+    def compile(self, policy: Policy) -> None:
+        """Compile all programs at once, whereas the first call compiles one after the other."""
+        place = _placement(policy)
+        worlds, slots = self.env.num_envs, policy.processor.robot_slots
+        policy = Policy(prepared(policy).model, policy.processor.shared())
+        key = jax.device_put(jax.random.key(0), place)
+        blank = lambda x: jax.device_put(jnp.zeros(x.shape, x.dtype), place)  # noqa: E731
+        placed = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place)  # noqa: E731
+        shape = lambda *axes, dtype: placed(jax.ShapeDtypeStruct(axes, dtype))  # noqa: E731
+        with ThreadPoolExecutor() as pool:
+            reset = _reset.lower(self.env, key, self.ranges)
+            compiling = [pool.submit(reset.compile)]
+            state = jax.tree.map(placed, reset.out_info)
+            observe = _observe.lower(self.env, state)
+            compiling.append(pool.submit(observe.compile))
+            prompts, done = shape(worlds, dtype="int32"), shape(worlds, dtype="bool")
+            inputs = jax.tree.map(blank, (observe.out_info, prompts, done))
+            predict = functools.partial(_predict(), denoise_steps=self.denoise_steps)
+            # Called, because several threads' calls compile this shared program only once.
+            compiling.append(pool.submit(predict, policy, key, np.int32(0), *inputs))
+            actions = shape(worlds, self.execute_steps, len(slots), dtype="float32")
+            compiling.append(pool.submit(_act.lower(self.env, state, actions).compile))
+            for compiled in compiling:
+                compiled.result()
+
+
 def split_rollout(
     env: Env,
     *,
     execute_steps: int = 5,
     denoise_steps: int = 10,
     ranges: Randomization | None = None,
-) -> Callable[..., Rollout]:
-    """Create a function like a jitted `make_rollout`, with equal results up to rounding.
-
-    One program samples a policy's chunk; it is shared by all environments with as many worlds and
-    equal cameras. Three programs reset, render and step the environment; they are shared by all
-    policies. Several threads may call the function. Its argument `calls` is the number of policy
-    calls, by default as many as an episode can have.
-    """
-
-    def rollout(policy: Policy, key: jax.Array, calls: int | None = None) -> Rollout:
-        most = num_calls(env, policy, execute_steps)
-        worlds = Worlds(env, policy, key, ranges)
-        records = []
-        for call in range(calls or most):
-            actions, ranks = worlds.predict(call, denoise_steps=denoise_steps)
-            records.append((worlds.act(actions, execute_steps), *ranks))
-        state, records = jax.device_get((worlds.state, records))
-        return as_rollout(state, *jax.tree.map(lambda *values: np.stack(values), *records))
-
-    return rollout
+) -> SplitRollout:
+    """Create a rollout from separate programs; see `SplitRollout` and `make_rollout`."""
+    return SplitRollout(env, execute_steps, denoise_steps, ranges)
 
 
 class Worlds:
