@@ -9,10 +9,12 @@ with the scale s = max |x| / M, where M is the largest number of its format:
 Products are summed in fp32. With normal operands, the relative error is 3.7 % for x W and 5.7 % for
 g Wᵀ (Frobenius norm). XLA hands the scales to cuBLASLt, which adds a third term in place, but only
 in this form: if the codes are converted to the dtype of x before the product, XLA first dequantizes
-whole stacks of layers.
+whole stacks of layers. Both factors must have the summed axis last, so W8 is stored as [O, I], and
+only g Wᵀ transposes it.
 
 Quantizing takes two passes over x, which cost as much as the faster product saves unless W is wide
-and there are many tokens. Elsewhere, and on other devices, W is dequantized to the dtype of x.
+and there are many tokens, or W is so large that dequantizing it takes longer even for few tokens.
+Elsewhere, and on other devices, W is dequantized to the dtype of x.
 """
 
 import math
@@ -29,8 +31,9 @@ from lorasp_jax.kernels.row_sharding import by_rows
 
 Kernel = jax.Array | QuantizedKernel
 
-MIN_WIDTH, MIN_PRODUCTS = 1024, 2**34
-"""Least columns of the result, and least multiplications T I O, for a product in float8."""
+MIN_WIDTH, MIN_PRODUCTS, MIN_SIZE = 1024, 2**34, 2**25
+"""Least columns of the result, and either least multiplications T I O or least weights I O, for a
+product in float8."""
 
 
 def frozen_matmul(x: jax.Array, kernel: Kernel) -> jax.Array:
@@ -45,23 +48,24 @@ def _frozen_matmul(x: jax.Array, kernel: Kernel) -> jax.Array:
 
 def matmul(x: jax.Array, kernel: Kernel) -> jax.Array:
     """Compute x W, [..., O], in the dtype of x [..., I], without a derivative in float8."""
-    if uses_float8(kernel, x, kernel.shape[-1]):
-        return _float8_product(x, jnp.float8_e4m3fn, kernel, axis=0)
+    if uses_float8(kernel, math.prod(x.shape[:-1]), kernel.shape[-1]):
+        return _float8_product(x, jnp.float8_e4m3fn, kernel, axis=1)
     return x @ kernel.astype(x.dtype)
 
 
 def matmul_transposed(g: jax.Array, kernel: Kernel) -> jax.Array:
     """Compute g Wᵀ, [..., I], in the dtype of g [..., O], without a derivative in float8."""
-    if uses_float8(kernel, g, kernel.shape[-2]):
-        return _float8_product(g, jnp.float8_e5m2, kernel, axis=1)
+    if uses_float8(kernel, math.prod(g.shape[:-1]), kernel.shape[-2]):
+        return _float8_product(g, jnp.float8_e5m2, kernel, axis=0)
     return g @ kernel.astype(g.dtype).T
 
 
-def uses_float8(kernel: Kernel, x: jax.Array, width: int) -> TypeGuard[QuantizedKernel]:
-    """Return whether a product of x and `kernel` with `width` columns is in float8."""
+def uses_float8(kernel: Kernel, rows: int, width: int) -> TypeGuard[QuantizedKernel]:
+    """Return whether a product of `rows` rows and `kernel` with `width` columns is in float8."""
     is_float8 = isinstance(kernel, QuantizedKernel) and kernel.kind == "float8"
-    products = math.prod(x.shape) * width
-    return is_float8 and width >= MIN_WIDTH and products >= MIN_PRODUCTS and multiplies_float8()
+    size = math.prod(kernel.shape)
+    is_large = size >= MIN_SIZE or rows * size >= MIN_PRODUCTS
+    return is_float8 and width >= MIN_WIDTH and is_large and multiplies_float8()
 
 
 def encode(x: jax.Array, dtype: Any) -> tuple[jax.Array, jax.Array]:
@@ -72,7 +76,7 @@ def encode(x: jax.Array, dtype: Any) -> tuple[jax.Array, jax.Array]:
 
 
 def _float8_product(x: jax.Array, dtype: Any, kernel: QuantizedKernel, axis: int) -> jax.Array:
-    """Encode x and sum its products with W [I, O] over this axis of W, in the dtype of x.
+    """Encode x and sum its products with W8 [O, I] over this axis of W8, in the dtype of x.
 
     Each device scales its own rows: one scale for all would be a collective before each product.
     """
@@ -80,6 +84,8 @@ def _float8_product(x: jax.Array, dtype: Any, kernel: QuantizedKernel, axis: int
     def product(shared: Sequence[jax.Array], arrays: Sequence[jax.Array]) -> tuple:
         (w, w_scale), (rows,) = shared, arrays
         codes, scale = encode(rows, dtype)
+        # Without the barrier XLA merges products of equal codes, as by gate and up, and copies W8.
+        codes, w = jax.lax.optimization_barrier((codes, w))
         axes = ((1,), (axis,)), ((), ())
         sums = jax.lax.dot_general(codes, w, axes, preferred_element_type=x.dtype)
         return [sums * (scale * w_scale.reshape(())).astype(x.dtype)], []

@@ -209,8 +209,9 @@ def _should_concat(kernel: jax.Array | QuantizedKernel, x: jax.Array, width: int
 
     See the module docstring.
     """
-    has_many_rows = math.prod(x.shape[:-1]) >= kernel.shape[0]
-    return has_many_rows and platform() != "cpu" and not uses_float8(kernel, x, width)
+    rows = math.prod(x.shape[:-1])
+    has_many_rows = rows >= kernel.shape[0]
+    return has_many_rows and platform() != "cpu" and not uses_float8(kernel, rows, width)
 
 
 def _concat_downs(layers: Sequence[LowRankLayer], x: jax.Array) -> jax.Array:

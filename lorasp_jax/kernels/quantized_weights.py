@@ -46,8 +46,9 @@ class QuantizedKernel:
     """
 
     codes: jax.Array
-    """float8 (e4m3fn), int8: [..., 1, I, O]. nf4: uint8 [..., I/64, 32, O], with row i of a block
-    in the low four bits and row i + 32 in the high four."""
+    """float8 (e4m3fn): [..., 1, O, I], since a product x W in float8 wants I last. int8:
+    [..., 1, I, O]. nf4: uint8 [..., I/64, 32, O], with row i of a block in the low four bits and
+    row i + 32 in the high four."""
     scale: jax.Array
     """f32 [..., 1 or I/64, 1, O]; float8: [..., 1, 1, 1]."""
     d_in: int = dataclasses.field(metadata={"static": True})
@@ -65,7 +66,7 @@ class QuantizedKernel:
         """Shape of the original kernel: [..., I, O], or [..., *axes]."""
         leading = self.codes.shape[:-3]
         if self.axes is None:
-            return *leading, self.d_in, self.codes.shape[-1]
+            return *leading, self.d_in, self.codes.shape[-2 if self.kind == "float8" else -1]
         return *leading[: len(leading) - self.batch], *self.axes
 
     @property
@@ -81,6 +82,8 @@ class QuantizedKernel:
 
     def astype(self, dtype: Any) -> jax.Array:
         """Dequantize to an array [..., I, O]."""
+        if self.kind == "float8":
+            return (self.codes.astype(jnp.float32) * self.scale).astype(dtype).squeeze(-3).mT
         if self.kind == "nf4":
             halves = [self.codes & 15, self.codes >> 4]
             values = jnp.array(NF4, jnp.float32)[jnp.concatenate(halves, axis=-2)]
@@ -126,7 +129,7 @@ def quantize_kernel(kernel: jax.Array, kind: Kind) -> QuantizedKernel:
 def _codes(kernel: jax.Array, kind: Kind) -> tuple[jax.Array, jax.Array]:
     """Compute the codes and scales of a `QuantizedKernel`."""
     *leading, d_in, d_out = kernel.shape
-    values = kernel.astype(jnp.float32)
+    values = (kernel.mT if kind == "float8" else kernel).astype(jnp.float32)
     if kind == "nf4":
         blocks = math.ceil(d_in / NF4_BLOCK)
         padding = [(0, 0)] * len(leading) + [(0, blocks * NF4_BLOCK - d_in), (0, 0)]

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.compress import quantization
 from lorasp_jax.adapters.layers import prepared
 from lorasp_jax.models import flow_matching, real_time_chunking
 from lorasp_jax.models.config import BackboneConfig
@@ -56,8 +57,9 @@ class Sampler:
     """Samples action chunks from a backbone, with input-independent results precomputed once.
 
     A sampler copies most of the weights; drop all references to the backbone to free the originals.
-    Quantized weights stay so in the vision tower and the language model, which run once per call.
-    Those of the action expert are dequantized.
+    In the vision tower and the language model, which run once per call, weights stay quantized if
+    that only saves memory. If the GPU multiplies float8, only large float8 kernels do; all smaller
+    ones, and those of the action expert, are dequantized.
     The weights are a flat list, because a jitted call with a module of about a thousand arrays has
     too much dispatch latency for some control loops.
     """
@@ -155,10 +157,11 @@ def _prefix_model(model: FlowModel, once: bool) -> FlowModel:
     """Copy a model for the prefix, blocks unstacked so that an outer loop slices no weights."""
     model = nnx.merge(*nnx.split(model))
     for tower in (model.vision, model.language):
-        if once or prepared.has_quantized_kernels(tower.blocks):
+        if once or quantization.only_saves_memory(tower.blocks):
             tower.blocks = unstack(prepared.fuse_stack(tower.blocks))
             continue
         tower.blocks = unstack(tower.blocks)
+        quantization.dequantize(tower, keep_float8=True)
         for block in tower.blocks:
             block.fuse_projections()
     return model
@@ -169,6 +172,7 @@ def _suffix_model(model: FlowModel) -> FlowModel:
     model = nnx.merge(*nnx.split(model))
     del model.vision, model.language
     model.action.blocks = unstack(model.action.blocks)
+    quantization.dequantize(cast(nnx.Module, model))
     for module in (model, *(module for _, module in nnx.iter_modules(model.action))):
         if isinstance(module, prepared.FusableModule):
             module.fuse_projections()

@@ -15,6 +15,10 @@ from lorasp_jax.training.distributed import mesh as meshes
 
 METHOD = LoRASP(rank=8)
 
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:The Pallas Triton backend is deprecated:DeprecationWarning"
+)
+
 
 def normal(seed, *shape):
     return jax.random.normal(jax.random.key(seed), shape)
@@ -77,8 +81,8 @@ def test_codes_are_the_only_difference(on_hopper, method):
     np.testing.assert_allclose(gradient, of_base + of_adapter(x), atol=1e-5)
 
 
-def formats(tokens, d_in, d_out, kind="float8", platform="cuda"):
-    """Float8 formats that an adapted layer rounds to, forward and backward, once each."""
+def lowered(tokens, d_in, d_out, kind="float8", platform="cuda"):
+    """The program of an adapted layer, forward and backward."""
     kernel = jax.eval_shape(lambda: quantize_kernel(jnp.zeros((d_in, d_out)), kind))
     params, _ = jax.eval_shape(lambda: METHOD.init(jax.random.key(0), jnp.zeros((d_in, d_out))))
     x = jax.ShapeDtypeStruct((tokens, d_in), jnp.bfloat16)
@@ -90,11 +94,15 @@ def formats(tokens, d_in, d_out, kind="float8", platform="cuda"):
     mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
     with jax.sharding.use_abstract_mesh(mesh):
         traced = jax.jit(jax.value_and_grad(loss, (0, 1))).trace(params, x, kernel)
-        text = traced.lower(lowering_platforms=(platform,)).as_text()
+        return traced.lower(lowering_platforms=(platform,)).as_text()
+
+
+def formats(*shape, **options):
+    """Float8 formats that an adapted layer rounds to, forward and backward, once each."""
+    text = lowered(*shape, **options)
     return sorted(re.findall(r"convert .*-> tensor<[^>]*x(f8\w+)>", text))
 
 
-@pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
 def test_used_where_it_pays():
     """On NVIDIA GPUs, for many tokens and a wide result; each pass decides for itself."""
     both = ["f8E4M3FN", "f8E5M2"]
@@ -102,9 +110,18 @@ def test_used_where_it_pays():
     assert formats(26112, 4096, 512) == both[1:]
     assert formats(26112, 512, 4096) == both[:1]
     assert formats(1024, 2048, 2048) == []
+    assert formats(16, 2048, 16384) == both  # dequantizing a large W takes longer
     assert formats(26112, 2048, 16384, kind="int8") == []
     assert formats(26112, 2048, 16384, platform="cpu") == []
     assert formats(26112, 2048, 16384, platform="rocm") == []
+
+
+def test_the_forward_product_transposes_nothing_and_is_not_merged():
+    """cuBLASLt wants both factors as [rows, summed]. XLA merges products of one and the same x8."""
+    text = lowered(16, 2048, 16384)
+    x8, w8 = "tensor<16x2048xf8E4M3FN>", "tensor<16384x2048xf8E4M3FN>"
+    assert re.search(rf"contracting_dims = \[1\] x \[1\].* \({x8}, {w8}\)", text)
+    assert re.search(rf"optimization_barrier .*{x8}, {w8}", text)
 
 
 def test_each_device_scales_its_own_rows(on_hopper):

@@ -14,7 +14,7 @@ quantizes the residual.
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -23,7 +23,9 @@ from flax import nnx
 
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.layers import nnx_layers
-from lorasp_jax.dense import AdaptedLayer, AdapterParam, validate
+from lorasp_jax.dense import AdaptedLayer, AdapterParam, Dense, validate
+from lorasp_jax.kernels.frozen_matmul import uses_float8
+from lorasp_jax.kernels.platform import multiplies_float8
 from lorasp_jax.kernels.quantized_weights import KINDS, Kind, QuantizedKernel, quantize_kernel
 from lorasp_jax.peft._fields import short
 
@@ -90,6 +92,31 @@ def is_quantized(model: nnx.Module) -> bool:
     """Whether the model has a quantized kernel."""
     parameters = paths.locate(nnx.List([model]), nnx.Param)
     return any(isinstance(location.child.get_value(), QuantizedKernel) for location in parameters)
+
+
+def only_saves_memory(module: nnx.Module) -> bool:
+    """Whether a kernel of a `Dense` is quantized, but is not to be multiplied in float8."""
+    kinds = {kernel.kind for _, kernel in _quantized_layers(module)}
+    return bool(kinds - {"float8"} if multiplies_float8() else kinds)
+
+
+def dequantize(module: nnx.Module, *, keep_float8: bool = False) -> None:
+    """Dequantize the kernel of each unstacked `Dense`, in place and in its compute dtype.
+
+    With `keep_float8`, kernels stay as they are if every product with them is in float8.
+    """
+    for layer, kernel in _quantized_layers(module):
+        if not (keep_float8 and uses_float8(kernel, rows=1, width=kernel.shape[-1])):
+            layer.set_kernel_matrices(kernel.astype(layer.dtype or kernel.dtype))
+
+
+def _quantized_layers(module: nnx.Module) -> Iterator[tuple[Dense, QuantizedKernel]]:
+    """Yield each `Dense` with a quantized kernel, and the kernel."""
+    layers = [layer for _, layer in nnx.iter_modules(module) if isinstance(layer, Dense)]
+    for layer in layers:
+        kernel: Any = layer.kernel_matrices()
+        if isinstance(kernel, QuantizedKernel):
+            yield layer, kernel
 
 
 def _quantize_layer(layer: nnx.Module, kind: Kind, shared: Shared) -> tuple[AdaptedLayer, float]:

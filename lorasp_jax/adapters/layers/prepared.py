@@ -12,8 +12,8 @@ and with a shared input become one matmul, x [W1, W2, ...]. The original layers 
 
 Very wide layers compute y = [x, z] [W; U] instead: another pass over y would cost more than a
 second matmul with x. Where copying W would cost more than it saves, as in a sampler that is used
-once, only the P are concatenated, and P and U are cast to the compute dtype. For training, see
-`lorasp_jax.kernels.low_rank_matmul`.
+once, or where W is quantized, only the P are concatenated, and P and U are cast to the compute
+dtype. For training, see `lorasp_jax.kernels.low_rank_matmul`.
 """
 
 import dataclasses
@@ -168,17 +168,18 @@ def fuse_layers(layers: Sequence[Layer], *, copy_kernels: bool = True) -> list[L
     A single (unstacked) adapted `Dense` can be fused if it has an explicit dtype, and its method
     computes exactly x W + z U and does not need x P in fp32. If all layers can be fused and agree
     on method and dtype, they are fused together. Otherwise each fusable layer is fused alone, and
-    the others are returned unchanged. Several layers without adapters, or a quantized one, are
-    fused if `copy_kernels` is true and all have the same explicit dtype.
+    the others are returned unchanged. Several layers without adapters are fused if W may be copied
+    and all have the same explicit dtype.
 
     Args:
       layers: layers in call order.
-      copy_kernels: whether to copy W, dequantized; best unless the fused layers are called once.
+      copy_kernels: whether to copy W, unless one is quantized; best unless the fused layers are
+        called once.
     """
+    copy_kernels = copy_kernels and not any(map(_is_quantized, layers))
     plain = [layer for layer in layers if _is_plain(layer)]
-    pays = len(layers) > 1 or any(map(_is_quantized, plain))
     same = len(plain) == len(layers) and len({layer.dtype for layer in plain}) == 1
-    if copy_kernels and pays and same:
+    if copy_kernels and len(layers) > 1 and same:
         return [Prepared(_fused_kernels(plain)), *(Prepared() for _ in plain[1:])]
     fusable = [layer for layer in layers if _is_fusable(layer)]
     fuse = _with_copied_kernels if copy_kernels else _shared_projection
@@ -200,12 +201,6 @@ def fuse_stack(blocks: Block) -> Block:
         return block
 
     return jax.vmap(fuse)(blocks)
-
-
-def has_quantized_kernels(module: nnx.Module) -> bool:
-    """Return whether a kernel is quantized: a copy in the compute dtype would take more memory."""
-    leaves = jax.tree.leaves(module, is_leaf=lambda leaf: isinstance(leaf, QuantizedKernel))
-    return any(isinstance(leaf, QuantizedKernel) for leaf in leaves)
 
 
 def _call_fused(
@@ -303,19 +298,20 @@ def _is_plain(layer: Layer) -> TypeGuard[Dense]:
     return len(layer.kernel_matrices().shape) == 2  # quantized kernels have no ndim
 
 
-def _is_quantized(layer: Dense) -> bool:
-    return isinstance(layer.kernel_matrices(), QuantizedKernel)
+def _is_quantized(layer: Layer) -> bool:
+    return isinstance(layer, Dense) and isinstance(layer.kernel_matrices(), QuantizedKernel)
 
 
 def _matrices(
     layers: Sequence[Dense],
 ) -> tuple[list[jax.Array], list[jax.Array], list[jax.Array], list[jax.Array | None]]:
-    """W, P, U and bias of each layer, in the compute dtype."""
+    """W unless it is quantized, P, U and bias of each layer, in the compute dtype."""
     method, _ = layers[0].method_and_params()
     params, dtype = [layer.method_and_params()[1] for layer in layers], layers[0].dtype
+    kernels = [layer.kernel_matrices() for layer in layers]
     biases = [None if layer.bias is None else layer.bias.get_value() for layer in layers]
     return (
-        [layer.kernel_matrices().astype(dtype) for layer in layers],
+        [k if isinstance(k, QuantizedKernel) else k.astype(dtype) for k in kernels],
         [method.down(p).astype(dtype) for p in params],
         [method.up(p).astype(dtype) for p in params],
         [None if bias is None else bias.astype(dtype) for bias in biases],
@@ -346,13 +342,11 @@ def _with_copied_kernels(layers: Sequence[Dense]) -> FusedLayers | SharedProject
 
 def _shared_projection(layers: Sequence[Dense], *, join: bool = False) -> SharedProjection:
     """Concatenate only the P of all layers; with `join`, also W and U of each layer."""
-    dense, downs, ups, biases = _matrices(layers)
+    kernels, downs, ups, biases = _matrices(layers)
     down, spec = pad_columns(jnp.concatenate(downs, axis=1)), _bottleneck_spec(layers, downs)
     if join:
-        joined = [pad_columns(jnp.concatenate(pair).T).T for pair in zip(dense, ups, strict=True)]
+        joined = [pad_columns(jnp.concatenate(pair).T).T for pair in zip(kernels, ups, strict=True)]
         return SharedProjection(*spec, down, [None] * len(ups), joined, biases)
-    pairs = zip((layer.kernel_matrices() for layer in layers), dense, strict=True)
-    kernels = [k if isinstance(k, QuantizedKernel) else w for k, w in pairs]
     return SharedProjection(*spec, down, ups, kernels, biases)
 
 
