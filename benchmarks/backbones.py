@@ -36,6 +36,7 @@ from lorasp_jax.models import backbone
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.sampling import Sampler
+from lorasp_jax.serving.exported import sampling_options
 from lorasp_jax.training import compilation
 from lorasp_jax.training.cost import flops, preflight
 from lorasp_jax.training.cost.preflight import GIB, REMATS, abstract_batch, estimate_memory
@@ -196,7 +197,7 @@ def sampling(name: str, label: str, run: Config | None, options: argparse.Namesp
     sampler = nnx.merge(*arrays(config, run)).sampler()
     observation = noise(abstract_batch(config, 1).observation)
 
-    @jax.jit
+    @functools.partial(jax.jit, compiler_options=sampling_options())
     def sample(sampler: Sampler, observation: Any) -> jax.Array:
         return sampler.sample_actions(jax.random.key(0), observation, num_steps=STEPS)
 

@@ -52,6 +52,7 @@ from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.models.transformer import attention
 from lorasp_jax.peft import LoRA, LoRASP
+from lorasp_jax.serving.exported import sampling_options
 from lorasp_jax.training.cost import preflight
 
 STEPS = 10
@@ -177,8 +178,8 @@ def programs(table: Sequence[Case], options: argparse.Namespace) -> dict[Case, P
         is_graph = case.change == "graph"
         key = is_graph, program.as_text()
         if key not in compiling:
-            extra = GRAPH_OPTIONS if is_graph else {}
-            compiling[key] = pool.submit(program.compile, compiler_options=extra)
+            chosen = (sampling_options() or {}) | (GRAPH_OPTIONS if is_graph else {})
+            compiling[key] = pool.submit(program.compile, compiler_options=chosen)
         found[case] = Program(sampler, observation, compiling[key])
     pool.shutdown(wait=False)
     return found

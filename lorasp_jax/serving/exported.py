@@ -10,6 +10,7 @@ This file needs only JAX with flatbuffers, NumPy and safetensors. A copy of it w
     continue-B.bin         the same for chunks that continue the previous one
 """
 
+import functools
 import hashlib
 import json
 import os
@@ -81,6 +82,18 @@ class Description:
         return [PROCESSOR, INSTRUCTIONS, WEIGHTS, *(program_file(*each) for each in self.programs)]
 
 
+def sampling_options() -> dict[str, str | bool] | None:
+    """Return the compiler options of a program that samples a chunk for a few observations.
+
+    Its kernels take microseconds, and XLA's CUDA graphs run independent ones one after another
+    unless told otherwise: on an H200, pi0 takes 17.0 instead of 17.8 ms, with LoRA-SP 29.5 instead
+    of 30.9.
+    """
+    if jax.default_backend() != "gpu" or jax.__version_info__ < (0, 11):
+        return None
+    return {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
+
+
 class ExportedPolicy:
     """A policy with programs for fixed batch sizes, which compile when first used; see `load`."""
 
@@ -93,7 +106,8 @@ class ExportedPolicy:
         tokens: Mapping[str, Mapping[str, Any]],
     ) -> None:
         self.description = description
-        self._programs = {name: jax.jit(program.call) for name, program in programs.items()}
+        jit = functools.partial(jax.jit, compiler_options=sampling_options())
+        self._programs = {name: jit(program.call) for name, program in programs.items()}
         self._weights, self._statistics, self._tokens = weights, statistics, tokens
 
     @property

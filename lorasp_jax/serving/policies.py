@@ -13,6 +13,7 @@ from lorasp_jax.policies.policy import Observation, Policy
 from lorasp_jax.policies.processor import Processor
 from lorasp_jax.policies.prompt_table import Ids
 from lorasp_jax.policies.tokenizer import Tokenizer
+from lorasp_jax.serving.exported import sampling_options
 from lorasp_jax.serving.noise import draw
 from lorasp_jax.serving.requests import PolicySpec, Request, choose_prompt, common_spec
 
@@ -90,7 +91,11 @@ class CompiledPolicies:
         self._policies = {name: without_prompts(policy) for name, policy in policies.items()}
         self._words = dict(words)
         self._tokens = functools.lru_cache(CACHED_PROMPTS)(self._tokenize)
-        self._sample = jax.jit(_sample, static_argnames=("num_steps", "continues"))
+        self._sample = jax.jit(
+            _sample,
+            static_argnames=("num_steps", "continues"),
+            compiler_options=sampling_options(),
+        )
         self.sizes: tuple[int, ...] = batch_sizes(max_batch)
 
     @property

@@ -129,6 +129,19 @@ def test_another_platform_is_not_cached(env, cache, monkeypatch):
     assert programs._is_on_default_device(np.ones(3))
 
 
+def test_a_program_compiles_from_shapes(env, cache):
+    call = programs.cached(Drawn())
+    place = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    key = jax.device_put(KEY, place)
+    shape = jax.ShapeDtypeStruct(key.shape, key.dtype, sharding=place)
+    lowered = call.lower(env, shape, 0.5)
+    noise, _ = lowered.out_info
+    assert (noise["noise"].shape, noise["noise"].dtype) == ((3, env.num_joints), np.float32)
+    expected = jax.tree.leaves(call(env, key, 0.5))
+    found = lowered.compile()(key, 0.5)
+    jax.tree.map(np.testing.assert_array_equal, jax.tree.leaves(found), expected)
+
+
 def test_a_program_is_part_of_another(env, cache):
     call = programs.cached(Drawn())
     inside = jax.jit(lambda key: call(env, key, 0.5)[0]["noise"])(KEY)
