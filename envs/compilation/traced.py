@@ -139,10 +139,14 @@ def _is_default_device() -> bool:
 
 
 def _is_on_default_device(leaf: Any) -> bool:
-    """Return whether an argument is a number, traced, or on one device of the default platform."""
-    if not isinstance(leaf, jax.Array) or isinstance(leaf, jax.core.Tracer):
+    """Return whether a leaf is a number, traced, or on one device of the default platform.
+
+    A shape without a sharding counts as such a leaf.
+    """
+    sharding = None if isinstance(leaf, jax.core.Tracer) else getattr(leaf, "sharding", None)
+    if sharding is None:
         return True
-    platforms = [device.platform for device in leaf.sharding.device_set]
+    platforms = [device.platform for device in sharding.device_set]
     return platforms == [jax.devices()[0].platform]
 
 

@@ -127,6 +127,9 @@ def test_another_platform_is_not_cached(env, cache, monkeypatch):
             assert not programs._is_default_device()
     assert programs._is_on_default_device(KEY)
     assert programs._is_on_default_device(np.ones(3))
+    mesh = jax.make_mesh((2,), ("d",), devices=jax.devices()[:2])
+    shards = jax.sharding.NamedSharding(mesh, jax.P())
+    assert not programs._is_on_default_device(jax.ShapeDtypeStruct((3,), int, sharding=shards))
 
 
 def test_a_program_compiles_from_shapes(env, cache):
