@@ -58,7 +58,7 @@ class SplitRollout:
         """Compile all programs at once, whereas the first call compiles one after the other."""
         place = _placement(policy)
         worlds, slots = self.env.num_envs, policy.processor.robot_slots
-        policy = Policy(prepared(policy).model, policy.processor.shared())
+        policy = _shareable(policy)
         key = jax.device_put(jax.random.key(0), place)
         blank = lambda x: jax.device_put(jnp.zeros(x.shape, x.dtype), place)  # noqa: E731
         placed = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place)  # noqa: E731
@@ -108,7 +108,7 @@ class Worlds:
         """
         rows = policy.processor.prompts.rows(env.instructions)
         self._env = env
-        self._policy = Policy(prepared(policy).model, policy.processor.shared())
+        self._policy = _shareable(policy)
         # Programs are compiled again for arrays placed otherwise, so all follow the keys.
         self._place = _placement(policy)
         reset_key, self._sample_key = jax.device_put(tuple(jax.random.split(key)), self._place)
@@ -153,6 +153,11 @@ def prepared(policy: Policy) -> Policy:
     if isinstance(policy.model, Sampler):
         return policy
     return dataclasses.replace(policy, model=_sampler(policy.model))
+
+
+def _shareable(policy: Policy) -> Policy:
+    """Return the policy as `_predict` takes it, with a sampler and for rows of any prompt table."""
+    return Policy(prepared(policy).model, policy.processor.shared())
 
 
 def compiled_rollout(config: Config, task: str) -> tuple[Env, Callable[..., Rollout]]:

@@ -277,3 +277,11 @@ def test_platforms_have_the_names_of_exported_programs(monkeypatch):
     ):
         monkeypatch.setattr(jax, "devices", lambda p=platform, v=version: [device(p, client(v))])
         assert exported._platform() == expected
+
+
+def test_kernels_run_at_once_only_where_xla_knows_the_option(monkeypatch):
+    assert exported.sampling_options() is None
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    for version, known in [((0, 10, 2), False), ((0, 11, 2), True)]:
+        monkeypatch.setattr(jax, "__version_info__", version)
+        assert bool(exported.sampling_options()) is known
