@@ -31,12 +31,12 @@ from benchmarks.measuring import best, machine, print_table
 from lorasp_jax import peft
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config, ModelConfig, OptimConfig
+from lorasp_jax.extras.serving.exported import sampling_options
 from lorasp_jax.kernels.quantized_weights import KINDS, Kind
 from lorasp_jax.models import backbone
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.sampling import Sampler
-from lorasp_jax.serving.exported import sampling_options
 from lorasp_jax.training import compilation
 from lorasp_jax.training.cost import flops, preflight
 from lorasp_jax.training.cost.preflight import GIB, REMATS, abstract_batch, estimate_memory

@@ -46,13 +46,13 @@ from benchmarks.measuring import best, machine
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.layers import prepared
 from lorasp_jax.dense import AdaptedLayer, AdapterParam
+from lorasp_jax.extras.serving.exported import sampling_options
 from lorasp_jax.models import backbone
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.models.transformer import attention
 from lorasp_jax.peft import LoRA, LoRASP
-from lorasp_jax.serving.exported import sampling_options
 from lorasp_jax.training.cost import preflight
 
 STEPS = 10

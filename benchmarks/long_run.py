@@ -22,11 +22,11 @@ from rich.console import Console
 import envs
 from benchmarks import measuring
 from envs import Randomization
-from envs.compilation import cache
 from envs.env import Env
 from envs.experts import expert
 from envs.physics import physics
 from envs.state import State
+from lorasp_jax.base import compilation_cache as cache
 
 PARTS = 5
 MAX_GROWTH = 1.02  # memory relative to that after the first part; chosen above allocator noise

@@ -20,9 +20,9 @@ import numpy as np
 from rich.console import Console
 
 from benchmarks.measuring import print_table
-from lorasp_jax.serving.client import PolicyClient
-from lorasp_jax.serving.metrics import COLUMNS, summary
-from lorasp_jax.serving.requests import PolicySpec, Request
+from lorasp_jax.extras.serving.client import PolicyClient
+from lorasp_jax.extras.serving.metrics import COLUMNS, summary
+from lorasp_jax.extras.serving.requests import PolicySpec, Request
 
 WARM_UP = 2
 """Calls of each client before the clock starts, as in openpi's example client."""
@@ -55,7 +55,7 @@ def serve_waiting(image_size: int, cameras: int, seconds: float) -> None:
     """Serve a `Waiting` policy until the process ends; prints the address."""
     import asyncio
 
-    from lorasp_jax.serving.server import PolicyServer, bind
+    from lorasp_jax.extras.serving.server import PolicyServer, bind
 
     async def run() -> None:
         port = bind("127.0.0.1", 0)
@@ -154,7 +154,7 @@ def main() -> None:
     parser.add_argument("--cameras", type=int, default=3)
     options = parser.parse_args()
     console = Console()
-    nano = ["-m", "lorasp_jax.serving", "assets/pi0_nano", "--joints", "7", "--port", "0"]
+    nano = ["-m", "lorasp_jax.extras.serving", "assets/pi0_nano", "--joints", "7", "--port", "0"]
     servers = {
         f"wait {options.milliseconds:g} ms": waiting_command(
             options.image_size, options.cameras, options.milliseconds / 1e3

@@ -22,7 +22,7 @@ API = {
     "data": ["lorasp_jax.data"],
     "training": ["lorasp_jax.training", "lorasp_jax.config"],
     "evaluation": ["lorasp_jax.evaluation"],
-    "study": ["lorasp_jax.study"],
+    "study": ["lorasp_jax.extras.study"],
     "envs": [
         "envs",
         "envs.mjcf",
@@ -30,7 +30,7 @@ API = {
         "envs.datasets.rlds",
         "envs.interop.gymnasium",
         "envs.interop.brax",
-        "envs.compilation.cache",
+        "lorasp_jax.base.compilation_cache",
     ],
 }
 """API pages and the public modules on each."""

@@ -7,8 +7,10 @@ episodes = envs.collect("press", robot="panda", num_episodes=512, key=jax.random
 
 import lazy_loader
 
-import envs.compilation.fast_cpu  # first: it must run before anything starts JAX
 import envs.interop.ids
+import lorasp_jax.base.fast_cpu
+
+lorasp_jax.base.fast_cpu.set_flag()  # before anything starts JAX
 
 # Lazy, because importing MJX would delay `--help` by seconds.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,5 +1,4 @@
 # Public names: `__init__.py` imports each on first access.
-from . import compilation as compilation
 from . import interop as interop
 from . import mjcf as mjcf
 from . import robots as robots

@@ -12,11 +12,12 @@ from rich.console import Console
 
 from envs import actions
 from envs.cli import commands
-from envs.cli.errors import parse_arguments, run_command
-from envs.compilation import alarms, cache
 from envs.experts.collection import Record
 from envs.names import names
 from envs.scene import distractors
+from lorasp_jax.base import alarms
+from lorasp_jax.base import compilation_cache as cache
+from lorasp_jax.base.errors import parse_arguments, run_command
 
 _DEFAULT = "(default: %(default)s)"
 

@@ -20,7 +20,6 @@ import mujoco
 import numpy as np
 
 from envs import actions, checks, observations, rewards
-from envs.compilation import fast_cpu, messages
 from envs.physics.physics import Physics
 from envs.rendering.renderer import Appearance, Renderer, RenderModel
 from envs.robots import Robot
@@ -29,6 +28,7 @@ from envs.scene.randomization import Draw
 from envs.scene.ranges import Randomization
 from envs.state import Changes, Data, Poses, State, Trajectory, where
 from envs.tasks import Layout, Task, View
+from lorasp_jax.base import fast_cpu, messages
 
 _HOME_NOISE = 0.03  # rad, half the range of random start angles around home; our choice
 _START_OPENING = 0.04  # m, gripper opening at reset; our choice

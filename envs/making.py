@@ -11,7 +11,6 @@ import mujoco
 import envs.scene.distractors
 from envs import checks, mjcf
 from envs.actions import MODES, TARGET_DT, Mode
-from envs.compilation import fast_cpu
 from envs.env import Env
 from envs.names import check, names
 from envs.physics import physics
@@ -20,6 +19,7 @@ from envs.rendering import renderer as render
 from envs.rewards import REWARDS, Reward
 from envs.robots import Robot
 from envs.scene import scene
+from lorasp_jax.base import fast_cpu
 
 AnyRobot = str | os.PathLike[str] | Robot
 RendererName = Literal["rays", "warp"]

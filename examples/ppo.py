@@ -22,8 +22,9 @@ import optax
 import tyro
 
 import envs
-from envs.compilation import cache, messages
-from envs.datasets.files import check_local
+from lorasp_jax.base import compilation_cache as cache
+from lorasp_jax.base import messages
+from lorasp_jax.base.files import check_local
 
 
 @dataclasses.dataclass(frozen=True)

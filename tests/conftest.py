@@ -7,7 +7,7 @@ os.environ["JAX_PLATFORMS"] = "cpu"
 
 import jax
 
-from envs.compilation import cache
+from lorasp_jax.base import compilation_cache as cache
 from tests import xla
 
 cache.enable()

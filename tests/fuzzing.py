@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from lorasp_jax.storage.digest import DIGEST, with_digest
+from lorasp_jax.base.digest import DIGEST, with_digest
 
 Change = Callable[[random.Random, list[Path]], None]
 VALUES: list[Any] = [

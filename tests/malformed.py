@@ -12,8 +12,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import safetensors.numpy
 
-from envs.datasets.files import RefusedError
-from lorasp_jax.storage.digest import DIGEST, with_digest
+from lorasp_jax.base.digest import DIGEST, with_digest
+from lorasp_jax.base.files import RefusedError
 from tests import ROOT
 
 Damage = Callable[[Path], None]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lorasp_jax.evaluation.intervals import wilson_interval
-from lorasp_jax.evaluation.latency import figure as latency
+from lorasp_jax.extras.latency import figure as latency
 from tests import ROOT
 
 FOLDER = ROOT / "docs" / "figures"

@@ -27,9 +27,9 @@ COMMANDS = {
     "train a config": (["train.py", "--config", "configs/multitask.py", "--help"], "--peft.rank"),
     "data": (["-m", "lorasp_jax.data", "--help"], "inspect"),
     "data inspect": (["-m", "lorasp_jax.data", "inspect", "--help"], "--state-numbers"),
-    "deploy": (["-m", "lorasp_jax.deployment", "--help"], "--save"),
+    "deploy": (["-m", "lorasp_jax.extras.deployment", "--help"], "--save"),
     "report": (["-m", "lorasp_jax.report", "--help"], "rank-map"),
-    "export": (["-m", "lorasp_jax.serving.export", "--help"], "--max-batch"),
+    "export": (["-m", "lorasp_jax.extras.serving.export", "--help"], "--max-batch"),
     "rank maps": (["-m", "lorasp_jax.report", "rank-map", "--help"], "--gif"),
 }
 PROGRAM = """

@@ -8,9 +8,9 @@ import types
 import numpy as np
 import pytest
 
-from lorasp_jax.serving.requests import PolicySpec, parse
+from lorasp_jax.extras.serving.requests import PolicySpec, parse
 from tests import ROOT
-from tests.serving.stand_in import StandIn, serving
+from tests.extras.serving.stand_in import StandIn, serving
 
 PANDA = PolicySpec(("base", "wrist"), image_size=8, state_dim=8, chunk=10)
 

@@ -17,10 +17,10 @@ from envs.datasets.episodes import Episodes
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io.hugging_face import load_peft
 from lorasp_jax.adapters.io.native import load_adapters, save_adapters
+from lorasp_jax.base.digest import with_digest
 from lorasp_jax.data import cache
 from lorasp_jax.data.opening import open_source
 from lorasp_jax.peft import LoRASP
-from lorasp_jax.storage.digest import with_digest
 from tests import malformed
 from tests.data.lerobots import GOLDEN, digest, golden
 from tests.malformed import ABSENT, HUGE, TENSORS, Cases, Damage, check_refusal

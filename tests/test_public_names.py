@@ -31,9 +31,9 @@ PUBLIC = {
     "lorasp_jax.data": "Stream cache open_source",
     "lorasp_jax.training": "load_policy",
     "lorasp_jax.evaluation": "Result evaluate make_rollout",
-    "lorasp_jax.study": "Cell Derived Study",
+    "lorasp_jax.extras.study": "Cell Derived Study",
     "envs": """
-        Env Episodes Randomization State Trajectory collect compilation expert_success interop
+        Env Episodes Randomization State Trajectory collect expert_success interop
         make mjcf rlds robots
     """,
 }
@@ -44,7 +44,7 @@ SHOWN = {
     "lorasp_jax.models.published": "load_published",
     "lorasp_jax.models.smolvla": "SmolVLAConfig",
     "lorasp_jax.config": "Config DataConfig EvaluationConfig ModelConfig OptimConfig",
-    "envs.compilation.cache": "enable",
+    "lorasp_jax.base.compilation_cache": "enable",
     "envs.interop.brax": "BraxEnv",
     "envs.interop.gymnasium": "VectorEnv",
     "envs.mjcf": "load",

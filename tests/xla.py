@@ -22,6 +22,6 @@ def drop_training_step_options() -> None:
     Imports JAX.
     """
     if UNOPTIMIZED in os.environ.get("XLA_FLAGS", ""):
-        from envs.compilation import fast_cpu
+        from lorasp_jax.base import fast_cpu
 
         fast_cpu.without_simulation = functools.wraps(fast_cpu.without_simulation)(lambda: None)

@@ -18,13 +18,13 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 import envs
-from envs.compilation import cache
 from envs.rendering.renderer import RayRenderer
 from lorasp_jax import models
+from lorasp_jax.base import compilation_cache as cache
+from lorasp_jax.base import hub
 from lorasp_jax.evaluation import make_rollout
 from lorasp_jax.evaluation.rollout import Rollout
 from lorasp_jax.policies import Policy
-from lorasp_jax.storage import hub
 from lorasp_jax.training import load_policy
 from lorasp_jax.training.run_folder import read_json
 

@@ -6,7 +6,7 @@ Writes latency.svg next to this file.
 import json
 from pathlib import Path
 
-from lorasp_jax.evaluation.latency import figure
+from lorasp_jax.extras.latency import figure
 
 HERE = Path(__file__).parent
 

@@ -10,8 +10,8 @@ import numpy as np
 from films import with_prompts
 
 import envs
-from envs.compilation import cache
 from envs.rendering.renderer import RayRenderer
+from lorasp_jax.base import compilation_cache as cache
 from lorasp_jax.models.transformer.depth import unstack
 from lorasp_jax.models.transformer.siglip import patches
 from lorasp_jax.peft.lora_sp import reference

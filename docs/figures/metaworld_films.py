@@ -1,4 +1,4 @@
-"""Join the films of `python -m lorasp_jax.evaluation ... --films FOLDER` as one animation.
+"""Join the films of `python -m lorasp_jax.extras.judge ... --films FOLDER` as one animation.
 
     python docs/figures/metaworld_films.py FOLDER --out docs/figures/metaworld.webp
 

@@ -15,14 +15,15 @@ from rich.console import Console
 
 import envs
 from envs.cli import recipes
-from envs.cli.bars import Report, bars, collecting
-from envs.datasets import rlds, writing
+from envs.datasets import rlds
 from envs.datasets.episodes import Episodes
-from envs.datasets.files import check_local
-from envs.datasets.locks import locked
 from envs.experts import collection
 from envs.names import names
 from envs.rendering import video
+from lorasp_jax.base import writing
+from lorasp_jax.base.bars import Report, bars, collecting
+from lorasp_jax.base.files import check_local
+from lorasp_jax.base.locks import locked
 
 WORLDS = 4
 """Number of parallel attempts in `play`, which shows one success; the expert may fail."""

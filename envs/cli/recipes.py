@@ -8,7 +8,7 @@ import jax
 import mujoco
 
 import envs
-from envs.compilation import traced
+from envs import traced
 
 
 def recipe(options: argparse.Namespace, env: envs.Env) -> dict[str, Any]:

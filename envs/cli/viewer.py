@@ -12,11 +12,11 @@ import mujoco
 import mujoco.viewer
 import numpy as np
 
-from envs.compilation import fast_cpu
 from envs.env import Env
 from envs.experts import expert
 from envs.scene import placing
 from envs.state import State
+from lorasp_jax.base import fast_cpu
 
 
 def check_display() -> None:

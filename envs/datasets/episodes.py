@@ -16,8 +16,8 @@ import jax
 import numpy as np
 
 from envs.actions import MODES
-from envs.datasets.files import as_value_error, check_local, check_memory, check_regular
-from envs.datasets.writing import atomic_file
+from lorasp_jax.base.files import as_value_error, check_local, check_memory, check_regular
+from lorasp_jax.base.writing import atomic_file
 
 Array = jax.Array | np.ndarray
 

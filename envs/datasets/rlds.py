@@ -23,8 +23,6 @@ from array_record.python import array_record_module
 
 from envs.datasets import rlds_schema
 from envs.datasets.episodes import SHARED, Episodes
-from envs.datasets.files import check_regular, first_line
-from envs.datasets.locks import locked
 from envs.datasets.rlds_reading import (
     FORMAT,
     METADATA,
@@ -35,7 +33,9 @@ from envs.datasets.rlds_reading import (
     metadata,
     read,
 )
-from envs.datasets.writing import atomic_folder, sync, write_text
+from lorasp_jax.base.files import check_regular, first_line
+from lorasp_jax.base.locks import locked
+from lorasp_jax.base.writing import atomic_folder, sync, write_text
 
 __all__ = ["METADATA", "ShardWriter", "Reader", "metadata", "read", "write"]
 

@@ -12,9 +12,10 @@ import tensorflow_datasets as tfds
 from array_record.python import array_record_module
 from google.protobuf.json_format import ParseError
 
-from envs.datasets import files, rlds_schema
+from envs.datasets import rlds_schema
 from envs.datasets.episodes import SHARED, Episodes, concatenate
-from envs.datasets.files import RefusedError, as_int, check_regular, read_json
+from lorasp_jax.base import files
+from lorasp_jax.base.files import RefusedError, as_int, check_regular, read_json
 
 FORMAT, SPLIT = "envs-rlds-1", "train"
 METADATA = "metadata.json"

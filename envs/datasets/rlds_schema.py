@@ -16,7 +16,7 @@ from PIL import Image
 from tensorflow_datasets.core.example_serializer import ExampleSerializer
 
 from envs.datasets.episodes import Episodes
-from envs.datasets.files import RefusedError, read_json
+from lorasp_jax.base.files import RefusedError, read_json
 
 FEATURES, INFO = "features.json", "dataset_info.json"
 """Files of tfds that describe a dataset, in the dataset's folder."""

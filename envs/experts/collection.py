@@ -12,8 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs import checks
-from envs.compilation import traced
+from envs import checks, traced
 from envs.datasets.episodes import Episodes, concatenate
 from envs.env import Env
 from envs.experts import expert

@@ -14,11 +14,11 @@ import jax
 import jax.numpy as jnp
 
 from envs import checks
-from envs.compilation import fast_cpu
 from envs.env import Env
 from envs.scene.randomization import prepare
 from envs.scene.ranges import Randomization
 from envs.state import State
+from lorasp_jax.base import fast_cpu
 
 try:
     from brax.envs import base

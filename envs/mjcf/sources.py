@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
-from envs.datasets.files import check_memory, check_regular, read_text
+from lorasp_jax.base.files import check_memory, check_regular, read_text
 
 _FOLDERS = ("assetdir", "meshdir", "texturedir")  # attributes of <compiler>
 _DESCRIPTIONS = ("include", "model")  # elements that refer to another MJCF file

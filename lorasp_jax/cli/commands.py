@@ -12,10 +12,13 @@ import lorasp_jax
 
 COMMANDS = {
     "train": ("lorasp_jax.cli.train", "adapt a policy to a robot"),
-    "study": ("lorasp_jax.study.__main__", "run many experiments and test claims about them"),
-    "judge": ("lorasp_jax.evaluation.__main__", "judge a policy in a Gymnasium environment"),
+    "study": (
+        "lorasp_jax.extras.study.__main__",
+        "run many experiments and test claims about them",
+    ),
+    "judge": ("lorasp_jax.extras.judge.__main__", "judge a policy in a Gymnasium environment"),
     "latency": (
-        "lorasp_jax.evaluation.latency.__main__",
+        "lorasp_jax.extras.latency.__main__",
         "evaluate policies whose actions arrive late",
     ),
     "correction": (
@@ -29,24 +32,24 @@ COMMANDS = {
         "rebuild the report of a run, or film its active ranks",
     ),
     "deploy": (
-        "lorasp_jax.deployment.__main__",
+        "lorasp_jax.extras.deployment.__main__",
         "compare forms in which a run can be deployed, or save one",
     ),
-    "serve": ("lorasp_jax.serving.__main__", "serve a policy to robots over websockets"),
-    "export": ("lorasp_jax.serving.export", "export a policy, to run without this package"),
+    "serve": ("lorasp_jax.extras.serving.__main__", "serve a policy to robots over websockets"),
+    "export": ("lorasp_jax.extras.serving.export", "export a policy, to run without this package"),
     "completion": ("lorasp_jax.cli.completion", "print a shell completion script"),
 }
 """Module and help text of each command. A module has `main(arguments, program)`, which returns the
 exit code, and `parser(program)`, which returns its options for shell completion."""
 INTERRUPTED = 130
 """Exit code after SIGINT (128 + 2, as in shells) or SIGTERM. Repeats the constant of
-`envs.cli.errors`, whose import takes a second."""
+`lorasp_jax.base.errors`, whose import takes a second."""
 
 
 def main() -> NoReturn:
     """Run the command named on the command line."""
     exit_on_signals()
-    from envs.cli.errors import parse_arguments
+    from lorasp_jax.base.errors import parse_arguments
 
     first, rest = sys.argv[1:2], sys.argv[2:]
     command = parse_arguments(_parser(), first).command
@@ -64,7 +67,7 @@ def exit_on_signals() -> None:
 
 def run(command: str, arguments: Sequence[str], program: str) -> NoReturn:
     """Run one of `COMMANDS` and exit with its exit code."""
-    from envs.compilation import alarms
+    from lorasp_jax.base import alarms
 
     alarms.silence()
     if code := importlib.import_module(COMMANDS[command][0]).main(arguments, program):

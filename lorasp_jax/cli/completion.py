@@ -5,7 +5,7 @@ import importlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from envs.cli.errors import parse_arguments
+from lorasp_jax.base.errors import parse_arguments
 from lorasp_jax.cli import commands
 
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from envs.cli.errors import run_command
-from envs.compilation import cache
+from lorasp_jax.base import compilation_cache as cache
+from lorasp_jax.base.errors import run_command
 
 if TYPE_CHECKING:
     from lorasp_jax.training.overrides import Command

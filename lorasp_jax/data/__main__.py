@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from envs.cli.bars import bars
-from envs.cli.errors import parse_arguments, run_command
-from envs.datasets.files import check_local
+from lorasp_jax.base.bars import bars
+from lorasp_jax.base.errors import parse_arguments, run_command
+from lorasp_jax.base.files import check_local
 from lorasp_jax.data.keys import Keys
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.data") -> int:
-    """Run a command and return its exit code: 0 for success, or one of `envs.cli.errors`."""
+    """Run a command and return its exit code: 0 for success, or one of `lorasp_jax.base.errors`."""
     options = parse_arguments(parser(program), arguments)
     import jax  # imported here to keep --help fast
 

@@ -26,16 +26,16 @@ from typing import Any, Self
 import numpy as np
 
 from envs.datasets.episodes import SHARED, Episodes, check_camera
-from envs.datasets.files import as_value_error, read_json, read_text
-from envs.datasets.locks import locked
-from envs.datasets.writing import atomic_folder
+from lorasp_jax.base.digest import DIGEST, verify_digest, with_digest
+from lorasp_jax.base.files import as_value_error, read_json, read_text
+from lorasp_jax.base.json_values import check
+from lorasp_jax.base.locks import locked
+from lorasp_jax.base.writing import atomic_folder
 from lorasp_jax.data.batches import Steps
 from lorasp_jax.data.cache_writer import Column, map_column
 from lorasp_jax.data.checked_images import CheckedImages, checksum
 from lorasp_jax.data.source import Progress, Source
 from lorasp_jax.policies.statistics import Statistics
-from lorasp_jax.storage.digest import DIGEST, verify_digest, with_digest
-from lorasp_jax.storage.json_values import check
 
 FORMAT = "lorasp-cache-1"
 HEADER, STATISTICS = "cache.json", "statistics.json"

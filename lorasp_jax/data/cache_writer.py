@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.datasets.files import as_value_error, check_regular
+from lorasp_jax.base.files import as_value_error, check_regular
 
 
 class Column:

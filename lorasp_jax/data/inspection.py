@@ -14,8 +14,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from envs.datasets.episodes import Episodes
-from envs.datasets.writing import atomic_file
 from envs.rendering.video import side_by_side
+from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.data.lerobot import LeRobot
 from lorasp_jax.data.source import Source
 from lorasp_jax.data.video import downscale

@@ -18,7 +18,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from envs.datasets.episodes import Episodes
-from envs.datasets.files import as_int, check_memory, check_regular
+from lorasp_jax.base import hub
+from lorasp_jax.base.files import as_int, check_memory, check_regular
 from lorasp_jax.data.keys import Keys
 from lorasp_jax.data.lerobot_files import (
     EpisodeEntry,
@@ -28,7 +29,6 @@ from lorasp_jax.data.lerobot_files import (
     read_table,
 )
 from lorasp_jax.data.video import VideoReader, decode_image
-from lorasp_jax.storage import hub
 
 _COLUMNS = ("timestamp", "frame_index", "episode_index", "task_index")
 _MAX_DIM = 10_000  # limit for state and action

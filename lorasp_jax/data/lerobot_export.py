@@ -16,8 +16,8 @@ import pyarrow.parquet as pq
 from PIL import Image
 
 from envs.datasets.episodes import Episodes
-from envs.datasets.locks import locked
-from envs.datasets.writing import atomic_folder, write_text
+from lorasp_jax.base.locks import locked
+from lorasp_jax.base.writing import atomic_folder, write_text
 from lorasp_jax.data.source import Progress, Source
 
 _FILES_PER_CHUNK = 1000

@@ -19,8 +19,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from envs.datasets import files
-from envs.datasets.files import (
+from lorasp_jax.base import files
+from lorasp_jax.base.files import (
     as_int,
     check_memory,
     check_regular,

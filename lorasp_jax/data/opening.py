@@ -7,11 +7,11 @@ from pathlib import Path
 
 from envs.datasets import rlds
 from envs.datasets.episodes import Episodes
+from lorasp_jax.base import hub
 from lorasp_jax.data.cache import HEADER, Cache
 from lorasp_jax.data.lerobot import Keys, LeRobot
 from lorasp_jax.data.lerobot_files import is_lerobot
 from lorasp_jax.data.source import Source
-from lorasp_jax.storage import hub
 
 
 def open_source(where: str | os.PathLike[str], keys: Keys | None = None) -> Source:

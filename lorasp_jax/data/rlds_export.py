@@ -5,8 +5,8 @@ from pathlib import Path
 
 from envs.datasets import rlds
 from envs.datasets.episodes import concatenate
-from envs.datasets.locks import locked
-from envs.datasets.writing import atomic_folder
+from lorasp_jax.base.locks import locked
+from lorasp_jax.base.writing import atomic_folder
 from lorasp_jax.data.source import Progress, Source
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from av.video.reformatter import VideoReformatter
 from PIL import Image
 
-from envs.datasets.files import check_memory, first_line
+from lorasp_jax.base.files import check_memory, first_line
 
 # Allowed containers: FFmpeg would also read playlists, which refer to other files and URLs.
 _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"

@@ -11,14 +11,14 @@ import jax
 import numpy as np
 from rich.progress import Progress
 
-from envs.cli.bars import bars
-from envs.compilation import messages
-from envs.datasets.writing import atomic_file
 from envs.env import Env
 from envs.physics import physics
 from envs.scene.randomization import Draw
 from envs.state import Poses
 from lorasp_jax.adapters import adaptation
+from lorasp_jax.base import messages
+from lorasp_jax.base.bars import bars
+from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.config import Config
 from lorasp_jax.evaluation import metrics, video
 from lorasp_jax.evaluation.programs import compiled_rollout, prepared

@@ -15,10 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import envs
-from envs.compilation import fast_cpu, traced
+from envs import traced
 from envs.env import Env
 from envs.scene.ranges import Randomization
 from envs.state import Poses, State
+from lorasp_jax.base import fast_cpu
 from lorasp_jax.config import Config
 from lorasp_jax.evaluation import rollout
 from lorasp_jax.evaluation.rollout import Rollout, act, as_rollout, num_calls, predict

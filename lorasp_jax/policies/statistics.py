@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lorasp_jax.base.digest import DIGEST, verify_digest, with_digest
 from lorasp_jax.policies.normalization import MIN_SPREAD
-from lorasp_jax.storage.digest import DIGEST, verify_digest, with_digest
 
 NAMES = ("mean", "std", "min", "max", "q01", "q99", "q10", "q90")
 """Names of all supported statistics."""

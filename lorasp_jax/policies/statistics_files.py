@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 import safetensors
 
-from envs.datasets.files import path_beside, read_text
+from lorasp_jax.base import hub
+from lorasp_jax.base.files import path_beside, read_text
 from lorasp_jax.policies.statistics import NAMES, Statistics, validate
-from lorasp_jax.storage import hub
 
 OURS, OPENPI, DATASET = "statistics.json", "norm_stats.json", "stats.json"
 EPISODES = "episodes_stats.jsonl"

@@ -54,9 +54,9 @@ def load_tokenizer(where: str | os.PathLike[str]) -> Tokenizer:
     Raises:
         ValueError: the path does not exist or contains no valid tokenizer.
     """
-    from envs.datasets.files import TEXT_BYTES
+    from lorasp_jax.base import hub
+    from lorasp_jax.base.files import TEXT_BYTES
     from lorasp_jax.policies.pretrained_tokenizers import SentencePiece, TokenizersFile
-    from lorasp_jax.storage import hub
 
     if not os.fspath(where):
         return Offline()

@@ -7,13 +7,13 @@ from pathlib import Path
 
 from rich.console import Console
 
-from envs.cli.errors import parse_arguments, run_command
+from lorasp_jax.base.errors import parse_arguments, run_command
 
 RANK_MAP = "rank-map"
 
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.report") -> int:
-    """Write a run's report.html or rank maps; return the exit code, one of `envs.cli.errors`."""
+    """Write a run's report.html or rank maps; return an exit code of `base.errors`."""
     maps = [*arguments[:1]] == [RANK_MAP]
     if maps:
         options = parse_arguments(rank_map_parser(f"{program} {RANK_MAP}"), arguments[1:])
@@ -30,7 +30,7 @@ def _write_report(options: argparse.Namespace, console: Console) -> None:
 
 
 def _write_rank_maps(options: argparse.Namespace, console: Console) -> None:
-    from envs.compilation import cache
+    from lorasp_jax.base import compilation_cache as cache
     from lorasp_jax.report import rank_map
 
     cache.enable()

@@ -10,8 +10,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from envs.datasets.files import join_inside, read_bytes
-from envs.datasets.writing import write_text
+from lorasp_jax.base.files import join_inside, read_bytes
+from lorasp_jax.base.writing import write_text
 from lorasp_jax.report import figures
 from lorasp_jax.training import records
 from lorasp_jax.training.run_folder import (

@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.compilation import fast_cpu, messages
 from envs.env import Env
 from envs.scene.randomization import Draw
 from envs.state import Poses, State
+from lorasp_jax.base import fast_cpu, messages
 from lorasp_jax.evaluation import metrics
 from lorasp_jax.evaluation.rollout import RECORDED_WORLDS
 from lorasp_jax.peft import Aux

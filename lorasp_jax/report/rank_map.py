@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 
 import envs
-from envs.datasets.files import check_local
-from envs.datasets.writing import atomic_file
 from envs.env import Env
 from envs.rendering.video import write_gif, write_video
 from lorasp_jax.adapters.io import native
+from lorasp_jax.base.files import check_local
+from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.evaluation.video import render_episode
 from lorasp_jax.report import rank_film
 from lorasp_jax.report.rank_episode import Episode, Recorder

@@ -9,13 +9,13 @@ from flax import nnx
 import envs
 from lorasp_jax import models
 from lorasp_jax.adapters.compress import quantization
+from lorasp_jax.base import hub
 from lorasp_jax.config import Config
 from lorasp_jax.kernels.quantized_weights import Kind
 from lorasp_jax.models import backbone
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.checkpoints import loading
 from lorasp_jax.models.config import BackboneConfig
-from lorasp_jax.storage import hub
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run_folder import read_json
 

@@ -18,10 +18,10 @@ import jax
 import orbax.checkpoint as ocp
 from rich.console import Console
 
-from envs.cli.errors import DISK_FULL
-from envs.datasets.writing import rename
+from lorasp_jax.base.digest import digest
+from lorasp_jax.base.errors import DISK_FULL
+from lorasp_jax.base.writing import rename
 from lorasp_jax.models.checkpoints import orbax_folders
-from lorasp_jax.storage.digest import digest
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.step import TrainState
 

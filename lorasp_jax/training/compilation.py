@@ -2,7 +2,7 @@
 
 import jax
 
-from envs.compilation import fast_cpu
+from lorasp_jax.base import fast_cpu
 
 _ON_GPU: dict[str, str | bool] = {
     "xla_gpu_enable_triton_gemm": False,

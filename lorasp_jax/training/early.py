@@ -7,9 +7,9 @@ import jax
 import numpy as np
 from flax import nnx
 
-from envs.compilation import messages
 from envs.datasets.episodes import Episodes
 from lorasp_jax.adapters import adaptation
+from lorasp_jax.base import messages
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import flatten
 from lorasp_jax.policies.policy import Policy

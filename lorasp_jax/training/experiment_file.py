@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from lorasp_jax.storage import shipped
+from lorasp_jax.base import shipped
 
 
 def call(path: Path, function: str, scale: str) -> Any:

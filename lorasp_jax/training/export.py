@@ -13,6 +13,8 @@ import jax.numpy as jnp
 from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io import native
+from lorasp_jax.base import hub
+from lorasp_jax.base.digest import digest
 from lorasp_jax.kernels.quantized_weights import Kind
 from lorasp_jax.models import backbone
 from lorasp_jax.policies import tokenizer
@@ -20,8 +22,6 @@ from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.statistics import Statistics
-from lorasp_jax.storage import hub
-from lorasp_jax.storage.digest import digest
 from lorasp_jax.training.base import TRAINING, quantized
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import read_json, write_json

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import jax
 from flax import nnx
 
-from envs.cli.bars import bars
 from lorasp_jax.adapters import adaptation
+from lorasp_jax.base.bars import bars
 from lorasp_jax.config import Config, OptimConfig
 from lorasp_jax.data.batches import Raw, encode
 from lorasp_jax.policies.policy import Policy

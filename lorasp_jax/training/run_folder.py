@@ -19,14 +19,14 @@ from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.proto.summary_pb2 import Summary
 
-from envs.datasets.files import as_value_error, check_only_files, read_bytes
-from envs.datasets.locks import acquire
-from envs.datasets.writing import TEMPORARY_SUFFIX, write_text
 from envs.scene.ranges import Randomization
+from lorasp_jax.base.digest import verify_digest, with_digest
+from lorasp_jax.base.files import as_value_error, check_only_files, read_bytes
+from lorasp_jax.base.json_values import check
+from lorasp_jax.base.locks import acquire
+from lorasp_jax.base.writing import TEMPORARY_SUFFIX, write_text
 from lorasp_jax.config import Config
 from lorasp_jax.peft._settings import upgrade
-from lorasp_jax.storage.digest import verify_digest, with_digest
-from lorasp_jax.storage.json_values import check
 from lorasp_jax.training import records
 from lorasp_jax.training.distributed import processes
 

@@ -15,12 +15,13 @@ from rich.console import Console
 from rich.progress import TaskID
 
 import envs
-from envs.cli.bars import bars
 from envs.datasets.episodes import Episodes
 from envs.env import Env
 from lorasp_jax import peft
 from lorasp_jax.adapters import adaptation, summary
 from lorasp_jax.adapters.compress import calibration
+from lorasp_jax.base import hub
+from lorasp_jax.base.bars import bars
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Batch, encode, flatten, sample_batch, windows
 from lorasp_jax.data.checked_images import load_images
@@ -33,7 +34,6 @@ from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor, Statistics, check_delta, robot_slots, to_delta
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Tokenizer, load_tokenizer
-from lorasp_jax.storage import hub
 from lorasp_jax.training.base import base_model, quantized, with_config
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.dataset import as_cache, is_simulated, open_dataset, outline

@@ -11,8 +11,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from envs.compilation import messages
 from envs.datasets.episodes import Episodes
+from lorasp_jax.base import messages
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Raw, Steps, fit_to_size, flatten
 from lorasp_jax.data.checked_images import load_images

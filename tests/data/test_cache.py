@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from envs.datasets.episodes import Episodes
+from lorasp_jax.base.digest import DIGEST, with_digest
 from lorasp_jax.data import cache, rlds_export
 from lorasp_jax.data.batches import flatten, gather
 from lorasp_jax.data.lerobot import Keys, LeRobot
 from lorasp_jax.data.opening import open_source
-from lorasp_jax.storage.digest import DIGEST, with_digest
 from tests.data.lerobots import GOLDEN, VERSIONS, copied, digest, edit_rows, golden, set_value
 from tests.runs import random_episodes
 

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from envs.datasets.locks import locked
+from lorasp_jax.base.locks import locked
 from lorasp_jax.data import cache
 from lorasp_jax.data.__main__ import main
 from lorasp_jax.data.cache import Cache

@@ -9,7 +9,7 @@ from typing import ClassVar
 import gymnasium
 import numpy as np
 
-from lorasp_jax.evaluation.gymnasium import Task
+from lorasp_jax.extras.judge import Task
 
 
 class Line(gymnasium.Env):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from websockets.sync.server import serve
 
-from lorasp_jax.serving import wire
+from lorasp_jax.extras.serving import wire
 
 
 @contextlib.contextmanager

@@ -11,12 +11,12 @@ import pytest
 from flax import nnx
 from jax import monitoring
 
-from envs.compilation import fast_cpu
-from envs.compilation.alarms import COMPILATION
 from envs.scene.ranges import Randomization
 from envs.state import Data, State
 from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
+from lorasp_jax.base import fast_cpu
+from lorasp_jax.base.alarms import COMPILATION
 from lorasp_jax.config import EvaluationConfig
 from lorasp_jax.evaluation import make_rollout, programs
 from lorasp_jax.evaluation.programs import compiled_rollout, prepared, split_rollout

@@ -213,7 +213,7 @@ def test_lowers_without_the_device(platform, kind, implementation, call):
 
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
 def test_a_program_does_not_depend_on_the_call_stack():
-    """`envs.compilation.cache.enable` leaves it out, so that JAX finds the program on disk."""
+    """`base.compilation_cache.enable` leaves it out, so that JAX finds the program on disk."""
     device = jax.sharding.AbstractDevice("NVIDIA H200", num_cores=None, platform="cuda")
     mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
     run = jax.jit(lambda s: gate.energy_gate(s, 0.9, implementation="pallas"))

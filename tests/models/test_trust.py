@@ -8,7 +8,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 
-from envs.datasets.files import TEXT_BYTES
+from lorasp_jax.base.files import TEXT_BYTES
 from lorasp_jax.models.checkpoints import layouts, loading, native, published
 from lorasp_jax.models.checkpoints.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
 from lorasp_jax.models.pi0 import Pi0Config

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
+from lorasp_jax.base.digest import with_digest
 from lorasp_jax.report import callback
-from lorasp_jax.storage.digest import with_digest
 from lorasp_jax.training.run_folder import write_json
 from tests.report.test_html import folder, without_base  # noqa: F401
 from tests.runs import RESULTS

@@ -5,8 +5,8 @@ import re
 
 import pytest
 
+from lorasp_jax.base.digest import with_digest
 from lorasp_jax.report.html import speed, write_report
-from lorasp_jax.storage.digest import with_digest
 from lorasp_jax.training.run_folder import STOPPED, MetricsLog, to_json, write_json
 from tests.runs import CONFIG, RESULTS, finish
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from lorasp_jax.storage.digest import digest
+from lorasp_jax.base.digest import digest
 from lorasp_jax.training.checkpoint import COMMIT_MARKER, Checkpoints
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.guard import Guard

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from envs.compilation import fast_cpu
+from lorasp_jax.base import fast_cpu
 from lorasp_jax.training import compilation, loop
 from tests.runs import make_run
 

@@ -12,12 +12,12 @@ import pytest
 from rich.console import Console
 
 from lorasp_jax.adapters import adaptation
+from lorasp_jax.base.digest import with_digest
 from lorasp_jax.config import DataConfig
 from lorasp_jax.data.batches import flatten
 from lorasp_jax.evaluation.callback import NoEvaluation
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.report.html import write_report
-from lorasp_jax.storage.digest import with_digest
 from lorasp_jax.training import setup
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.cost.speed import Speed

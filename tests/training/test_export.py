@@ -16,13 +16,13 @@ from flax import nnx
 from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io import native
+from lorasp_jax.base.digest import with_digest
 from lorasp_jax.config import ModelConfig
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import FullFineTuning
 from lorasp_jax.policies import tokenizer
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Statistics
-from lorasp_jax.storage.digest import with_digest
 from lorasp_jax.training import base, export
 from tests import ROOT
 from tests.models.random_models import random_backbone

@@ -12,8 +12,8 @@ import pytest
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from envs.cli.errors import DISK_FULL
 from envs.scene.ranges import Randomization
+from lorasp_jax.base.errors import DISK_FULL
 from lorasp_jax.config import Config, DataConfig
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.training import run_folder

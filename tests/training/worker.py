@@ -28,7 +28,7 @@ def main(args: argparse.Namespace) -> None:
     import jax
     from rich.console import Console
 
-    from envs.compilation import cache
+    from lorasp_jax.base import compilation_cache as cache
 
     cache.enable()
     xla.drop_training_step_options()

@@ -161,7 +161,7 @@ def _local_folder(folder: str | os.PathLike[str]) -> pathlib.Path:
     """Return the folder's local path, after downloading a repository hf://owner/name."""
     if not isinstance(folder, str) or "://" not in folder:
         return validate.folder(folder)
-    from lorasp_jax.storage import hub
+    from lorasp_jax.base import hub
 
     return hub.local(folder, only=[CONFIG, TENSORS])
 

@@ -23,10 +23,10 @@ from flax import nnx
 from lorasp_jax import peft
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.layers import nnx_layers
+from lorasp_jax.base import digest
 from lorasp_jax.dense import AdapterParam, validate
 from lorasp_jax.peft import Method, to_settings
 from lorasp_jax.peft._fields import short
-from lorasp_jax.storage import digest
 
 TENSORS, DESCRIPTION = "adapter.safetensors", "adapter.json"
 FORMAT, VERSION = "lorasp_jax adapter", 2
@@ -238,7 +238,7 @@ def _checked_metadata(metadata: Any) -> dict[str, Any]:
 
 def write_atomic(path: pathlib.Path, data: bytes) -> None:
     """Write a file atomically, replacing an existing one."""
-    from envs.datasets.writing import write_bytes  # imported here because envs sets an XLA flag
+    from lorasp_jax.base.writing import write_bytes  # imported here because envs sets an XLA flag
 
     write_bytes(path, data)
 

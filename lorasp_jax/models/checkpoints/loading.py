@@ -9,14 +9,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-from envs.datasets.files import read_text
+from lorasp_jax.base import hub
+from lorasp_jax.base.files import read_text
 from lorasp_jax.models import backbone
 from lorasp_jax.models.checkpoints import lerobot_config, native, published
 from lorasp_jax.models.checkpoints.layouts import ModelMismatchError
 from lorasp_jax.models.checkpoints.tensor_files import weight_files
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.inputs import InputConfig
-from lorasp_jax.storage import hub
 
 _log = logging.getLogger(__name__)
 

@@ -20,10 +20,10 @@ import numpy as np
 import safetensors.numpy
 from flax import nnx
 
-from envs.datasets.files import check_local, read_text
-from envs.datasets.writing import write_bytes
 from lorasp_jax.adapters.combine.adapter_set import AdapterSetParam
 from lorasp_jax.adapters.compress.quantization import is_quantized
+from lorasp_jax.base.files import check_local, read_text
+from lorasp_jax.base.writing import write_bytes
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models import backbone
 from lorasp_jax.models.checkpoints.tensor_files import INDEX, SINGLE, TensorFiles, weight_files

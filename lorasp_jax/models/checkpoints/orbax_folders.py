@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from envs.datasets.files import TEXT_BYTES, RefusedError, check_memory, check_only_files
+from lorasp_jax.base.files import TEXT_BYTES, RefusedError, check_memory, check_only_files
 
 MANIFEST = "manifest.ocdbt"
 """Root file of a TensorStore database, read whole; a checkpoint may have several."""

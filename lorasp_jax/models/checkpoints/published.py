@@ -26,8 +26,8 @@ import orbax.checkpoint as ocp
 import safetensors.numpy
 from flax import nnx
 
-from envs.datasets.files import check_local
-from envs.datasets.writing import atomic_file
+from lorasp_jax.base.files import check_local
+from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.models.checkpoints import layouts, orbax_folders
 from lorasp_jax.models.checkpoints.native import base_arrays, by_path, named_arrays, set_arrays
 from lorasp_jax.models.checkpoints.tensor_files import INDEX, SINGLE, TensorFiles, weight_files

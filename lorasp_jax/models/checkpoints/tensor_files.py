@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import safetensors
 
-from envs.datasets.files import check_memory, path_beside, read_text
+from lorasp_jax.base.files import check_memory, path_beside, read_text
 
 SINGLE, INDEX = "model.safetensors", "model.safetensors.index.json"
 

@@ -7,20 +7,20 @@ from pathlib import Path
 
 from rich.console import Console
 
-from envs.cli.errors import parse_arguments, run_command
+from lorasp_jax.base.errors import parse_arguments, run_command
 
 
 def main(
     arguments: Sequence[str], program: str = "python -m lorasp_jax.training.correction"
 ) -> int:
-    """Train and save a head; return the exit code, one of `envs.cli.errors`."""
+    """Train and save a head; return the exit code, one of `lorasp_jax.base.errors`."""
     options = parse_arguments(parser(program), arguments)
     return run_command(lambda: _train(options.run), Console(stderr=True))
 
 
 def _train(run: Path) -> None:
-    from envs.cli.bars import bars
-    from envs.compilation import cache
+    from lorasp_jax.base import compilation_cache as cache
+    from lorasp_jax.base.bars import bars
     from lorasp_jax.training.correction.run import train
 
     cache.enable()

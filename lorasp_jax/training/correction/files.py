@@ -14,11 +14,11 @@ import numpy as np
 import safetensors.numpy
 from flax import nnx
 
-from envs.datasets.files import as_value_error, read_bytes
-from envs.datasets.writing import write_bytes
+from lorasp_jax.base.digest import digest
+from lorasp_jax.base.files import as_value_error, read_bytes
+from lorasp_jax.base.writing import write_bytes
 from lorasp_jax.policies.correction import CorrectionHead
 from lorasp_jax.policies.policy import Policy
-from lorasp_jax.storage.digest import digest
 from lorasp_jax.training import records
 from lorasp_jax.training.run_folder import read_json, write_json
 

@@ -16,7 +16,7 @@ import numpy as np
 import optax
 from flax import nnx
 
-from envs.compilation import fast_cpu
+from lorasp_jax.base import fast_cpu
 from lorasp_jax.data.batches import Raw, Steps, gather, windows
 from lorasp_jax.policies.correction import CorrectionHead, residual
 from lorasp_jax.policies.policy import Policy

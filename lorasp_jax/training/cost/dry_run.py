@@ -10,9 +10,9 @@ from rich.console import Console
 from rich.table import Table
 
 from lorasp_jax.adapters import adaptation
+from lorasp_jax.base import hub
 from lorasp_jax.config import Config
 from lorasp_jax.dense import AdaptedLayer
-from lorasp_jax.storage import hub
 from lorasp_jax.training import early, setup
 from lorasp_jax.training.base import base_model
 from lorasp_jax.training.cost import preflight

@@ -12,9 +12,9 @@ from flax import nnx
 from lorasp_jax import peft
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io.native import load_adapters, save_adapters
+from lorasp_jax.base.digest import with_digest
 from lorasp_jax.dense import Dense
 from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP
-from lorasp_jax.storage.digest import with_digest
 
 SP = LoRASP(rank=8, hidden_width=4, energy_target=0.8)
 

@@ -11,9 +11,10 @@ from PIL import Image
 
 import envs
 from envs import __main__ as command_line
-from envs.datasets import locks, rlds, writing
+from envs.datasets import rlds
 from envs.datasets.episodes import Episodes
 from envs.experts import collection
+from lorasp_jax.base import locks, writing
 from tests.cases import mostly_slow
 from tests.envs import user_arm
 from tests.envs.children import COLLECT, MOMENTS, REPLACING, fake_record, run_child

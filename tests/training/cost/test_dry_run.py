@@ -8,13 +8,12 @@ import pytest
 from flax import nnx
 from rich.console import Console
 
-from envs.compilation import messages
 from lorasp_jax.adapters import adaptation
+from lorasp_jax.base import hub, messages
 from lorasp_jax.config import DataConfig
 from lorasp_jax.data.batches import flatten
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import LoRA
-from lorasp_jax.storage import hub
 from lorasp_jax.training import early, setup
 from lorasp_jax.training.cost import dry_run, preflight
 from lorasp_jax.training.distributed import mesh as meshes

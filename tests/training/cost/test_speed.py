@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from envs.compilation import messages
+from lorasp_jax.base import messages
 from lorasp_jax.data.batches import flatten
 from lorasp_jax.training.cost import flops, speed
 from lorasp_jax.training.cost.speed import Speed

@@ -1,1 +1,0 @@
-"""XLA settings for simulation, compilation cache and messages."""

@@ -1,0 +1,1 @@
+"""Products built on the core, each with its own optional dependencies."""

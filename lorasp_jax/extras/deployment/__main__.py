@@ -1,0 +1,57 @@
+"""Compare or save the deployment variants of a run (`lorasp-jax deploy --help`)."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from lorasp_jax.base.errors import parse_arguments, run_command
+
+
+def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.deployment") -> int:
+    """Measure all variants, or save one; return the exit code, one of `lorasp_jax.base.errors`."""
+    options = parse_arguments(parser(program), arguments)
+    return run_command(lambda: _run(options), Console(stderr=True))
+
+
+def parser(program: str) -> argparse.ArgumentParser:
+    """Return the argument parser of this command."""
+    parser = argparse.ArgumentParser(
+        prog=program,
+        description="Compare forms in which a LoRA-SP run can be deployed, or save one of them.",
+        epilog="variants: whole, pruned, half or merged, then -bf16, -int8 or -nf4, such as "
+        "half-int8. See docs/deployment.md.",
+    )
+    add = parser.add_argument
+    add("run", type=Path, help="folder of a finished LoRA-SP run, such as runs/multitask")
+    add("--variants", nargs="+", default=[], metavar="VARIANT", help="default: all")
+    text = "episodes per task (default: as in the run's evaluation)"
+    add("--episodes", type=int, default=0, metavar="N", help=text)
+    add("--save", default="", metavar="VARIANT", help="write this variant instead of measuring")
+    add("--out", type=Path, metavar="DIR", help="folder to write, which the policy server serves")
+    return parser
+
+
+def _run(options: argparse.Namespace) -> None:
+    from lorasp_jax.base import compilation_cache as cache
+    from lorasp_jax.extras.deployment import measurement, saving
+
+    if bool(options.save) != bool(options.out):
+        raise ValueError("--save and --out must be given together")
+    if options.save and (options.variants or options.episodes):
+        raise ValueError("--variants and --episodes are for measuring: leave out --save")
+    cache.enable()
+    if options.save:
+        saving.save(options.run, options.save, options.out)
+        print(f"written: {options.out}")
+        return
+    say = lambda name: print(f"measuring {name}", file=sys.stderr, flush=True)  # noqa: E731
+    found = measurement.measure(options.run, options.variants, options.episodes, progress=say)
+    print(measurement.table(found), end="")
+    print(f"written: {options.run / measurement.FILE}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

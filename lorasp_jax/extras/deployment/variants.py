@@ -1,0 +1,122 @@
+"""Make the deployment variants of a LoRA-SP policy: forms of the adapters times stored bases."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+import lorasp_jax
+from envs.datasets.episodes import Episodes
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.data.batches import Batch
+from lorasp_jax.dense import AdapterParam
+from lorasp_jax.extras.study.held_out import keyed_batches
+from lorasp_jax.kernels.quantized_weights import Kind, QuantizedKernel
+from lorasp_jax.models.backbone import Backbone
+from lorasp_jax.peft.lora_sp.bank import BankMethod
+from lorasp_jax.policies.policy import Policy
+from lorasp_jax.training.base import quantized
+
+BATCH_SIZE, BATCHES = 64, 8
+"""Windows per batch, and batches per task, for calibration and for the loss."""
+
+Batches = Sequence[tuple[jax.Array, Batch]]
+"""Batches with the keys of their losses."""
+
+
+def _whole(model: Backbone, batches: Batches) -> Backbone:
+    del batches
+    return model
+
+
+def _pruned(model: Backbone, batches: Batches) -> Backbone:
+    return lorasp_jax.prune(model, batches, for_kernel=True, forward=forward)[0]
+
+
+def _half(model: Backbone, batches: Batches) -> Backbone:
+    (rank,) = {method.rank for method in adaptation.methods(model).values() if is_bank(method)}
+    return lorasp_jax.prune(model, batches, rank=max(rank // 2, 1), forward=forward)[0]
+
+
+def _merged(model: Backbone, batches: Batches) -> Backbone:
+    return in_bf16(lorasp_jax.merge(lorasp_jax.distill(model, batches, forward=forward)[0]))
+
+
+FORMS: dict[str, Callable[[Backbone, Batches], Backbone]] = {
+    "whole": _whole,
+    "pruned": _pruned,
+    "half": _half,
+    "merged": _merged,
+}
+"""Forms by name: as trained; pruned to the directions in use on calibration data, and those more
+that a kernel needs; pruned to the most used half of the bank; distilled to LoRA and merged."""
+BASES: dict[str, Kind | None] = {"bf16": None, "int8": "int8", "nf4": "nf4"}
+"""How the base is stored."""
+
+
+class Variant(NamedTuple):
+    """A form of the adapters on a base."""
+
+    form: str
+    base: str
+
+    def __str__(self) -> str:
+        return f"{self.form}-{self.base}"
+
+
+VARIANTS = {str(v): v for v in (Variant(form, base) for form in FORMS for base in BASES)}
+
+
+def find(name: str) -> Variant:
+    """Return a variant by name.
+
+    Raises:
+        ValueError: unknown variant.
+    """
+    if name not in VARIANTS:
+        raise ValueError(f"unknown variant {name!r}: choose one of {', '.join(VARIANTS)}")
+    return VARIANTS[name]
+
+
+def is_bank(method: Any) -> bool:
+    """Return whether a method has LoRA-SP's bank of directions."""
+    return isinstance(method, BankMethod)
+
+
+def in_form(policy: Policy, form: str, episodes: Mapping[str, Episodes]) -> Policy:
+    """Return a policy whose adapters have another form, and whose frozen weights are in bf16.
+
+    Args:
+        policy: a LoRA-SP policy; not modified.
+        form: one of `FORMS`.
+        episodes: calibration data by task; all tasks count alike.
+    """
+    model = in_bf16(policy.model)
+    policy = dataclasses.replace(policy, model=model)
+    by_task = keyed_batches(policy, episodes, BATCH_SIZE, BATCHES)
+    together = [pair for pairs in by_task.values() for pair in pairs]
+    return dataclasses.replace(policy, model=FORMS[form](model, together))
+
+
+def on_base(policy: Policy, base: str) -> Policy:
+    """Return the policy with its base stored as one of `BASES`."""
+    return dataclasses.replace(policy, model=quantized(policy.model, BASES[base]))
+
+
+def in_bf16(model: Backbone) -> Backbone:
+    """Return the model with its frozen weights rounded to bf16, as they are saved."""
+    graphdef, frozen, rest = nnx.split(model, nnx.All(nnx.Param, nnx.Not(AdapterParam)), ...)
+    is_kernel = lambda leaf: isinstance(leaf, QuantizedKernel)  # noqa: E731
+    frozen = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), frozen, is_leaf=is_kernel)
+    model = nnx.merge(graphdef, frozen, rest)
+    model.config = dataclasses.replace(model.config, param_dtype="bfloat16")
+    return model
+
+
+def forward(model: Any, keyed: tuple[jax.Array, Batch]) -> Any:
+    """Return the model's loss on a batch, for calibration."""
+    key, batch = keyed
+    return model.loss(key, batch.observation, batch.actions, action_mask=batch.action_mask)

@@ -1,0 +1,141 @@
+"""Judge a policy in a Gymnasium environment: `python -m lorasp_jax.extras.judge --help`."""
+
+import argparse
+import contextlib
+import functools
+import importlib.util
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from lorasp_jax.extras.judge.actors import Actor, RunActor, ServerActor
+from lorasp_jax.extras.judge.judge import judge
+from lorasp_jax.extras.judge.parallel import judge_in_processes
+from lorasp_jax.extras.judge.task import Task, load_tasks
+
+# As in `lorasp_jax.base.errors`, which imports JAX: this command runs without it.
+REFUSED = 2
+"""Exit code after bad input."""
+INTERRUPTED = 130
+"""Exit code after Ctrl-C."""
+
+
+def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.judge") -> int:
+    """Judge a policy; return the exit code."""
+    options = parser(program).parse_args(arguments)
+    try:
+        _run(options)
+    except (ValueError, OSError) as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return REFUSED
+    except KeyboardInterrupt:
+        print("interrupted; nothing was written but films", file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
+def _run(options: argparse.Namespace) -> None:
+    _check(options)
+    settings: dict[str, Any] = {"seed": options.seed, "films": options.films}
+    if sys.stderr.isatty():
+        settings["progress"] = _print_progress
+    if options.processes > 1:
+        where = options.env, options.tasks, _server(options), options.episodes, options.processes
+        results = judge_in_processes(*where, **settings)
+    else:
+        tasks = load_tasks(options.env, options.tasks)
+        with _actor(options, tasks) as actor:
+            results = judge(tasks, actor, options.episodes, **settings)
+    if sys.stderr.isatty():
+        print(file=sys.stderr)
+    print(table(results))
+    if options.out:
+        source = options.server or str(options.run)
+        described = {"policy": source, "env": options.env, "seed": options.seed, **results}
+        temporary = options.out.with_name(f".{options.out.name}.tmp")
+        temporary.write_text(json.dumps(described, indent=1))
+        temporary.replace(options.out)  # so that a file is always whole
+        print(f"written: {options.out}")
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Raise ValueError for options that cannot work, before anything is loaded."""
+    if (options.run is None) == (not options.server):
+        raise ValueError("give either the folder of a run or --server, and not both")
+    if options.processes < 1:
+        raise ValueError(f"--processes must be at least 1, got {options.processes}")
+    if options.processes > 1 and not options.server:
+        raise ValueError("--processes needs --server, whose policy all processes share")
+    if options.out and options.out.exists():
+        raise ValueError(f"{options.out} exists: choose another --out")
+    if options.films and options.films.exists():
+        raise ValueError(f"{options.films} exists: choose another --films")
+    if options.films and importlib.util.find_spec("PIL") is None:
+        raise ValueError("--films needs pip install pillow")
+
+
+@contextlib.contextmanager
+def _actor(options: argparse.Namespace, tasks: Sequence[Task]) -> Iterator[Actor]:
+    if not options.server:
+        yield RunActor(options.run, [task.instruction for task in tasks])
+        return
+    with contextlib.closing(_server(options)()) as server:
+        yield server
+
+
+def _server(options: argparse.Namespace) -> Callable[[], ServerActor]:
+    """Return what connects to the server; processes can import it, unlike this module."""
+    return functools.partial(ServerActor, options.server, token=options.token, wait=options.wait)
+
+
+def _print_progress(task: str, done: int, successes: int) -> None:
+    print(f"\r\033[K{task}: {successes} of {done}", end="", file=sys.stderr, flush=True)
+
+
+def table(results: dict[str, Any]) -> str:
+    """Format success rates with their intervals, one line per task and group."""
+    rows = {**results["tasks"], **results["groups"], "all": results}
+    width = max(map(len, rows))
+    lines = []
+    for name, row in rows.items():
+        low, high = (100 * bound for bound in row["ci95"])
+        wins = round(row["success"] * row["episodes"])
+        lines.append(
+            f"{name:{width}}  {100 * row['success']:5.1f} %  [{low:.1f}, {high:.1f}]  "
+            f"{wins} of {row['episodes']}"
+        )
+    return "\n".join([*lines, f"{results['steps_per_second']:.0f} environment steps/s"])
+
+
+def parser(program: str) -> argparse.ArgumentParser:
+    """Define the options."""
+    parser = argparse.ArgumentParser(
+        prog=program,
+        description="Judge a policy in a Gymnasium environment by the environment's own success. "
+        "With --server, JAX is not needed. Execution under latency: "
+        "python -m lorasp_jax.extras.latency.",
+    )
+    add = parser.add_argument
+    add("run", type=Path, nargs="?", help="folder of a run, such as runs/NAME")
+    add("--server", default="", metavar="URL", help="ask a policy server, such as ws://HOST:PORT")
+    add("--token", default="", help="token of the server, if it requires one")
+    text = "how long to wait for the server [s] (default: %(default)g)"
+    add("--wait", type=float, default=0.0, metavar="S", help=text)
+    text = "function without arguments that returns one or more lorasp_jax Tasks"
+    add("--env", required=True, metavar="MODULE:FACTORY", help=text)
+    add("--tasks", nargs="+", default=(), metavar="TASK", help="tasks (default: all)")
+    text = "episodes per task (default: %(default)s)"
+    add("--episodes", type=int, default=10, metavar="N", help=text)
+    text = "tasks judged at once, each in a process; needs --server (default: %(default)s)"
+    add("--processes", type=int, default=1, metavar="N", help=text)
+    text = "seed of the first episode; the next has the next seed (default: %(default)s)"
+    add("--seed", type=int, default=0, help=text)
+    add("--out", type=Path, metavar="FILE", help="JSON file to write")
+    add("--films", type=Path, metavar="FOLDER", help="film the first episode of each task")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

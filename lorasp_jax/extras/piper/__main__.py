@@ -1,0 +1,179 @@
+"""Run a policy on a PiPER: `python -m lorasp_jax.extras.piper --task press --dry-run`."""
+
+import argparse
+import contextlib
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from lorasp_jax.base.errors import parse_arguments, run_command
+from lorasp_jax.base.locks import locked
+from lorasp_jax.extras.piper import options as shared
+from lorasp_jax.extras.piper.arm import PiperArm
+from lorasp_jax.extras.piper.asking import InThread
+from lorasp_jax.extras.piper.cameras import OpenCameras
+from lorasp_jax.extras.piper.clock import RealClock
+from lorasp_jax.extras.piper.recording import Recording
+from lorasp_jax.extras.piper.safety import Unsafe
+from lorasp_jax.extras.piper.session import Session, Settings
+from lorasp_jax.extras.piper.teaching import Lesson
+
+HELD = 3
+"""Exit code after a problem in which the arm held."""
+
+
+def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.piper") -> int:
+    """Run one episode; return the exit code: `HELD`, or one of `lorasp_jax.base.errors`."""
+    options = parse_arguments(parser(program), arguments)
+    return run_command(lambda: _run(options), Console(stderr=True))
+
+
+def parser(program: str) -> argparse.ArgumentParser:
+    """Return the argument parser of this command."""
+    parser = argparse.ArgumentParser(
+        prog=program,
+        description="Run a policy on an AgileX PiPER, or record demonstrations. "
+        "Read docs/robot.md first.",
+        epilog="Ctrl-C brakes and holds. An emergency stop lets the arm sink: keep it for people.",
+    )
+    add = parser.add_argument
+    add("--task", default="", help="one of the simulation's tasks, for its request and time limit")
+    add("--seconds", type=float, default=0.0, help="length; default: the task's limit, or 60")
+    add("--dry-run", action="store_true", help="print commands instead of sending them")
+    add("--record", type=Path, metavar="FOLDER", help="add the episode to an RLDS dataset, which "
+        "train.py takes as --data.source")  # fmt: skip
+    add("--teach", choices=("hand", "leader"), help="record what a person shows the arm, guided by "
+        "hand or through a leader arm, in place of a policy")  # fmt: skip
+    add("--image-size", type=int, default=224, help="of recorded pictures [px] (default: 224)")
+    add = parser.add_argument_group("robot").add_argument
+    add("--can", default="can0", help="CAN interface (default: %(default)s)")
+    add("--bus", choices=("socketcan", "slcan"), default="socketcan", help="its kind "
+        "(default: %(default)s)")  # fmt: skip
+    add("--camera", action="append", default=[], metavar="NAME=SOURCE", help="such as "
+        "side=/dev/video0; once for each of the policy's cameras")  # fmt: skip
+    shared.add_shared(parser)
+    return parser
+
+
+def _run(options: argparse.Namespace) -> int:
+    task = shared.task(options.task) if options.task else None
+    prompt = options.prompt or (task.instructions[0] if task else "")
+    if not prompt:
+        raise ValueError("pass --task or --prompt: the policy must be told what to do")
+    if options.teach and not options.record:
+        raise ValueError("--teach needs --record FOLDER")
+    if options.record and options.dry_run:
+        raise ValueError("--record has nothing to record in a --dry-run")
+    settings = shared.settings(options, prompt, dry_run=options.dry_run)
+    seconds = options.seconds or (task.time_limit if task else 60.0)
+    with contextlib.ExitStack() as stack:
+        server = None if options.teach else stack.enter_context(shared.policy(options))
+        cameras = _cameras(options, server)
+        stack.callback(cameras.close)
+        if server:
+            server.warn([prompt])
+        recorder = _recorder(options, task, prompt, stack)
+        arm = _arm(options)
+        stack.callback(arm.close)
+        if not (options.dry_run or options.teach == "leader"):
+            arm.enable(shared.limits(options))
+        if server:
+            log = stack.enter_context(shared.opened_log(options))
+            problem = _execute(options, settings, (arm, cameras, server, recorder, log), seconds)
+        else:
+            problem = _teach(options, (arm, cameras, recorder), seconds)
+        if recorder and not problem:
+            _keep(recorder)
+        return HELD if problem else 0
+
+
+def _execute(
+    options: argparse.Namespace, settings: Settings, parts: tuple, seconds: float
+) -> str | None:
+    """Run the policy; return the problem in a sentence, if there is one."""
+    arm, cameras, server, recorder, log = parts
+    server.reset()
+    more = {"recorder": recorder, "log": log}
+    limits = shared.limits(options)
+    session = Session(arm, cameras, InThread(server), limits, settings, RealClock(), **more)
+    shared.stop_on_signals(session)
+    return session.run(seconds)
+
+
+def _teach(options: argparse.Namespace, parts: tuple, seconds: float) -> str | None:
+    """Record a person; return the problem in a sentence, if there is one."""
+    arm, cameras, recorder = parts
+    way = {"way": options.teach, "control_dt": options.control_dt}
+    lesson = Lesson(arm, cameras, recorder, shared.limits(options), RealClock(), **way)
+    shared.stop_on_signals(lesson)
+    print("show the task, then press Ctrl-C")
+    try:
+        lesson.run(seconds)
+    except Unsafe as error:
+        print(f"recording ended: {error}")
+        return str(error)
+    return None
+
+
+def _keep(recorder: Recording) -> None:
+    """Let a person judge the episode."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    if input(f"keep this episode of {recorder.steps} steps? [y/N] ").strip().lower() == "y":
+        recorder.keep()
+        print(f"{recorder.num_episodes} episodes recorded")
+
+
+def _recorder(
+    options: argparse.Namespace, task: Any, prompt: str, stack: contextlib.ExitStack
+) -> Recording | None:
+    """Open the dataset, and keep other processes from writing it."""
+    if not options.record:
+        return None
+    stack.enter_context(locked(options.record))
+    return Recording(
+        options.record,
+        task=task.name if task else "task",
+        instructions=task.instructions if task else (),
+        prompt=prompt,
+        control_dt=options.control_dt,
+        image_size=options.image_size,
+    )
+
+
+def _cameras(options: argparse.Namespace, server: shared.Server | None) -> OpenCameras:
+    """Open the cameras after checking that there are those that the policy needs."""
+    sources = dict(_pair(text) for text in options.camera)
+    needed = server.metadata.get("cameras", []) if server else list(sources)[:1] or ["side"]
+    if missing := [name for name in needed if name not in sources]:
+        examples = " ".join(f"--camera {name}=SOURCE" for name in missing)
+        raise ValueError(
+            f"cameras are needed for {', '.join(needed)}: pass {examples}, such as /dev/video0"
+        )
+    return OpenCameras(sources)
+
+
+def _arm(options: argparse.Namespace) -> PiperArm:
+    arm = PiperArm(
+        options.can,
+        bus=options.bus,
+        speed=options.speed,
+        effort=options.effort,
+        zeros=options.zeros,
+    )
+    arm.connect()
+    return arm
+
+
+def _pair(text: str) -> tuple[str, str]:
+    name, equals, source = text.partition("=")
+    if not (name and equals and source):
+        raise ValueError(f"--camera must be NAME=SOURCE, got {text!r}")
+    return name, source
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,91 @@
+"""Ask a policy for actions while the arm goes on."""
+
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+
+from lorasp_jax.extras.piper.clock import Clock
+
+Observation = Mapping[str, Any]
+"""`image`: camera -> uint8 [H, W, 3]; `state`: f32 [7]; `prompt`: the request in words; `executed`
+and `delay` as in `lorasp_jax.extras.serving.requests`, if the arm does not wait for the answer."""
+Ask = Callable[[Observation], Any]
+"""Return actions [C, 7] for an observation; may raise what `PolicyClient.infer` raises."""
+
+
+class Asker(Protocol):
+    """One question at a time."""
+
+    def ask(self, observation: Observation) -> None:
+        """Send a question."""
+        ...
+
+    def answer(self) -> Any | None:
+        """Return the actions once they are there, else None; raise what asking raised."""
+        ...
+
+
+class InThread:
+    """Asks in a thread; answers arrive when they do."""
+
+    def __init__(self, ask: Ask) -> None:
+        """Wrap a function that waits for the answer."""
+        self._ask, self._lock = ask, threading.Lock()
+        self._outcome: list | None = None
+
+    def ask(self, observation: Observation) -> None:
+        """Send a question."""
+        self._outcome = outcome = []
+        arguments = (observation, outcome)
+        self._thread = threading.Thread(target=self._run, args=arguments, daemon=True)
+        self._thread.start()
+
+    def answer(self) -> Any | None:
+        """Return the actions once they are there, else None; raise what asking raised."""
+        return _unpack(self._outcome)
+
+    def _run(self, observation: Observation, outcome: list) -> None:
+        with self._lock:  # a question that nobody waits for any more may still be open
+            outcome.append(_outcome(self._ask, observation))
+
+
+class InTurn:
+    """Asks while simulated time stands still; answers arrive after a chosen latency."""
+
+    def __init__(self, ask: Ask, clock: Clock, latency: float = 0.0) -> None:
+        """Wrap a function, on a simulated clock.
+
+        Args:
+            ask: the function.
+            clock: measures the latency.
+            latency: time from question to answer [s].
+        """
+        self._ask, self._clock, self._latency = ask, clock, latency
+        self._outcome, self._due = [], 0.0
+
+    def ask(self, observation: Observation) -> None:
+        """Send a question."""
+        self._outcome = [_outcome(self._ask, observation)]
+        self._due = self._clock.now() + self._latency
+
+    def answer(self) -> Any | None:
+        """Return the actions once they are due, else None; raise what asking raised."""
+        return _unpack(self._outcome) if self._clock.now() >= self._due - 1e-9 else None
+
+
+def _outcome(ask: Ask, observation: Observation) -> tuple[Any, Exception | None]:
+    try:
+        return np.asarray(ask(observation)), None
+    except Exception as error:  # raised again in the control loop
+        return None, error
+
+
+def _unpack(outcome: list | None) -> Any | None:
+    if not outcome:
+        return None
+    actions, error = outcome[0]
+    if error:
+        raise error
+    return actions

@@ -1,0 +1,135 @@
+"""Pictures of named cameras: V4L2 devices, or anything else that ffmpeg can read."""
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import av
+import numpy as np
+from av.error import FFmpegError
+
+from lorasp_jax.extras.piper.safety import Unsafe
+
+MAX_AGE = 0.3
+"""Age beyond which a picture is stale [s]: nine frames at 30 per second; our choice."""
+
+
+class NoPicture(Unsafe):
+    """A picture is missing or stale."""
+
+
+class Cameras(Protocol):
+    """What a session looks through."""
+
+    def read(self) -> dict[str, np.ndarray]:
+        """Return the newest picture of each camera, uint8 [H, W, 3].
+
+        Raises:
+            NoPicture: a picture is missing or stale.
+        """
+        ...
+
+    def close(self) -> None:
+        """Stop."""
+        ...
+
+
+class Camera:
+    """One source of pictures, decoded in a thread that keeps only the newest."""
+
+    def __init__(self, name: str, source: str, size: str = "640x480", rate: int = 30) -> None:
+        """Open a source and wait for its first picture.
+
+        Args:
+            name: of the camera, such as wrist.
+            source: a device such as /dev/video0, or a file or address that ffmpeg can read.
+            size: width x height asked of a device.
+            rate: pictures per second asked of a device.
+
+        Raises:
+            ConnectionError: the source cannot be opened, or shows nothing.
+        """
+        self._name, self._newest, self._stop = name, (-np.inf, None), False
+        device = source.startswith("/dev/")
+        options = {"video_size": size, "framerate": str(rate)} if device else {}
+        try:
+            self._container: Any = av.open(
+                source, format="v4l2" if device else None, options=options
+            )
+        except (FFmpegError, OSError, ValueError) as error:
+            raise ConnectionError(f"cannot open camera {name} at {source}: {error}") from error
+        self._first = threading.Event()
+        self._thread = threading.Thread(target=self._decode, daemon=True)
+        self._thread.start()
+        if not self._first.wait(5.0):
+            raise ConnectionError(f"camera {name} at {source} shows nothing")
+
+    def read(self) -> np.ndarray:
+        """Return the newest picture, uint8 [H, W, 3].
+
+        Raises:
+            NoPicture: it is stale.
+        """
+        taken, image = self._newest
+        if image is None or time.monotonic() - taken > MAX_AGE:
+            raise NoPicture(f"camera {self._name} shows nothing new")
+        return image
+
+    def close(self) -> None:
+        """Stop decoding."""
+        self._stop = True
+        self._thread.join(1.0)
+
+    def _decode(self) -> None:
+        try:
+            for frame in self._container.decode(video=0):
+                self._newest = time.monotonic(), frame.to_ndarray(format="rgb24")
+                self._first.set()
+                if self._stop:
+                    break
+        except (FFmpegError, OSError, ValueError):
+            pass  # the picture goes stale, which `read` reports
+        self._container.close()
+
+
+class OpenCameras:
+    """Several sources."""
+
+    def __init__(self, sources: Mapping[str, str]) -> None:
+        """Open camera name -> source.
+
+        Raises:
+            ConnectionError: a source cannot be opened.
+        """
+        self._cameras: dict[str, Camera] = {}
+        try:
+            for name, source in sources.items():
+                self._cameras[name] = Camera(name, source)
+        except ConnectionError:
+            self.close()
+            raise
+
+    def read(self) -> dict[str, np.ndarray]:
+        """Return the newest picture of each camera, uint8 [H, W, 3]; raise `NoPicture` if stale."""
+        return {name: camera.read() for name, camera in self._cameras.items()}
+
+    def close(self) -> None:
+        """Stop all."""
+        for camera in self._cameras.values():
+            camera.close()
+
+
+class Simulated:
+    """Cameras of a simulated world."""
+
+    def __init__(self, render: Callable[[], dict[str, np.ndarray]]) -> None:
+        """Wrap a function that renders all cameras."""
+        self._render = render
+
+    def read(self) -> dict[str, np.ndarray]:
+        """Return a picture of each camera, uint8 [H, W, 3]."""
+        return self._render()
+
+    def close(self) -> None:
+        """Do nothing."""

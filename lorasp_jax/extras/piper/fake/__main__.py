@@ -1,0 +1,246 @@
+"""Run a policy on the fake PiPER: `python -m lorasp_jax.extras.piper.fake --task press`."""
+
+import argparse
+import itertools
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.console import Console
+
+from envs.rendering.video import side_by_side, write_video
+from lorasp_jax.base import compilation_cache as cache
+from lorasp_jax.base.errors import parse_arguments, run_command
+from lorasp_jax.base.locks import locked
+from lorasp_jax.evaluation.intervals import wilson_interval
+from lorasp_jax.extras.piper import options as shared
+from lorasp_jax.extras.piper.arm import PiperArm
+from lorasp_jax.extras.piper.asking import InThread, InTurn
+from lorasp_jax.extras.piper.cameras import Simulated
+from lorasp_jax.extras.piper.fake.demonstrator import Demonstrator
+from lorasp_jax.extras.piper.fake.firmware import PERIOD, FakePiper
+from lorasp_jax.extras.piper.fake.timing import Lockstep, RealTime
+from lorasp_jax.extras.piper.fake.world import Physics, World
+from lorasp_jax.extras.piper.recording import Recording
+from lorasp_jax.extras.piper.session import Session
+from lorasp_jax.extras.serving.client import ServerGone
+
+_LARGEST_LATENCY = 0.15  # s, of commands; our choice
+_VIDEO_RATE = 10  # pictures per second
+_SETTLING = 0.3  # s, longer than a command can take
+_CHANNELS = itertools.count()  # the SDK keeps one interface per name in a process
+
+
+def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.piper.fake") -> int:
+    """Run episodes; return the exit code, one of `lorasp_jax.base.errors`."""
+    options = parse_arguments(parser(program), arguments)
+    console = Console()
+    return run_command(lambda: _run(options, console), Console(stderr=True))
+
+
+def parser(program: str) -> argparse.ArgumentParser:
+    """Return the argument parser of this command."""
+    parser = argparse.ArgumentParser(
+        prog=program,
+        description="Run a policy on a PiPER in MuJoCo, through piper_sdk and a virtual CAN bus.",
+        epilog="Time stands still while the policy thinks, unless --realtime is given.",
+    )
+    add = parser.add_argument
+    add(
+        "--task", default="press", help="open_pot, pick_place, pour or press (default: %(default)s)"
+    )
+    add("--expert", action="store_true", help="the scripted expert in place of a server")
+    add("--episodes", type=int, default=1, help="default: %(default)s")
+    add("--seed", type=int, default=0, help="of the first layout (default: %(default)s)")
+    add("--latency", type=float, default=0.0, help="of commands on their way to the motors [s], "
+        f"at most {_LARGEST_LATENCY} (default: %(default)s)")  # fmt: skip
+    add("--thinking", type=float, default=0.0, help="time from observation to actions [s] "
+        "(default: %(default)s)")  # fmt: skip
+    add("--noise", type=float, default=2e-4, help="of measured angles [rad] (default: %(default)s)")
+    add("--realtime", action="store_true", help="let time run while the policy thinks")
+    add("--image-size", type=int, default=64, help="of pictures [px], for policies that do not "
+        "say it (default: %(default)s)")  # fmt: skip
+    add("--record", type=Path, metavar="FOLDER", help="add the successful episodes to an RLDS "
+        "dataset, which train.py takes as --data.source")  # fmt: skip
+    add("--video", type=Path, metavar="FILE", help="MP4 of what the cameras see")
+    shared.add_shared(parser)
+    return parser
+
+
+def _run(options: argparse.Namespace, console: Console) -> None:
+    if not 0 <= options.latency <= _LARGEST_LATENCY:
+        raise ValueError(f"--latency must be 0 to {_LARGEST_LATENCY} s, got {options.latency}")
+    if options.episodes < 1:
+        raise ValueError(f"--episodes must be at least 1, got {options.episodes}")
+    if options.thinking < 0:
+        raise ValueError(f"--thinking must be at least 0 s, got {options.thinking}")
+    shared.task(options.task)
+    shared.limits(options)
+    shared.settings(options, "")
+    cache.enable()
+    source = nullcontext() if options.expert else shared.policy(options)
+    with source as server, shared.opened_log(options) as log:
+        size = (server and server.metadata.get("image_size")) or options.image_size
+        world = World(options.task, image_size=size)
+        world.reset(options.seed)
+        if server:
+            server.warn([options.prompt] if options.prompt else world.env.instructions)
+        with (
+            _video(options.video) as film,
+            _bench(options, world) as bench,
+            _recorder(options, world, size) as recorder,
+        ):
+            bench.arm.connect()
+            _episodes(options, bench, server, (log, recorder, film), console)
+
+
+def _episodes(
+    options: argparse.Namespace, bench: "Bench", server: Any, records: tuple, console: Console
+) -> None:
+    """Run and count episodes.
+
+    Raises:
+        ServerGone: the connection to the server ended; an episode that it cut short is not counted.
+    """
+    wins, (log, recorder, film) = 0, records
+    for episode in range(options.episodes):
+        bench.reset(options.seed + episode)
+        log.line(bench.clock.now(), episode=episode)
+        session = _session(options, bench, server, options.seed + episode, records, console)
+        world = bench.fake.world
+        problem = session.run(world.env.task.time_limit, _judge(world, film))
+        wins += world.success
+        if recorder and world.success:
+            recorder.keep()
+        elif recorder:
+            recorder.discard()
+        if server and server.ended and not (world.success or session.stopped):
+            before = f"before, {_result(wins, episode)}" if episode else "no episode was judged"
+            raise ServerGone(f"stopped in episode {episode}, as {server.ended}; {before}")
+        outcome = "success" if world.success else f"failure: {problem}" if problem else "failure"
+        console.print(f"episode {episode}: {outcome}", markup=False, highlight=False)
+        if session.stopped:
+            raise KeyboardInterrupt
+    console.print(_result(wins, options.episodes))
+
+
+def _result(wins: int, episodes: int) -> str:
+    low, high = wilson_interval(wins, episodes)
+    return f"{wins} of {episodes} succeeded ({low:.0%} to {high:.0%})"
+
+
+@contextmanager
+def _video(path: Path | None) -> Iterator[list[np.ndarray] | None]:
+    """Collect pictures, and write what there is of them however the episodes end."""
+    film: list[np.ndarray] = []
+    try:
+        yield film if path else None
+    finally:
+        if path and film:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_video(path, np.stack(film), _VIDEO_RATE)
+
+
+def _session(
+    options: argparse.Namespace,
+    bench: "Bench",
+    server: Any,
+    seed: int,
+    records: tuple,
+    console: Console,
+) -> Session:
+    """Enable the arm, and prepare an episode."""
+    limits, world, clock = shared.limits(options), bench.fake.world, bench.clock
+    bench.arm.enable(limits)
+    if server:
+        server.reset()
+    ask = server or Demonstrator(world, clock, seed)
+    asker = InThread(ask) if options.realtime else InTurn(ask, clock, options.thinking)
+    settings = shared.settings(options, world.instruction)
+    log, recorder, _ = records
+    if recorder:
+        recorder.say(settings.prompt)
+    more = {"log": log, "recorder": recorder, "say": console.print}
+    cameras = Simulated(world.images)
+    session = Session(bench.arm, cameras, asker, limits, settings, clock, **more)
+    shared.stop_on_signals(session)
+    return session
+
+
+@contextmanager
+def _recorder(options: argparse.Namespace, world: World, size: int) -> Iterator[Recording | None]:
+    """Open the dataset, if there is to be one, and keep other processes from writing it."""
+    if not options.record:
+        yield None
+        return
+    with locked(options.record):
+        instructions = world.env.task.instructions
+        yield Recording(
+            options.record,
+            task=world.env.task.name,
+            instructions=instructions,
+            prompt=options.prompt or instructions[0],
+            control_dt=options.control_dt,
+            image_size=size,
+            physics_dt=Physics().timestep,
+        )
+
+
+class Bench(NamedTuple):
+    """A connected arm, its fake other end and their clock."""
+
+    arm: PiperArm
+    fake: FakePiper
+    clock: Lockstep | RealTime
+
+    def reset(self, seed: int) -> None:
+        """Start a new layout, and wait until the arm's driver has noticed."""
+        self.fake.reset(seed)
+        self.clock.wait_until(self.clock.now() + _SETTLING)
+
+
+@contextmanager
+def _bench(options: argparse.Namespace, world: World) -> Iterator[Bench]:
+    """Yield both ends of a bus."""
+    channel = f"fake_piper_{next(_CHANNELS)}"
+    noise = {"noise": options.noise, "seed": options.seed}
+    fake = FakePiper(channel, world, latency=options.latency, **noise)
+    clock = RealTime(fake) if options.realtime else Lockstep(fake)
+    arm = PiperArm(
+        channel,
+        bus="virtual",
+        speed=options.speed,
+        effort=options.effort,
+        zeros=options.zeros,
+        clock=clock,
+    )
+    try:
+        clock.start(arm)
+        yield Bench(arm, fake, clock)
+    finally:
+        clock.stop()
+        arm.close()
+        fake.close()
+
+
+def _judge(world: World, film: list[np.ndarray] | None) -> Callable[[], bool]:
+    """Return a function for every tick that tests for success at every control step."""
+    ticks, every = 0, round(world.env.control_dt / PERIOD)
+
+    def done() -> bool:
+        nonlocal ticks
+        ticks += 1
+        if ticks % every:
+            return False
+        if film is not None:
+            film.append(side_by_side(world.images()))
+        return world.judge()
+
+    return done
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

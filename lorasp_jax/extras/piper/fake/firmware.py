@@ -1,0 +1,211 @@
+"""The fake arm's controller: CAN frames in, servo targets out, feedback at 200 Hz.
+
+It imitates what matters to a client: drivers that must be switched on, control modes, the speed
+percentage, the last target that stays in force, delays, noise, and faults on demand.
+"""
+
+import threading
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import can
+import numpy as np
+
+from envs.robots.piper import ROBOT, SDK_OFFSET
+from lorasp_jax.extras.piper.fake import frames
+from lorasp_jax.extras.piper.fake.world import World
+
+PERIOD = 0.005
+"""Time between two feedback frames of a kind [s], as measured on PiPERs (200 Hz)."""
+_SLOW = 10  # the drivers' own states come every tenth time
+_FASTEST, _GRIPPER_SPEED = 3.0, 0.1  # rad/s as the firmware's default; m/s, our choice
+_STANDBY, _CAN, _TEACHING = 0, 1, 2
+_MIT = 0xAD
+_EMERGENCY, _GUIDED = 1, 11  # arm_status
+
+
+@dataclass
+class Faults:
+    """What goes wrong; may be changed at any time.
+
+    Attributes:
+        silent: no frames are sent.
+        zeros: all joints are reported as zero.
+        status: arm_status that is reported, such as 7 for a collision; the arm then stands still.
+        ctrl_mode: control mode that is reported in place of the true one.
+        corrupted: the firmware's joint limits are those of a known defect: all -0.1 degrees.
+        clock_step: added to the frames' time stamps [s], as when the system's clock is set.
+        dead_driver: number from 0 of a joint whose driver does not switch on.
+    """
+
+    silent: bool = False
+    zeros: bool = False
+    status: int = 0
+    ctrl_mode: int | None = None
+    corrupted: bool = False
+    dead_driver: int | None = None
+    clock_step: float = 0.0
+
+
+class FakePiper:
+    """A PiPER on one end of a virtual bus.
+
+    Attributes:
+        world: the simulated scene.
+        faults: what goes wrong.
+        time: simulated time [s].
+        commands: number of joint targets received.
+        hand: pose [7] to which a person guides the arm while it is in teaching mode.
+        unsafe: everything received that a client must never send, in words.
+    """
+
+    def __init__(
+        self,
+        channel: str,
+        world: World,
+        *,
+        latency: float = 0.0,
+        noise: float = 2e-4,
+        seed: int = 0,
+    ) -> None:
+        """Join a bus.
+
+        Args:
+            channel: name of python-can's virtual bus.
+            world: the scene; call its `reset` first.
+            latency: delay of every command [s].
+            noise: standard deviation of measured angles [rad]; our choice.
+            seed: of the noise.
+        """
+        self.world, self.faults, self.time = world, Faults(), 1.0
+        self.unsafe: list[str] = []
+        self.commands, self.hand = 0, None
+        self._latency, self._noise = latency, noise
+        self._random = np.random.default_rng(seed)
+        self._bus = can.Bus(channel, interface="virtual", preserve_timestamps=True)
+        self._waiting: deque[tuple[float, Any]] = deque()
+        self._tick, self._ctrl_mode, self._stopped = 0, _STANDBY, 0
+        self._percent, self._enabled = 100, np.zeros(6, bool)
+        self._target, self._setpoint = self.world.pose, self.world.pose
+        self._turn = threading.Lock()  # the arm may live in a thread of its own
+
+    def reset(self, seed: int) -> None:
+        """Start a random layout, with the arm at rest in its start pose.
+
+        Commands that are still on their way are lost: they were meant for the previous layout.
+        """
+        with self._turn:
+            self.world.reset(seed)
+            self._receive()
+            self._waiting.clear()
+            self._target, self._setpoint = self.world.pose, self.world.pose
+
+    def tick(self) -> None:
+        """Advance by `PERIOD`: receive, simulate, send."""
+        with self._turn:
+            self._take_turn()
+
+    def _take_turn(self) -> None:
+        self.time = round(self.time + PERIOD, 6)
+        self._receive()
+        while self._waiting and self._waiting[0][0] <= self.time + 1e-9:
+            self._obey(self._waiting.popleft()[1])
+        self._move()
+        self.world.advance(PERIOD)
+        self._tick += 1
+        if not self.faults.silent:
+            self._report()
+
+    def _receive(self) -> None:
+        while (message := self._bus.recv(0)) is not None:
+            self._waiting.append((self.time + self._latency, message))
+
+    @property
+    def stamp(self) -> float:
+        """Time stamp of the latest frames [s]."""
+        return self.time + self.faults.clock_step
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._bus.shutdown()
+
+    def _obey(self, message: can.Message) -> None:
+        kind, data = message.arbitration_id, bytes(message.data)
+        if kind in frames.TARGETS:
+            first = 2 * frames.TARGETS.index(kind)
+            pair = np.deg2rad(np.array(frames.unpack_pair(data)) / 1000)
+            self._aim(slice(first, first + 2), pair + SDK_OFFSET[first : first + 2])
+            self.commands += kind == frames.TARGETS[-1]
+        elif kind == frames.GRIPPER_TARGET:
+            opening, effort, code = frames.unpack_gripper(data)
+            self._check(0 <= opening <= 70000, f"gripper {opening / 1000} mm")
+            self._check(effort <= 5000 and code in (0, 1), f"effort {effort}, code {code}")
+            self._target[6] = np.clip(opening / 1e6, 0, ROBOT.stroke)
+        elif kind == frames.MODE:
+            self._check(data[3] != _MIT, "MIT mode")
+            self._check(1 <= data[2] <= 100, f"speed {data[2]} %")
+            if self._ctrl_mode != _TEACHING:  # a person has the arm until teaching ends
+                self._ctrl_mode = data[0]
+            self._percent = data[2]
+        elif kind == frames.ENABLE:
+            self._enabled[:] = data[1] == 0x02
+        elif kind == frames.STOP_OR_TEACH:
+            self._stop_or_teach(data)
+        elif kind == frames.ASK_LIMITS and data[1] == 0x01:
+            self._tell_limits(data[0])
+
+    def _stop_or_teach(self, data: bytes) -> None:
+        if data[0]:
+            self.unsafe.append("emergency stop or reset")
+            self._stopped = _EMERGENCY if data[0] == 1 else 0
+        if data[2] in (1, 2):
+            self._ctrl_mode = _TEACHING if data[2] == 1 else _STANDBY
+            self._target = self.world.pose
+
+    def _aim(self, joints: slice, angles: np.ndarray) -> None:
+        # A count is 0.001 degrees, and a target at a limit may be rounded past it.
+        low, high = ROBOT.lower[joints] - 2e-5, ROBOT.upper[joints] + 2e-5
+        within = bool(np.all((low <= angles) & (angles <= high)))
+        self._check(within, f"joints {joints.start + 1}-{joints.stop} at {np.rad2deg(angles)} deg")
+        if self._ctrl_mode == _CAN and within:
+            self._target[joints] = angles
+
+    def _check(self, fine: bool, what: str) -> None:
+        if not fine:
+            self.unsafe.append(what)
+
+    def _move(self) -> None:
+        """Let the servos' targets follow the last target, as fast as the percentage allows."""
+        if self._ctrl_mode == _TEACHING:
+            self._setpoint = self.world.pose if self.hand is None else np.array(self.hand)
+        elif self._enabled.all() and not (self.faults.status or self._stopped):
+            speed = np.append(np.full(6, _FASTEST * self._percent / 100), _GRIPPER_SPEED) * PERIOD
+            self._setpoint = self._setpoint + np.clip(self._target - self._setpoint, -speed, speed)
+        self.world.command(self._setpoint)
+
+    def _report(self) -> None:
+        pose = self.world.pose
+        angles = pose[:6] + self._noise * self._random.standard_normal(6) - SDK_OFFSET
+        counts = np.zeros(6) if self.faults.zeros else np.rad2deg(angles) * 1000
+        for i, kind in enumerate(frames.JOINTS):
+            self._send(kind, frames.pair(*counts[2 * i : 2 * i + 2]))
+        self._send(frames.GRIPPER, frames.gripper(1e6 * pose[6], 0, bool(self._enabled.all())))
+        if self._tick % _SLOW == 0:
+            for i, kind in enumerate(frames.DRIVERS):
+                on = bool(self._enabled[i]) and i != self.faults.dead_driver
+                self._send(kind, frames.driver(on))
+        mode = self._ctrl_mode if self.faults.ctrl_mode is None else self.faults.ctrl_mode
+        teaching = int(self._ctrl_mode == _TEACHING)
+        status = self.faults.status or self._stopped or (_GUIDED if teaching else 0)
+        self._send(frames.STATUS, frames.status(mode, status, teaching))
+
+    def _tell_limits(self, joint: int) -> None:
+        low, high = np.rad2deg([ROBOT.lower[joint - 1], ROBOT.upper[joint - 1]])
+        limits = (-0.1, -0.1, _FASTEST) if self.faults.corrupted else (low, high, _FASTEST)
+        self._send(frames.FIRMWARE_LIMITS, frames.firmware_limits(joint, *limits))
+
+    def _send(self, kind: int, data: bytes) -> None:
+        message = can.Message(arbitration_id=kind, data=data, is_extended_id=False)
+        message.timestamp = self.stamp
+        self._bus.send(message)

@@ -1,0 +1,344 @@
+"""The control loop: read the arm, ask the policy, command the arm, 200 times a second.
+
+Whatever goes wrong, the arm holds. If feedback or pictures come back soon, it goes on from the
+measured pose. Otherwise, and after a refused chunk or a lost server, it moves slowly to its rest
+pose and stays there, powered; it does not move again while it reports a fault itself. Ctrl-C stops
+it where it is.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from lorasp_jax.extras.piper.asking import Asker
+from lorasp_jax.extras.piper.cameras import Cameras, NoPicture
+from lorasp_jax.extras.piper.clock import Clock
+from lorasp_jax.extras.piper.interpolation import Path
+from lorasp_jax.extras.piper.log import Log
+from lorasp_jax.extras.piper.safety import (
+    CAN_CONTROL,
+    MAX_AGE,
+    Governor,
+    Limits,
+    Reading,
+    Unsafe,
+    check_chunk,
+    fault,
+)
+from lorasp_jax.extras.serving.client import PolicyError, ServerGone
+
+PERIOD = 0.005
+"""Time between two commands [s], as in piper_sdk's examples (200 Hz)."""
+REST = np.array([0.0, 0.06, -0.06, 0.0, 0.35, 0.0, 0.0])
+"""Pose in which the arm lies folded [rad, m]: all joints near zero; our choice."""
+_REACHED = 0.01  # rad from the rest pose that counts as arrived
+_APPROACH_TIME = 20.0  # s that the way to the first action may take
+_REST_TIME = 60.0  # s that the way to the rest pose may take
+_INSTANT = 1e-6  # control steps that rounding may take from a clock's time
+_LATE = 0.05  # s of delay after which ticks are skipped instead of made up for
+
+
+class Arm(Protocol):
+    """The part of `PiperArm` that a session uses."""
+
+    def read(self) -> Reading: ...  # noqa: D102
+    def command(self, pose: np.ndarray) -> None: ...  # noqa: D102
+
+
+class Recorder(Protocol):
+    """Receives what was observed and commanded at every control step.
+
+    Attributes:
+        steps: number of control steps received.
+    """
+
+    @property
+    def steps(self) -> int: ...  # noqa: D102
+
+    def step(self, images: dict[str, np.ndarray], state: np.ndarray, action: np.ndarray) -> None:
+        """Take a control step: pictures, measured pose [7], action [7]."""
+        ...
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a policy's chunks are executed.
+
+    Attributes:
+        prompt: the request in words.
+        control_dt: duration of an action [s], as in the policy's training.
+        execute: actions of each chunk that are executed.
+        ahead: how many actions before the end of these the next chunk is asked for. At 0 the arm
+            waits for the answer. Otherwise the new chunk counts from when it was asked for, and
+            takes over when the action ends during which it arrives: its first actions are then in
+            the past. If it arrives after the end of the previous chunk, the arm has waited.
+        patience: longest time to wait for an answer [s].
+        hold: time to hold, after which the arm goes to rest [s].
+        dry_run: print commands instead of sending them.
+    """
+
+    prompt: str
+    control_dt: float = 0.1
+    execute: int = 5
+    ahead: int = 0
+    patience: float = 2.0
+    hold: float = 3.0
+    dry_run: bool = False
+
+    def __post_init__(self) -> None:
+        """Raise ValueError if a number is out of range."""
+        if not 0 <= self.ahead < self.execute:
+            raise ValueError(f"ahead must be 0 to {self.execute - 1}, got {self.ahead}")
+
+
+class Session:
+    """One run of a policy on an arm.
+
+    Attributes:
+        problem: why the arm holds, in a sentence; None while it does not.
+        chunks: number of chunks received.
+        stopped: whether `stop` was called.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        cameras: Cameras,
+        asker: Asker,
+        limits: Limits,
+        settings: Settings,
+        clock: Clock,
+        *,
+        log: Log | None = None,
+        recorder: Recorder | None = None,
+        say: Callable[[str], None] = print,
+    ) -> None:
+        """Prepare a session; the arm is enabled, unless it is a dry run."""
+        self._arm, self._cameras, self._asker, self._clock = arm, cameras, asker, clock
+        self._limits, self._settings, self._log, self._say = limits, settings, log, say
+        self._recorder = recorder
+        self._governor = Governor(limits, PERIOD)
+        self.problem: str | None = None
+        self.chunks = 0
+        self._final, self._since, self.stopped, self._next = False, 0.0, False, 0.0
+        self._forget()
+
+    def stop(self) -> None:
+        """Brake and hold from the next tick on; may be called from a signal handler."""
+        self.stopped = True
+
+    def run(self, seconds: float, done: Callable[[], bool] = lambda: False) -> str | None:
+        """Run the policy until the time is over, `done` says so, or a problem lasts.
+
+        Returns:
+            The problem in a sentence, or None.
+
+        Raises:
+            ValueError: the first chunk has fewer actions than the settings need; the arm has not
+                moved.
+        """
+        self._governor.start(self._arm.read().pose)
+        self._next = start = self._clock.now()
+        while self._clock.now() - start < seconds and not self.stopped and not done():
+            self._tick()
+            if self.problem and self._clock.now() - self._since > self._settings.hold:
+                self._rest()
+                break
+        self._settle()
+        return self.problem
+
+    def _tick(self) -> None:
+        reading, now = self._read(), self._clock.now()
+        try:
+            if problem := fault(reading, self._limits):
+                self._hold(problem, reading, now)
+                self._final |= bool(reading.arm_status) or reading.ctrl_mode != CAN_CONTROL
+            elif not self._final:
+                self._drive(reading, now)
+        except NoPicture as error:
+            self._hold(str(error), reading, now)
+        except (Unsafe, ServerGone, PolicyError) as error:
+            self._hold(str(error), reading, now)
+            self._final = True
+        if self.problem:
+            self._send(self._governor.brake(), reading)
+        self._wait()
+
+    def _drive(self, reading: Reading, now: float) -> None:
+        """Follow the policy's path by one tick."""
+        if self.problem:
+            self._say("going on")
+            self._governor.start(reading.pose)
+            self.problem = None
+            self._forget()
+        self._receive(now)
+        if self._asked is None and self._wants_chunk(now):
+            self._ask(reading, now)
+            self._receive(now)
+        if self._asked is not None and now - self._asked > self._settings.patience:
+            raise ServerGone(f"the server did not answer within {self._settings.patience:g} s")
+        if self._path is None:
+            self._send(self._governor.brake(), reading)
+            return
+        if self._governor.approaching:
+            self._send(self._approach(self._path, now), reading)
+        else:
+            self._record(reading, now)
+            command = self._governor.step(self._path.target(now + PERIOD - self._start))
+            self._send(command, reading)
+
+    def _approach(self, path: Path, now: float) -> np.ndarray:
+        """Return the command of a tick on the way to the first action; the path waits for it."""
+        command = self._governor.step(path.action(0))
+        if self._approached is None:
+            self._approached = now
+        if now - self._approached > _APPROACH_TIME:
+            raise Unsafe("the first action is out of reach: the finger tips would leave the box")
+        self._path, self._start = path.starting_at(command), now + PERIOD
+        return command
+
+    def _ask(self, reading: Reading, now: float) -> None:
+        images = self._cameras.read()
+        state = reading.pose.astype(np.float32)
+        observation = {"image": images, "state": state, "prompt": self._settings.prompt}
+        if self._path:
+            self._executed = min(round(self._position(now)), self._path.steps)
+            if self._settings.ahead:  # the new chunk may continue the previous one
+                left = self._path.steps - self._executed
+                observation |= {"executed": self._executed, "delay": left}
+        if self._log:
+            self._log.observation(now, observation)
+        self._asker.ask(observation)
+        self._asked = now
+
+    def _receive(self, now: float) -> None:
+        """Start on a new chunk if there is one."""
+        if self._asked is None or (actions := self._asker.answer()) is None:
+            return
+        settings, chunk = self._settings, check_chunk(actions)
+        self._check_length(chunk, now)
+        own = chunk[: settings.execute + settings.ahead]
+        if self._path is None:
+            self._path = Path(self._governor.pose.copy(), own, settings.control_dt)
+            self._start, self._recorded = now, -1
+        else:
+            self._switch(own, now)
+        self._asked = None
+        self.chunks += 1
+        self._write(now, chunk=chunk)
+
+    def _check_length(self, chunk: np.ndarray, now: float) -> None:
+        """Refuse a chunk that is too short; ValueError if it is the first, as no arm moves yet."""
+        execute, ahead = self._settings.execute, self._settings.ahead
+        if len(chunk) >= execute + ahead:
+            return
+        needed = f"need chunks of at least {execute + ahead} actions, got {len(chunk)}"
+        problem = f"execute {execute} and ahead {ahead} {needed}"
+        if self.chunks:
+            raise Unsafe(problem)
+        self._write(now, problem=problem)
+        raise ValueError(problem)
+
+    def _switch(self, chunk: np.ndarray, now: float) -> None:
+        """Let a new chunk take over where the present action ends, as in the simulation.
+
+        If the path has ended, the arm has waited, and no action is skipped for that time.
+        """
+        assert self._path is not None
+        step = min(math.ceil(self._position(now) - _INSTANT), self._path.steps)
+        skipped = step - self._executed
+        self._path = self._path.switching(self._executed, step, chunk)
+        self._recorded -= self._executed
+        dt = self._settings.control_dt
+        self._start = max(self._start + self._executed * dt, now - skipped * dt)
+
+    def _wants_chunk(self, now: float) -> bool:
+        if self._path is None:
+            return True
+        return self._path.steps - self._position(now) <= self._settings.ahead + _INSTANT
+
+    def _position(self, now: float) -> float:
+        """Return the time on the path in control steps."""
+        return (now - self._start) / self._settings.control_dt
+
+    def _hold(self, problem: str, reading: Reading, now: float) -> None:
+        """Begin to hold, unless the arm holds already: where it is if it reports where that is."""
+        if self.problem:
+            return
+        self.problem, self._since = problem, now
+        self._say(f"holding: {problem}")
+        self._write(now, problem=problem)
+        if reading.age <= MAX_AGE and (reading.arm_status or not reading.enabled):
+            self._governor.start(reading.pose)
+
+    def _rest(self) -> None:
+        """Move slowly to the rest pose, unless the arm itself reports a fault."""
+        reading = self._read()
+        if fault(reading, self._limits) or self.stopped:
+            return
+        self._say("moving slowly to the rest pose")
+        self._governor.start(reading.pose)
+        end = self._clock.now() + _REST_TIME
+        while np.abs(self._governor.pose - REST)[:6].max() > _REACHED and not self.stopped:
+            reading = self._read()
+            if fault(reading, self._limits) or self._clock.now() > end:
+                self._say("holding: the rest pose is out of reach")
+                return
+            self._send(self._governor.step(REST), reading)
+            self._wait()
+
+    def _settle(self) -> None:
+        """Brake, then leave the arm holding its last target."""
+        self._send(self._governor.brake(), self._read())
+        while self._governor.velocity.any():
+            self._wait()
+            self._send(self._governor.brake(), self._read())
+
+    def _read(self) -> Reading:
+        reading = self._arm.read()
+        if self._settings.dry_run:  # the arm need not be ready
+            return reading._replace(ctrl_mode=CAN_CONTROL, enabled=True)
+        return reading
+
+    def _send(self, command: np.ndarray, reading: Reading) -> None:
+        now = self._clock.now()
+        self._write(now, pose=reading.pose, command=command, age=reading.age)
+        if self._settings.dry_run:
+            if now - self._printed >= self._settings.control_dt - 1e-6:
+                degrees = " ".join(f"{angle:7.2f}" for angle in np.rad2deg(command[:6]))
+                self._say(f"would command {degrees} degrees, {1000 * command[6]:.1f} mm")
+                self._printed = now
+        elif reading.ctrl_mode == CAN_CONTROL:  # else a person or another program has the arm
+            self._arm.command(command)
+
+    def _record(self, reading: Reading, now: float) -> None:
+        """Record the first tick of every action."""
+        if self._recorder is None or self._path is None:
+            return
+        step = int(self._position(now) + _INSTANT)
+        if self._recorded < step < self._path.steps:
+            action = self._path.action(step)
+            self._recorder.step(self._cameras.read(), reading.pose, action)
+            self._recorded = step
+
+    def _forget(self) -> None:
+        """Drop the path and the open question."""
+        self._path: Path | None = None
+        self._start, self._asked, self._approached = 0.0, None, None
+        self._executed, self._recorded = 0, -1
+        self._printed = -np.inf
+
+    def _write(self, now: float, **values: Any) -> None:
+        if self._log:
+            self._log.line(now, **values)
+
+    def _wait(self) -> None:
+        """Wait for the next tick; after a long delay, do not make up for those that were missed."""
+        self._next += PERIOD
+        now = self._clock.now()
+        if now > self._next + _LATE:
+            self._next = now
+        self._clock.wait_until(self._next)

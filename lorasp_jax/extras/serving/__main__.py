@@ -1,0 +1,246 @@
+"""Serve a policy: `python -m lorasp_jax.extras.serving runs/NAME`."""
+
+import argparse
+import asyncio
+import secrets
+import signal
+import socket
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from lorasp_jax.base.errors import parse_arguments, run_command
+
+CHECKPOINT_OPTIONS = ("statistics", "dataset", "joints", "size", "dtype", "camera", "adapter")
+"""Options that say what the files of a published checkpoint do not."""
+
+
+def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.serving") -> int:
+    """Serve until SIGINT or SIGTERM; return the exit code, one of `lorasp_jax.base.errors`."""
+    options = parse_arguments(parser(program), arguments)
+    console = Console(stderr=True)
+    return run_command(lambda: _serve(options, Console()), console)
+
+
+def parser(program: str) -> argparse.ArgumentParser:
+    """Return the argument parser of this command."""
+    parser = argparse.ArgumentParser(
+        prog=program,
+        description="Serve a policy over websockets, in openpi's protocol.",
+        epilog="Pages on the same port: /healthz and /metrics. See docs/serving.md.",
+    )
+    add = parser.add_argument
+    add(
+        "policy",
+        nargs="+",
+        metavar="[NAME=]POLICY",
+        help="folder of a finished run or an exported policy, or a published checkpoint (folder, "
+        "hf://owner/name or gs://bucket/folder). Several runs: requests choose by NAME, the first "
+        "is the default",
+    )
+    add("--host", default="127.0.0.1", help="address to listen on; others than the default need a "
+        "token (default: %(default)s)")  # fmt: skip
+    add("--port", type=int, default=8000, help="default: %(default)s")
+    add(
+        "--token-file", type=Path, metavar="FILE", help="file with the token that clients must send"
+    )
+    add("--certificate", type=Path, metavar="FILE", help="PEM certificate chain, for wss://")
+    add("--key", type=Path, metavar="FILE", help="PEM private key of the certificate")
+    add("--prompt", default="", help="instruction of requests that have none")
+    add("--max-batch", type=int, help="largest batch (default: 8)")
+    add("--num-steps", type=int, help="flow steps (default: 10)")
+    add("--seed", type=int, help="seed of the flow's noise, which repeats what a server answered "
+        "(default: a fresh one, which is printed)")  # fmt: skip
+    add(
+        "--execution",
+        default="naive",
+        choices=("naive", "trained", "guided"),
+        help="whether chunks can continue the previous one, as learned in training or by guidance "
+        "(default: %(default)s); see docs/latency.md",
+    )
+    add("--guidance", type=float, help="limit of the guidance (default: 10)")
+    add("--base", default="", help="the run's base, if it has moved")
+    add("--tokenizer", default="", help="the policy's tokenizer; runs record theirs")
+    _add_checkpoint_options(parser.add_argument_group("published checkpoints"))
+    return parser
+
+
+def _add_checkpoint_options(group: Any) -> None:
+    checkpoint = group.add_argument
+    checkpoint(
+        "--statistics", default="", help="normalization statistics, if not in the checkpoint"
+    )
+    checkpoint("--dataset", default="", help="which statistics, if there are several")
+    checkpoint("--joints", type=int, default=0, help="the robot's number of joints")
+    checkpoint("--size", default="", help="size of an openpi checkpoint, such as base_pi05")
+    checkpoint("--dtype", default="", choices=("", "float32", "bfloat16"), help="of the weights")
+    pair = {"action": "append", "default": [], "metavar": "NAME=VALUE"}
+    checkpoint("--camera", **pair, help="the backbone's camera = the robot's camera, repeatedly")
+    checkpoint("--adapter", **pair, help="name = adapter folder, repeatedly; see docs/serving.md")
+
+
+def _serve(options: argparse.Namespace, console: Console) -> None:
+    server, token = _server_module(), _read_token(options.token_file)
+    if bool(options.certificate) != bool(options.key):
+        raise ValueError("--certificate and --key must be given together")
+    tls = server.tls_context(options.certificate, options.key) if options.key else None
+    with server.bind(options.host, options.port) as port:  # before anything that takes long
+        server.check_exposure(port, token)
+        policy, metadata = _load(options, console)
+        policy_server = server.PolicyServer(policy, metadata, token=token)
+        asyncio.run(_run(policy_server, port, tls, console))
+
+
+def _server_module() -> Any:
+    try:
+        from lorasp_jax.extras.serving import server
+    except ModuleNotFoundError as error:
+        if str(error.name).partition(".")[0] not in ("msgpack", "websockets"):
+            raise
+        raise ValueError(f'{error}: pip install "lorasp_jax[serving]"') from error
+    return server
+
+
+async def _run(policy_server: Any, port: socket.socket, tls: Any, console: Console) -> None:
+    """Serve until SIGINT or SIGTERM."""
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    async with policy_server.listen(port, tls=tls):
+        host, number = port.getsockname()[:2]
+        host = f"[{host}]" if ":" in host else host
+        _say(console, f"listening on {'wss' if tls else 'ws'}://{host}:{number}")
+        await stop.wait()
+        _say(console, "closing connections")
+    policy_server.close()
+
+
+def _load(options: argparse.Namespace, console: Console) -> tuple[Any, dict[str, Any]]:
+    """Load and compile the policies, saying what takes long."""
+    from lorasp_jax.base import compilation_cache as cache
+    from lorasp_jax.extras.serving.exported import is_exported
+
+    named, start = dict(map(_named, options.policy)), time.monotonic()
+    if len(named) < len(options.policy):
+        raise ValueError("the policies must have different names: pass NAME=POLICY")
+    cache.enable()
+    if options.seed is None:
+        options.seed = secrets.randbelow(2**31)
+    _say(console, f"loading {', '.join(options.policy)} with --seed {options.seed}")
+    load = _exported if all(map(is_exported, named.values())) else _compiled
+    policy, metadata = load(options, named)
+    pairs = [(name, size) for name in policy.adapters for size in policy.sizes]
+
+    def report(name: str, size: int) -> None:
+        step = pairs.index((name, size)) + 1
+        _say(console, f"compiling {name}, batch {size} ({step} of {len(pairs)})")
+
+    policy.warm_up(report)
+    _say(console, f"ready after {time.monotonic() - start:.0f} s")
+    return policy, metadata
+
+
+def _exported(options: argparse.Namespace, named: dict[str, str]) -> tuple[Any, dict[str, Any]]:
+    """Load exported policies."""
+    from lorasp_jax.extras.serving.exported import load
+    from lorasp_jax.extras.serving.exported_policies import ExportedPolicies
+
+    settings = ("num_steps", "max_batch", "guidance", "base", "tokenizer", *CHECKPOINT_OPTIONS)
+    _refuse(options, settings, "has no effect on exported policies")
+    policies = {name: load(folder) for name, folder in named.items()}
+    settings = {"prompt": options.prompt, "seed": options.seed, "execution": options.execution}
+    policy = ExportedPolicies(policies, **settings)
+    return policy, policy.metadata
+
+
+def _compiled(options: argparse.Namespace, named: dict[str, str]) -> tuple[Any, dict[str, Any]]:
+    """Load runs or a checkpoint."""
+    from lorasp_jax.extras.serving.policies import CompiledPolicies, batch_sizes
+
+    if options.max_batch is not None:
+        batch_sizes(options.max_batch)  # an invalid one is refused before anything that takes long
+    loaded = _loaded(options, named)
+    names = ("num_steps", "max_batch", "guidance", "prompt", "seed", "execution")
+    given = {name: getattr(options, name) for name in names}
+    settings = {name: value for name, value in given.items() if value is not None}
+    policy = CompiledPolicies(loaded.policies, loaded.words, **settings)
+    loaded.policies.clear()  # the prepared weights are copies
+    return policy, loaded.metadata
+
+
+def _loaded(options: argparse.Namespace, named: dict[str, str]) -> Any:
+    """Load the runs or the checkpoint."""
+    from lorasp_jax.extras.serving import loading
+
+    if all(map(loading.is_run, named.values())):
+        _refuse(options, CHECKPOINT_OPTIONS, "is for published checkpoints: runs record theirs")
+        if options.execution == "trained":
+            loading.check_trained(named.values())
+        return loading.load_runs(named, base=options.base, words=options.tokenizer)
+    if len(named) > 1:
+        raise ValueError("several policies must all be finished runs, or all be exported")
+    _refuse(options, ("base",), "is for runs")
+    return loading.load_checkpoint(_checkpoint(options, *named.values()))
+
+
+def _refuse(options: argparse.Namespace, names: Sequence[str], reason: str) -> None:
+    """Raise ValueError if one of these options was given, since it would have no effect."""
+    for name in names:
+        if getattr(options, name):
+            raise ValueError(f"--{name.replace('_', '-')} {reason}")
+
+
+def _checkpoint(options: argparse.Namespace, where: str) -> Any:
+    from lorasp_jax.extras.serving.loading import Checkpoint
+
+    return Checkpoint(
+        where,
+        tokenizer=options.tokenizer,
+        statistics=options.statistics,
+        dataset=options.dataset,
+        joints=options.joints,
+        size=options.size,
+        dtype=options.dtype,
+        cameras=dict(map(_pair, options.camera)),
+        adapters=dict(map(_pair, options.adapter)),
+    )
+
+
+def _named(text: str) -> tuple[str, str]:
+    """Split NAME=POLICY; without a name, the last part of the path is the name."""
+    if "=" not in text or Path(text).exists():  # a path may contain the character
+        return Path(text).name, text
+    return _pair(text)
+
+
+def _pair(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not (name and equals and value):
+        raise ValueError(f"expected NAME=VALUE, got {text!r}")
+    return name, value
+
+
+def _read_token(path: Path | None) -> str:
+    """Read the token, without a final newline.
+
+    Raises:
+        ValueError: the file is empty or not text.
+    """
+    if path is None:
+        return ""
+    token = path.read_text().strip()
+    if not token or not token.isascii() or not token.isprintable():
+        raise ValueError(f"{path} must contain a token of printable ASCII characters")
+    return token
+
+
+def _say(console: Console, text: str) -> None:
+    console.print(text, soft_wrap=True, highlight=False, markup=False)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,193 @@
+"""Run requests of several clients as one batch, in a thread of its own.
+
+The event loop stays free while a policy infers, so `/healthz` always answers. Batches have a few
+fixed sizes, compiled in advance; missing rows are copies of the first.
+
+A lone request never waits. After a batch, the worker waits until the clients of that batch have
+sent their next requests, at most `WAIT` seconds: clients that ask again at once, each as fast as it
+can, so share batches instead of taking turns.
+"""
+
+import asyncio
+import queue
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from lorasp_jax.extras.serving.metrics import Metrics
+from lorasp_jax.extras.serving.requests import PolicySpec, Request
+
+WAIT = 0.003
+"""Longest time to wait for the clients of the previous batch [s]."""
+
+
+class PolicyFailure(RuntimeError):
+    """The policy could not answer; the message is for the client."""
+
+
+class BatchPolicy(Protocol):
+    """A policy as the server sees it."""
+
+    @property
+    def spec(self) -> PolicySpec:
+        """What the policy needs and returns."""
+        ...
+
+    @property
+    def adapters(self) -> tuple[str, ...]:
+        """Names of the adapters that a request may choose; the first is the default."""
+        ...
+
+    @property
+    def instructions(self) -> Mapping[str, Sequence[str]]:
+        """The instructions that each adapter was trained with."""
+        ...
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Batch sizes, ascending."""
+        ...
+
+    def prepare(self, request: Request, index: tuple[int, int]) -> Any:
+        """Convert a request to a row of a batch.
+
+        Args:
+            request: a request.
+            index: numbers of the connection and of the request on it, for the flow's noise.
+
+        Raises:
+            ValueError: the request does not fit the policy.
+        """
+        ...
+
+    def run(self, adapter: str, rows: Sequence[Any]) -> np.ndarray:
+        """Return actions f32 `[B, C, J+1]`; B is one of `sizes`."""
+        ...
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Actions of one request.
+
+    Attributes:
+        actions: f32 `[C, J+1]`.
+        milliseconds: time that the policy took for the batch.
+    """
+
+    actions: np.ndarray
+    milliseconds: float
+
+
+@dataclass(eq=False)
+class _Job:
+    client: int
+    adapter: str
+    row: Any
+    future: Future[Answer] = field(default_factory=Future)
+
+
+class Batcher:
+    """Collects rows and runs them in batches, in its own thread until `close`."""
+
+    def __init__(
+        self,
+        policy: BatchPolicy,
+        metrics: Metrics,
+        on_failure: Callable[[BaseException], None] = lambda _: None,
+    ) -> None:
+        """Start the thread.
+
+        Args:
+            policy: runs the batches; its `run` is only called from the thread.
+            metrics: receives batch sizes and inference times.
+            on_failure: is told of exceptions of the policy, whose details are not for clients.
+        """
+        self._policy, self._metrics, self._on_failure = policy, metrics, on_failure
+        self._queue: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
+        self._pending: list[_Job] = []
+        self._awaited: set[int] = set()
+        self._finished = 0.0
+        self._thread = threading.Thread(target=self._work, name="policy", daemon=True)
+        self._thread.start()
+
+    async def infer(self, client: int, adapter: str, row: Any) -> Answer:
+        """Run one row, in a batch with others.
+
+        Raises:
+            PolicyFailure: the policy failed, or returned values that are not finite.
+        """
+        job = _Job(client, adapter, row)
+        self._queue.put(job)
+        return await asyncio.wrap_future(job.future)
+
+    def close(self) -> None:
+        """Stop the thread after the current batch."""
+        self._queue.put(None)
+        self._thread.join()
+
+    def _work(self) -> None:
+        while self._collect():
+            batch = self._take_batch()
+            if batch:
+                self._run(batch)
+                self._awaited = {job.client for job in batch}
+                self._finished = time.monotonic()
+        for job in self._pending:
+            job.future.cancel()
+
+    def _collect(self) -> bool:
+        """Fill the pending jobs, at least with one; return False after `close`."""
+        while True:
+            wait = self._seconds_to_wait()
+            try:
+                job = self._queue.get(timeout=wait) if wait != 0 else self._queue.get_nowait()
+            except queue.Empty:
+                return True
+            if job is None:
+                return False
+            self._pending.append(job)
+            self._awaited.discard(job.client)
+
+    def _seconds_to_wait(self) -> float | None:
+        """Return how long to wait for a further job; None: as long as it takes."""
+        if not self._pending:
+            return None
+        if not self._awaited or len(self._pending) >= self._policy.sizes[-1]:
+            return 0
+        return max(0.0, self._finished + WAIT - time.monotonic())
+
+    def _take_batch(self) -> list[_Job]:
+        """Take the oldest job and others with its adapter, skipping clients that have gone."""
+        alive = [job for job in self._pending if not job.future.cancelled()]
+        chosen = [job for job in alive if job.adapter == alive[0].adapter]
+        batch = chosen[: self._policy.sizes[-1]]
+        self._pending = [job for job in alive if job not in batch]
+        return [job for job in batch if job.future.set_running_or_notify_cancel()]
+
+    def _run(self, batch: list[_Job]) -> None:
+        size = next(size for size in self._policy.sizes if size >= len(batch))
+        rows = [job.row for job in batch]
+        rows += rows[:1] * (size - len(rows))
+        start = time.perf_counter()
+        try:
+            actions = self._policy.run(batch[0].adapter, rows)
+        except Exception as error:  # a failed batch must not stop the server
+            self._on_failure(error)
+            for job in batch:
+                job.future.set_exception(PolicyFailure("the policy failed: see the server's log"))
+            return
+        milliseconds = (time.perf_counter() - start) * 1e3
+        self._metrics.count("batches")
+        self._metrics.count("batched_requests", len(batch))
+        self._metrics.observe("policy infer", milliseconds)
+        for job, chunk in zip(batch, actions, strict=False):
+            if np.isfinite(chunk).all():
+                job.future.set_result(Answer(chunk, milliseconds))
+            else:
+                message = "the policy returned actions that are not finite"
+                job.future.set_exception(PolicyFailure(message))

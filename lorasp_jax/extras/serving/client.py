@@ -1,0 +1,189 @@
+"""Ask a policy server for actions, from a robot or a script.
+
+    with PolicyClient("ws://127.0.0.1:8000") as policy:
+        policy.reset()
+        reply = policy.infer({"image": {"side": ..., "wrist": ...}, "state": ..., "prompt": "..."})
+        reply["actions"]  # [C, J+1]
+
+Needs only NumPy, msgpack and websockets. Works with openpi's servers too.
+"""
+
+import asyncio
+import ssl
+import threading
+import time
+from collections.abc import Callable, Coroutine, Mapping
+from typing import Any, Self, TypeVar
+
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
+
+from lorasp_jax.extras.serving import wire
+
+T = TypeVar("T")
+RETRY_EVERY = 0.2
+"""Time between attempts to connect [s]."""
+SILENCE = 3.0
+"""Time without a server after which a waiting client says so [s]; our choice."""
+
+
+class PolicyError(RuntimeError):
+    """The server refused a request or failed; the message is the server's sentence."""
+
+
+class ServerGone(ConnectionError):
+    """There is no server, it closed the connection, or it did not reply in time."""
+
+
+class PolicyClient:
+    """A connection to a policy server. Not thread-safe.
+
+    The connection lives in a thread of its own, which answers the server's pings between requests.
+    Only that thread touches it, since Python's encrypted sockets do not tolerate two.
+
+    Attributes:
+        address: the server's.
+        metadata: the server's description of its policy.
+    """
+
+    def __init__(
+        self,
+        address: str = "ws://127.0.0.1:8000",
+        *,
+        token: str = "",
+        certificate: str = "",
+        timeout: float = 10.0,
+        wait: float = 0.0,
+        say: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        """Connect to a server.
+
+        Args:
+            address: ws://host:port or wss://host:port.
+            token: the server's token, if it requires one.
+            certificate: path of a PEM file to trust in addition to the system's certificates.
+            timeout: how long to wait for the connection and for each reply [s].
+            wait: how long to try again if there is no server yet [s].
+            say: called once, in another thread, with a sentence if that takes long.
+
+        Raises:
+            ServerGone: there is no server at this address, it requires another token, or its
+                certificate is not trusted.
+        """
+        self.address: str = address
+        self._timeout, self._reset = timeout, False
+        context = ssl.create_default_context(cafile=certificate or None)
+        self._options: dict[str, Any] = {
+            "additional_headers": {"Authorization": f"Api-Key {token}"} if token else {},
+            "ssl": context if address.startswith("wss:") else None,
+            "compression": None,
+            "max_size": wire.MAX_FRAME,
+            "open_timeout": timeout,
+            "close_timeout": 1,
+            "proxy": None,
+        }
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
+        self._thread.start()
+        self._socket: ClientConnection | None = None
+        try:
+            self._socket = self._run(self._connect(wait, say))
+            self.metadata: dict[str, Any] = self._exchange(None, timeout)
+        except BaseException:
+            self.close()
+            raise
+
+    def infer(
+        self, observation: Mapping[str, Any], *, timeout: float | None = None
+    ) -> dict[str, Any]:
+        """Return the server's reply: `actions` `[C, J+1]` f32, and timings [ms].
+
+        Args:
+            observation: one of the server's request forms; may have the key `adapter`.
+            timeout: how long to wait for the reply [s]; None is the client's default.
+
+        Raises:
+            PolicyError: the server refused the observation. It then closes the connection.
+            ServerGone: the connection is lost, or no reply came in time. The connection is closed,
+                since a late reply could be mistaken for the next one.
+            TypeError: the observation contains something else than numbers, text and arrays.
+        """
+        frame = wire.pack({**observation, "reset": True} if self._reset else observation)
+        try:
+            reply = self._exchange(frame, self._timeout if timeout is None else timeout)
+        except BaseException:  # also after Ctrl-C, as the reply may still come
+            self.close()
+            raise
+        self._reset = False
+        return reply
+
+    def reset(self) -> None:
+        """Tell the server with the next request that a new episode starts."""
+        self._reset = True
+
+    def close(self) -> None:
+        """Close the connection and stop its thread."""
+        if not self._thread.is_alive():
+            return
+        if self._socket is not None:
+            self._run(self._socket.close())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    def __enter__(self) -> Self:
+        """Return the client."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the connection."""
+        self.close()
+
+    def _run(self, coroutine: Coroutine[Any, Any, T]) -> T:
+        """Run a coroutine in the connection's thread."""
+        return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result()
+
+    async def _connect(self, wait: float, say: Callable[[str], None]) -> ClientConnection:
+        """Connect, trying again for some time while the address refuses connections."""
+        start, said = time.monotonic(), False
+        while True:
+            try:
+                return await connect(self.address, **self._options)
+            except ConnectionRefusedError as error:
+                waited = time.monotonic() - start
+                if waited > wait:
+                    raise ServerGone(f"no policy server at {self.address}: {error}") from error
+                if waited > SILENCE and not said:
+                    say(f"no server there yet: trying for up to {wait:g} s")
+                    said = True
+                await asyncio.sleep(RETRY_EVERY)
+            except InvalidStatus as error:
+                code, body = error.response.status_code, error.response.body or b""
+                text = body.decode(errors="replace").strip()
+                message = f"{self.address} refused the connection ({code}): {text}"
+                raise ServerGone(message) from error
+            except (OSError, WebSocketException) as error:
+                raise ServerGone(f"no policy server at {self.address}: {error}") from error
+
+    def _exchange(self, frame: bytes | None, timeout: float) -> dict[str, Any]:
+        """Send a frame, unless it is None, and return the next reply."""
+        if not self._thread.is_alive():
+            raise ServerGone(f"the connection to {self.address} is closed")
+        try:
+            reply = self._run(self._send_and_receive(frame, timeout))
+        except TimeoutError as error:
+            raise ServerGone(f"{self.address} did not reply within {timeout:g} s") from error
+        except ConnectionClosed as error:
+            reason = error.rcvd.reason if error.rcvd else ""
+            text = f"{self.address} closed the connection{reason and ': '}{reason}"
+            raise ServerGone(text) from error
+        if isinstance(reply, str):
+            raise PolicyError(reply)
+        return wire.unpack(reply)
+
+    async def _send_and_receive(self, frame: bytes | None, timeout: float) -> bytes | str:
+        assert self._socket is not None
+        async with asyncio.timeout(timeout):
+            if frame is not None:
+                await self._socket.send(frame)
+            return await self._socket.recv()

@@ -1,0 +1,60 @@
+"""Export a policy: `python -m lorasp_jax.extras.serving.export runs/NAME --out FOLDER`."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from lorasp_jax.base.errors import parse_arguments, run_command
+
+
+def main(
+    arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.serving.export"
+) -> int:
+    """Export a run; return the exit code, one of `lorasp_jax.base.errors`."""
+    options = parse_arguments(parser(program), arguments)
+    return run_command(lambda: _export(options, Console()), Console(stderr=True))
+
+
+def parser(program: str) -> argparse.ArgumentParser:
+    """Return the argument parser of this command."""
+    parser = argparse.ArgumentParser(
+        prog=program,
+        description="Export the policy of a finished run as a folder that runs without this "
+        "package. See docs/serving.md.",
+    )
+    add = parser.add_argument
+    add("run", help="folder of a finished run")
+    add("--out", type=Path, required=True, metavar="FOLDER", help="folder to create")
+    add("--base", default="", help="the run's base, if it has moved")
+    add("--tokenizer", default="", help="the policy's tokenizer, if it has moved")
+    add("--num-steps", type=int, default=10, help="flow steps (default: %(default)s)")
+    add("--max-batch", type=int, default=8, help="largest batch (default: %(default)s)")
+    return parser
+
+
+def _export(options: argparse.Namespace, console: Console) -> None:
+    import jax
+
+    if options.out.exists():  # said before the run loads, which can take a minute
+        raise ValueError(f"{options.out} already exists: choose another path")
+    jax.config.update("jax_platforms", "cpu")
+    from lorasp_jax.extras.serving import exporting, loading
+
+    loaded = loading.load_runs({"run": options.run}, base=options.base, words=options.tokenizer)
+    exporting.write(
+        loaded.policies["run"],
+        options.out,
+        continues=bool(loading.was_trained(options.run)),
+        num_steps=options.num_steps,
+        max_batch=options.max_batch,
+        metadata=loaded.metadata,
+    )
+    megabytes = sum(file.stat().st_size for file in options.out.iterdir()) / 1e6
+    console.print(f"wrote {options.out}, {megabytes:.1f} MB", soft_wrap=True, highlight=False)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

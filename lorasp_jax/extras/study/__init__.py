@@ -1,0 +1,5 @@
+"""Studies: many runs as one experiment, with scheduling, statistics and claims."""
+
+from lorasp_jax.extras.study.study import Cell, Derived, Study
+
+__all__ = ["Cell", "Derived", "Study"]

@@ -1,0 +1,132 @@
+"""All results of a study in one small file, from which tables, figures and page are made."""
+
+import dataclasses
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from lorasp_jax.base.digest import verify_digest, with_digest
+from lorasp_jax.base.files import as_value_error, read_bytes
+from lorasp_jax.base.json_values import check
+from lorasp_jax.base.writing import write_text
+from lorasp_jax.extras.study.status import SCHEMA
+from lorasp_jax.extras.study.study import Study
+from lorasp_jax.extras.study.study import load as load_file
+
+RESULTS_FILE = "results.json"
+MAX_BYTES = 2_000_000
+"""Largest size of the file, which is committed."""
+DIGITS = 5
+"""Significant digits of the floats in the file."""
+
+
+def write(path: Path, study: str, results: Mapping[str, Mapping[str, Any]]) -> None:
+    """Write the content of cell.json of all finished cells, by cell name, atomically.
+
+    The same results give the same bytes. Floats are rounded to `DIGITS` digits. Settings that most
+    cells share are stored once.
+
+    Raises:
+        ValueError: the file would be larger than `MAX_BYTES`.
+    """
+    settings = {name: dict(_flat(result["config"])) for name, result in results.items()}
+    common = _most_common(list(settings.values()))
+    cells = {
+        name: rounded(result) | {"config": _changes(settings[name], common)}
+        for name, result in sorted(results.items())
+    }
+    lines = [f"{json.dumps(name)}:{_dump(cell)}" for name, cell in cells.items()]
+    digest = with_digest({"study": study, "common": common, "cells": cells})["digest"]
+    rest = {"common": common, "digest": digest, "study": study}
+    text = '{"cells":{\n' + ",\n".join(lines) + f"\n}},\n{_dump(rest)[1:]}\n"
+    if len(text.encode()) > MAX_BYTES:
+        largest = max(lines, key=len)
+        raise ValueError(
+            f"the results of {study} take {len(text.encode()) / 1e6:.2f} MB, more than "
+            f"{MAX_BYTES / 1e6:g} MB: the largest cell, {largest.partition(':')[0]}, takes "
+            f"{len(largest) / 1e3:.1f} kB"
+        )
+    write_text(path, text)
+
+
+def load_study(config: Path, scale: str, path: Path | None) -> Study:
+    """Load the study that a file defines; it starts from the results in `path`, if given.
+
+    Raises:
+        ValueError: see `study.load` and `load`.
+    """
+    study = load_file(config, scale)
+    return dataclasses.replace(study, finished=load(path, study.name)) if path else study
+
+
+def load(path: Path, study: str = "") -> dict[str, dict[str, Any]]:
+    """Read the results of all cells, by cell name, from a file of `write`.
+
+    Raises:
+        ValueError: the file does not exist, is damaged or, if `study` is given, has the results of
+            another study.
+    """
+    with as_value_error(path, remedy=": restore it, or run the study again"):
+        content = verify_digest(json.loads(read_bytes(path)))
+        check(content, {"study": str, "common": {}, "cells": {str: {"config": {}}}})
+        if study and content["study"] != study:
+            raise ValueError(f"it has the results of {content['study']}, not of {study}")
+        results = {
+            name: {**cell, "config": _nested({**content["common"], **cell["config"]})}
+            for name, cell in content["cells"].items()
+        }
+        check(results, {str: SCHEMA})
+        return results
+
+
+def _dump(value: Any) -> str:
+    return json.dumps(value, sort_keys=True, separators=(",", ":"))
+
+
+def rounded(value: Any) -> Any:
+    """Round the floats in JSON values to `DIGITS` digits."""
+    if isinstance(value, float):
+        number = float(f"{value:.{DIGITS}g}")
+        return int(number) if number.is_integer() and abs(number) < 10**DIGITS else number
+    if isinstance(value, Mapping):
+        return {str(key): rounded(item) for key, item in value.items()}
+    return [*map(rounded, value)] if isinstance(value, list | tuple) else value
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield dotted names and values of nested settings."""
+    for name, value in settings.items():
+        if isinstance(value, Mapping) and value:
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _nested(flat: Mapping[str, Any]) -> dict[str, Any]:
+    """Undo `_flat`."""
+    nested: dict[str, Any] = {}
+    for name, value in flat.items():
+        *parents, last = name.split(".")
+        inner = nested
+        for parent in parents:
+            inner = inner.setdefault(parent, {})
+        inner[last] = value
+    return nested
+
+
+def _most_common(settings: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the most frequent value of every setting that all cells have."""
+    shared = set.intersection(*map(set, settings)) if settings else set()
+    common = {}
+    for name in sorted(shared):
+        counts = Counter(_dump(cell[name]) for cell in settings)
+        common[name] = json.loads(min(counts, key=lambda value: (-counts[value], value)))
+    return common
+
+
+def _changes(settings: Mapping[str, Any], common: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings that are not in `common`."""
+    missing = object()
+    return {name: value for name, value in settings.items() if common.get(name, missing) != value}

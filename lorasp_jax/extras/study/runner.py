@@ -1,0 +1,172 @@
+"""Run the cells of a study: one worker, of which many may share a study's folder.
+
+A worker claims a cell with a lock, which the operating system releases even if the worker is
+killed. What is finished stands in the cells' folders, so that workers need not talk to each other,
+and a killed one loses at most the steps since its last checkpoint.
+"""
+
+import collections
+import contextlib
+import functools
+import time
+import traceback
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import filelock
+
+from lorasp_jax.base.locks import acquire
+from lorasp_jax.config import Config
+from lorasp_jax.extras.study import status
+from lorasp_jax.extras.study.status import Board, State, Status
+from lorasp_jax.extras.study.study import Cell, Derived, Results, Study
+from lorasp_jax.training.run_folder import write_json
+
+POLL = 2.0
+"""Time between two looks at the cells of other workers [s]."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A cell that can run.
+
+    Attributes:
+        cell: the cell.
+        config: config of its run; that of the source's run for a derived cell.
+        study_folder: the study's folder.
+        results: results of the cells that it needs.
+    """
+
+    cell: Cell | Derived
+    config: Config
+    study_folder: Path
+    results: Results
+
+    @property
+    def folder(self) -> Path:
+        """The cell's folder."""
+        return self.study_folder / self.cell.name
+
+
+RunCell = Callable[[Job], dict[str, Any]]
+"""Runs a cell, resuming it if it was interrupted; returns cell.json without the config."""
+Report = Callable[[str, str], None]
+"""Called with "start", "end" or "fail" and the name of a cell."""
+
+
+def work(
+    study: Study,
+    folder: Path,
+    names: Collection[str],
+    run_cell: RunCell,
+    report: Report = lambda _event, _name: None,
+    poll: float = POLL,
+) -> None:
+    """Run the named cells until none of them can run.
+
+    While another worker runs one, this one waits: the cell may enable others, or be left behind.
+    """
+    board, last = Board(study, folder), ""
+    while True:
+        statuses = board.read()
+        runnable = [
+            cell.name
+            for cell in study.cells
+            if cell.name in names and statuses[cell.name].state is State.RUNNABLE
+        ]
+        if not runnable:
+            return
+        run = functools.partial(_run_claimed, study, board, folder, run_cell, report)
+        # The best cell that is free; then look again, because it may have enabled better ones.
+        ran = next((name for name in _by_urgency(study, statuses, runnable, last) if run(name)), "")
+        if not ran:
+            time.sleep(poll)
+        last = ran or last
+
+
+def _by_urgency(
+    study: Study, statuses: Mapping[str, Status], names: Sequence[str], last: str
+) -> list[str]:
+    """Sort cells in the order in which a worker that has run the cell `last` should run them.
+
+    First come those that most cells wait for, then those of the last cell's group, whose programs
+    are compiled, then the first of each other group, since other workers may go on with the rest.
+    """
+    waiting = [c for c in study.cells if statuses[c.name].state is State.WAITING]
+    dependents = collections.Counter(need for cell in waiting for need in cell.needs)
+    group_of = {c.name: group for group, cells in study.groups.items() for c in cells}
+    before = collections.Counter[str]()  # runnable cells of a group before this one
+
+    def urgency(name: str) -> tuple[int, bool, int]:
+        group = group_of[name]
+        before[group] += 1
+        return -dependents[name], group != group_of.get(last), before[group]
+
+    return sorted(names, key=urgency)
+
+
+def _run_claimed(
+    study: Study, board: Board, folder: Path, run_cell: RunCell, report: Report, name: str
+) -> bool:
+    """Run a cell, after those of `_due`; return False if another worker has claimed one of them."""
+    for due in _due(study, folder, study[name]):
+        with _claimed(folder, due.name) as claimed:
+            if not claimed:
+                return False
+            statuses = board.read()
+            config = statuses[due.name].config
+            if due.name == name:
+                is_due = statuses[name].state is State.RUNNABLE
+            else:
+                is_due = not _is_here(folder, due.name)
+            if is_due and config:  # no other worker has run the cell meanwhile
+                results = status.results_of(due.needs, statuses)
+                run_one(Job(due, config, folder, results), run_cell, report)
+    return True
+
+
+def _due(study: Study, folder: Path, cell: Cell | Derived) -> list[Cell | Derived]:
+    """Return a cell, after the sources that must run again because no policy of theirs is here.
+
+    That is so if the study started from a file of results.
+    """
+    if not isinstance(cell, Derived) or _is_here(folder, cell.source):
+        return [cell]
+    return [*_due(study, folder, study[cell.source]), cell]
+
+
+def _is_here(folder: Path, name: str) -> bool:
+    """Say whether a cell has run in this folder, so that its policy is here."""
+    return (folder / name / status.CELL_FILE).exists()
+
+
+def run_one(job: Job, run_cell: RunCell, report: Report) -> None:
+    """Run a cell and write cell.json, or failed.txt if it raises an exception."""
+    report("start", job.cell.name)
+    try:
+        job.folder.mkdir(parents=True, exist_ok=True)
+        result = run_cell(job)
+        settings = status.describe_config(job.cell, job.config)
+        write_json(job.folder / status.CELL_FILE, {"config": settings, **result})
+    except Exception as error:
+        status.record_failure(job.folder, status.one_line(error), traceback.format_exc())
+        report("fail", job.cell.name)
+    else:
+        status.tidy(job.folder)
+        report("end", job.cell.name)
+
+
+@contextlib.contextmanager
+def _claimed(folder: Path, name: str) -> Iterator[bool]:
+    """Claim a cell in this block; yield False if another worker has it."""
+    file = folder / "locks" / f"{name}.lock"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        lock = acquire(file)
+    except filelock.Timeout:
+        yield False
+        return
+    with lock:
+        yield True

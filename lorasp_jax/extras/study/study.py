@@ -1,0 +1,190 @@
+"""A study: named cells, most of which are training runs, and the claims that they test."""
+
+import fnmatch
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from lorasp_jax.config import MAX_NAME_BYTES, Config
+from lorasp_jax.training.experiment_file import call
+
+if TYPE_CHECKING:  # a run of a finished study should load no model code
+    from envs.datasets.episodes import Episodes
+    from lorasp_jax.policies.policy import Policy
+
+Results: TypeAlias = Mapping[str, Mapping[str, Any]]
+"""The content of cell.json by cell name."""
+RESERVED = (
+    *("demonstrations", "held_out", "locks", "logs"),
+    *("results.json", "study.md", "figures"),
+)
+"""What a study's folder contains besides the folders of cells."""
+_PART = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._+=-]*")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training run of a study.
+
+    Attributes:
+        name: path of the run's folder in the study's folder, such as "pi0/multi/lora_sp/s0".
+        config: the run's config, or a function that makes it from the results of the cells in
+            `after`. The config's own name is ignored.
+        after: names of the cells that must be finished first.
+        group: cells of one group share compiled programs, so a process that has run one prefers the
+            others; by default, each cell is its own group.
+        measured: whether to record the costs of training and the measures on held-out data, which
+            take programs of their own to compile; otherwise only success and active ranks.
+    """
+
+    name: str
+    config: Config | Callable[[Results], Config]
+    after: tuple[str, ...] = ()
+    group: str = ""
+    measured: bool = True
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Names of all cells that must be finished first."""
+        return self.after
+
+
+@dataclass(frozen=True)
+class Derived:
+    """A policy made from that of another cell without training, then evaluated as that cell was.
+
+    It belongs to the group of `source`.
+
+    Attributes:
+        name: path of the folder in the study's folder.
+        source: name of the cell whose policy is transformed.
+        transform: makes the policy to evaluate from the source's policy, the results of `source`
+            and of the cells in `after`, and held-out demonstrations by task.
+        after: names of further cells that must be finished first.
+    """
+
+    name: str
+    source: str
+    transform: Callable[["Policy", Results, Mapping[str, "Episodes"]], "Policy"]
+    after: tuple[str, ...] = ()
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Names of all cells that must be finished first."""
+        return self.source, *self.after
+
+
+@dataclass(frozen=True)
+class Study:
+    """A list of cells, and what they are to show.
+
+    Attributes:
+        name: the study's folder in the folder of all runs.
+        cells: every cell; each comes after those that it needs.
+        claims: the claims to test, decided before the cells run (see `study.claims`).
+        finished: results that the study starts from; these cells run only if a derived cell needs
+            their policies.
+        page: writes a page with figures into a folder, from the results of the finished cells.
+    """
+
+    name: str
+    cells: tuple[Cell | Derived, ...]
+    claims: tuple[Any, ...] = ()
+    finished: Results = field(default_factory=dict)
+    page: Callable[["Study", Results, Path], None] | None = None
+
+    def __post_init__(self) -> None:
+        """Validate names and order.
+
+        Raises:
+            ValueError: a name is unsafe, used twice or nested in another, or a cell needs one that
+                does not come before it.
+        """
+        _check_path(self.name)
+        if "/" in self.name:
+            raise ValueError(f"the name of a study must not contain '/', got {self.name!r}")
+        names = {cell.name: cell for cell in self.cells}
+        if len(names) < len(self.cells):
+            twice = next(cell.name for cell in self.cells if names[cell.name] is not cell)
+            raise ValueError(f"two cells have the name {twice!r}")
+        for name in names:
+            _check_path(name)
+            if parents := [str(path) for path in PurePosixPath(name).parents if str(path) in names]:
+                raise ValueError(f"cell {name!r} lies in the folder of cell {parents[0]!r}")
+        _check_order(self.cells)
+        for group in self.groups:
+            _check_path(group)
+
+    def __getitem__(self, name: str) -> Cell | Derived:
+        """Return a cell by name."""
+        return next(cell for cell in self.cells if cell.name == name)
+
+    @property
+    def groups(self) -> dict[str, tuple[Cell | Derived, ...]]:
+        """The cells of each group, in order; groups in the order of their first cells."""
+        group_of: dict[str, str] = {}
+        groups: dict[str, tuple[Cell | Derived, ...]] = {}
+        for cell in self.cells:
+            own = group_of[cell.source] if isinstance(cell, Derived) else cell.group or cell.name
+            group_of[cell.name] = own
+            groups[own] = (*groups.get(own, ()), cell)
+        return groups
+
+
+def load(path: Path, scale: str) -> Study:
+    """Load the study that a file defines.
+
+    Raises:
+        ValueError: the file is missing, its code fails, or `get_study` does not return a `Study`.
+    """
+    study = call(path, "get_study", scale)
+    if not isinstance(study, Study):
+        raise ValueError(f"get_study in {path} must return a Study, got {type(study).__name__}")
+    return study
+
+
+def select(study: Study, only: Sequence[str], shard: tuple[int, int]) -> list[str]:
+    """Return the names of a shard's cells that match one of some shell patterns.
+
+    Groups are dealt out in turn, so that every cell is in one shard.
+
+    Raises:
+        ValueError: no cell of the study matches one of the patterns.
+    """
+    matching = set[str]()
+    for pattern in only:
+        found = {cell.name for cell in study.cells if fnmatch.fnmatchcase(cell.name, pattern)}
+        if not found:
+            first = study.cells[0].name if study.cells else "none"
+            raise ValueError(
+                f"no cell of {study.name} matches {pattern!r}; the first cell is {first}"
+            )
+        matching |= found
+    index, count = shard
+    groups = list(study.groups.values())[index - 1 :: count]
+    return [cell.name for group in groups for cell in group if cell.name in matching]
+
+
+def _check_path(name: str) -> None:
+    """Raise ValueError unless `name` is a relative path of plain folder names."""
+    parts = name.split("/")
+    if not all(_PART.fullmatch(part) and len(part) <= MAX_NAME_BYTES for part in parts):
+        raise ValueError(
+            "names must be relative paths of letters, digits and . _ + = -, whose parts do not "
+            f"begin with . + = or -, got {name!r}"
+        )
+    if parts[0] in RESERVED:
+        raise ValueError(f"names must not begin with {', '.join(RESERVED)}, got {name!r}")
+
+
+def _check_order(cells: tuple[Cell | Derived, ...]) -> None:
+    """Raise ValueError unless each cell comes after those that it needs: so there is no circle."""
+    names, seen = {cell.name for cell in cells}, set[str]()
+    for cell in cells:
+        for need in cell.needs:
+            if need not in seen:
+                problem = "which comes later" if need in names else "which does not exist"
+                raise ValueError(f"cell {cell.name!r} needs {need!r}, {problem}")
+        seen.add(cell.name)

@@ -1,1 +1,0 @@
-"""Locate model files, and detect corrupted ones."""

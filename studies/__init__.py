@@ -1,0 +1,1 @@
+"""Experiments on the study engine; not part of the installed package."""

@@ -1,0 +1,1 @@
+"""Meta-World as data and judge."""

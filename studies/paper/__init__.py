@@ -1,0 +1,1 @@
+"""The study of the paper: LoRA-SP against its baselines on four PiPER tasks."""

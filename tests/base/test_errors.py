@@ -1,0 +1,45 @@
+"""How commands end."""
+
+import io
+
+import pytest
+from rich.console import Console
+
+from lorasp_jax.base.errors import INTERRUPTED, REFUSED, run_command
+
+
+def end(command, **options):
+    errors = Console(file=io.StringIO())
+    return run_command(command, errors, **options), errors.file.getvalue()
+
+
+def fail(error):
+    def command():
+        raise error
+
+    return command
+
+
+def test_success_is_silent():
+    assert end(lambda: None) == (0, "")
+    assert end(lambda: 3) == (3, "")
+
+
+def test_bad_input_is_reported_on_one_line():
+    assert end(fail(ValueError("no such\ntask"))) == (REFUSED, "error: no such task\n")
+    assert end(fail(MemoryError()), remedy=": buy more") == (
+        REFUSED,
+        "error: out of memory: buy more\n",
+    )
+
+
+def test_a_bug_is_raised():
+    with pytest.raises(KeyError):
+        end(fail(KeyError("task")))
+
+
+def test_an_interruption_says_what_is_left():
+    assert end(fail(KeyboardInterrupt())) == (INTERRUPTED, "interrupted\n")
+    assert end(fail(KeyboardInterrupt()), interrupted="stopped [1/2]")[1] == "stopped [1/2]\n"
+    saved = fail(KeyboardInterrupt("8 of 10 are saved"))
+    assert end(saved, interrupted="stopped")[1] == "interrupted; 8 of 10 are saved\n"

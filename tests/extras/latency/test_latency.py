@@ -1,0 +1,209 @@
+"""The command: what it measures, its files, and its errors on one line."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+from flax import nnx
+
+from lorasp_jax.extras.latency import __main__ as command
+from lorasp_jax.extras.latency import curve, figure
+from lorasp_jax.extras.latency.execution import Trace
+from lorasp_jax.policies.correction import CorrectionHead
+from lorasp_jax.training.correction import files
+from lorasp_jax.training.random_streams import RandomStream
+from lorasp_jax.training.run_folder import read_json, to_json, write_json
+from tests.evaluation.test_programs import policy
+from tests.extras.latency.test_execution import CONFIG as CHUNKS_OF_TEN
+from tests.runs import CONFIG, RESULTS, finish
+
+SETTINGS = dataclasses.replace(CONFIG.evaluation, episodes=4, num_envs=2, denoise_steps=3)
+TASK = RESULTS["tasks"]["press"]
+MODEL = dataclasses.replace(policy().model, config=CHUNKS_OF_TEN)
+POLICY = dataclasses.replace(policy(), model=MODEL)
+
+
+def played(env, how, *, ranges, head):
+    """Stand in for a rollout: the first world succeeds, and targets grow with the delay."""
+
+    def rollout(policy, key, delay):
+        assert ranges is None
+        assert (head is not None) == (how.execution == "corrected")
+        calls.append((env.task.name, how.execution, how.execute_steps, delay, key))
+        commands = np.zeros((2, 6, 7))
+        commands[..., 0] = delay * np.arange(6) ** 3
+        return Trace(np.array([True, False]), np.array([6, 6]), commands)
+
+    calls = played.calls
+    return rollout
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A finished run on two tasks, with stand-ins for policy and rollouts."""
+    (tmp_path / "run").mkdir()
+    folder = finish(tmp_path / "run")
+    write_json(folder / "results.json", RESULTS | {"tasks": {"press": TASK, "pour": TASK}})
+    optim = dataclasses.replace(CONFIG.optim, rtc_max_delay=2)
+    config = dataclasses.replace(CONFIG, evaluation=SETTINGS, optim=optim)
+    write_json(folder / "config.json", to_json(config))
+    monkeypatch.setattr(curve, "load_policy", lambda run: POLICY)
+    monkeypatch.setattr(curve, "prepared", lambda policy: policy)
+    monkeypatch.setattr(curve, "describe", lambda run: {"robot": "panda"})
+    monkeypatch.setattr(curve, "delayed_rollout", played)
+    played.calls = []
+    return folder
+
+
+def save_head(folder, seed):
+    head = CorrectionHead(("side", "wrist"), 8, 10, nnx.Rngs(seed))
+    files.save(folder, head, POLICY, {"naive": 1.0, "corrected": 1.0})
+
+
+def refused(capsys, *arguments):
+    """Return the line on stderr of a command that fails."""
+    assert command.main([*map(str, arguments)]) == 2
+    printed = capsys.readouterr().err
+    assert printed.count("error:") == 1
+    return printed
+
+
+def test_every_execution_is_measured_at_every_delay(folder, capsys):
+    assert command.main([str(folder), "--episodes", "4"]) == 0
+    beyond, *written = capsys.readouterr().out.splitlines()
+    assert beyond.endswith("trained execution at d = 3, 4, 5 is beyond its --optim.rtc-max-delay")
+    assert written == [f"written: {folder / name}" for name in ("latency.json", "latency.svg")]
+    found = read_json(folder / "latency.json", curve.SCHEMA)
+    assert (found["chunk"], found["execute_steps"], found["denoise_steps"]) == (10, 5, 3)
+    assert {(t, e) for t, curves in found["curves"].items() for e in curves} == {
+        (t, e) for t in ("press", "pour") for e in ("synchronous", "naive", "trained", "guided")
+    }
+    points = found["curves"]["pour"]["trained"]
+    assert [point["delay"] for point in points] == [0, 1, 2, 3, 4, 5]
+    assert (points[1]["success"], points[1]["outcomes"], points[1]["steps"]) == (0.5, "1010", 6)
+    np.testing.assert_allclose(points[2]["action_delta"], 2 * 125 / 5)
+    np.testing.assert_allclose(points[2]["jerk"], 2 * 6 / 0.1**3)
+    assert "<svg" in (folder / "latency.svg").read_text()
+
+
+def test_a_figure_of_several_runs(folder, tmp_path):
+    """The same file every time, whichever executions the first run has."""
+    (tmp_path / "other").mkdir()
+    other = finish(tmp_path / "other")
+    write_json(other / "config.json", read_json(folder / "config.json"))
+    command.main([str(folder), "--executions", "naive", "--delays", "0", "1", "--tasks", "press"])
+    path = tmp_path / "both.svg"
+    options = ["--delays", "0", "1", "--tasks", "press", "--figure", str(path)]
+    contents = set()
+    for _ in range(2):
+        assert command.main([str(folder), str(other), "--executions", "guided", *options]) == 0
+        contents.add(path.read_bytes())
+    assert len(contents) == 1
+
+
+def test_the_episodes_are_those_of_the_final_evaluation(folder):
+    command.main([str(folder), "--delays", "0", "--tasks", "pour", "--executions", "naive"])
+    keys = jax.random.split(RandomStream.FINAL_EVALUATION.key(CONFIG.seed, "pour"), 2)
+    assert [call[:4] for call in played.calls] == [("pour", "naive", 5, 0)] * 2
+    for call, key in zip(played.calls, keys, strict=True):
+        assert (jax.random.key_data(call[4]) == jax.random.key_data(key)).all()
+
+
+def test_what_is_measured_is_not_measured_again(folder, capsys):
+    options = [str(folder), "--tasks", "press", "--executions", "naive"]
+    command.main([*options, "--delays", "3"])
+    first = len(played.calls)
+    command.main([*options, "--delays", "1", "3"])
+    assert [call[3] for call in played.calls[first:]] == [1, 1]
+    points = read_json(folder / "latency.json")["curves"]["press"]["naive"]
+    assert [point["delay"] for point in points] == [1, 3]
+    before = (folder / "latency.json").read_bytes()
+    line = refused(capsys, *options, "--guidance", "3")
+    assert "measured with other settings (guidance)" in line
+    assert (folder / "latency.json").read_bytes() == before
+
+
+def test_corrected_execution_needs_a_correction_head(folder, capsys):
+    """It is among the executions of runs that have one; latency.json holds results of one head."""
+    options = [str(folder), "--tasks", "press", "--delays", "0"]
+    assert "has no correction head: train one with" in refused(
+        capsys, *options, "--executions", "corrected"
+    )
+    assert not played.calls
+    save_head(folder, seed=0)
+    assert command.main(options) == 0
+    assert [call[1] for call in played.calls[::2]] == [*curve.EXECUTIONS]
+    save_head(folder, seed=1)
+    assert "measured with other settings (correction)" in refused(capsys, *options)
+    assert command.main([*options, "--executions", "naive"]) == 0
+    (folder / "latency.json").unlink()
+    assert command.main(options) == 0
+
+
+def test_a_head_does_not_affect_other_executions(folder):
+    options = [str(folder), "--tasks", "press", "--delays", "0", "--executions"]
+    assert command.main([*options, "naive"]) == 0
+    save_head(folder, seed=0)
+    assert command.main([*options, "corrected"]) == 0
+    assert [call[1] for call in played.calls] == 2 * ["naive"] + 2 * ["corrected"]
+    found = read_json(folder / "latency.json", curve.SCHEMA)
+    assert found["correction"] == files.describe(folder)["sha256"]
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (["--delays", "6"], "must be from 0 to 5 control steps, got 6"),
+        (["--delays", "-1"], "control steps, got -1"),
+        (["--tasks", "pres"], "are press, pour, got 'pres'"),
+        (["--episodes", "3"], "episodes must be a positive multiple of 2, got 3"),
+        (["--execute-steps", "11"], "from 1 to the chunk length (10), got 11"),
+        (["--guidance", "nan"], "guidance must be above 0, got nan"),
+    ],
+)
+def test_bad_options_are_refused_before_anything_runs(options, reason, folder, capsys):
+    assert reason in refused(capsys, folder, *options)
+    assert not (folder / "latency.json").exists()
+    assert not played.calls
+
+
+def test_runs_that_cannot_be_measured(folder, capsys):
+    write_json(folder / "config.json", to_json(dataclasses.replace(CONFIG, evaluation=SETTINGS)))
+    line = refused(capsys, folder, "--executions", "trained")
+    assert "was not trained for execution trained: --optim.rtc-max-delay is 0" in line
+    command.main([str(folder), "--delays", "0", "--tasks", "press"])
+    assert "trained" not in {call[1] for call in played.calls}
+    write_json(folder / "results.json", RESULTS | {"tasks": {}})
+    assert "cannot be simulated" in refused(capsys, folder)
+    (folder / "results.json").unlink()
+    assert "no finished run in" in refused(capsys, folder)
+
+
+def test_results_of_a_miscompiled_program_are_refused():
+    """Every other episode of a batch succeeds."""
+    env = SimpleNamespace(num_envs=128, control_dt=0.1)
+    odd = np.arange(128) % 2 == 1
+    arguments = (None, env, lambda *_: trace, jax.random.key(0), 256, 0)
+    trace = Trace(odd, np.full(128, 4), np.zeros((128, 4, 7)))
+    with pytest.raises(ValueError, match="success depends on bit 0 of an episode's index"):
+        curve.measure_point(*arguments)
+    trace = dataclasses.replace(trace, success=np.ones(128, bool))
+    assert curve.measure_point(*arguments)["success"] == 1
+
+
+def test_the_figure_averages_over_tasks():
+    """Only delays that all tasks have; the interval pools their episodes."""
+    point = {"success": 0.5, "outcomes": "10", "action_delta": 1.0, "jerk": 4.0}
+    other = {"success": 1.0, "outcomes": "11", "action_delta": 3.0, "jerk": 2.0}
+    press = [{"delay": 0, **point}, {"delay": 1, **point}]
+    curves = {"press": {"naive": press}, "pour": {"naive": [{"delay": 1, **other}]}}
+    (mean,) = figure.average(curves, "naive")
+    assert (mean["delay"], mean["success"], mean["action_delta"], mean["jerk"]) == (1, 75, 2, 3)
+    assert mean["ci95"] == [100 * bound for bound in curve.wilson_interval(3, 4)]
+    assert figure.average(curves, "guided") == figure.average({}, "naive") == []
+
+
+def test_every_execution_has_a_color():
+    assert list(figure.COLORS) == list(curve.EXECUTIONS)

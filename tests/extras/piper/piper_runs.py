@@ -1,0 +1,82 @@
+"""Sessions of the PiPER client on the fake arm, and what must hold after them."""
+
+import numpy as np
+
+from lorasp_jax.extras.piper.asking import InTurn
+from lorasp_jax.extras.piper.cameras import Simulated
+from lorasp_jax.extras.piper.safety import Limits
+from lorasp_jax.extras.piper.session import PERIOD, Session, Settings
+
+LIMITS = Limits.of()
+ARM_STEP = np.array([0.03, 0, 0, 0, 0, 0, 0])  # rad per action
+
+
+class Turning:
+    """Turns the base by `ARM_STEP` an action; keeps what it was asked."""
+
+    def __init__(self, chunk=10):
+        self.asked, self.chunk, self.change = [], chunk, lambda actions: actions
+
+    def __call__(self, observation):
+        self.asked.append(observation)
+        steps = np.arange(1, self.chunk + 1)[:, None]
+        return self.change(observation["state"] + steps * ARM_STEP)
+
+
+class Run:
+    """A session whose sentences are kept; `at` calls functions at times since the start."""
+
+    def __init__(self, bench, ask, *, cameras=None, latency=0.0, **options):
+        self.bench, self.said, self.at, self.commands = bench, [], {}, []
+        settings = Settings("turn", hold=options.pop("hold", 0.5), **options.pop("settings", {}))
+        asker = options.pop("asker", None) or InTurn(ask, bench.clock, latency)
+        cameras = cameras or Simulated(bench.world.images)
+        self.session = Session(
+            bench.arm,
+            cameras,
+            asker,
+            LIMITS,
+            settings,
+            bench.clock,
+            say=self.said.append,
+            **options,
+        )
+
+    def __call__(self, seconds, done=lambda: False):
+        start, pending = self.bench.clock.now(), dict(self.at)
+
+        def each_tick():
+            self.commands.append(self.session._governor.pose.copy())
+            for time in [t for t in pending if self.bench.clock.now() - start >= t]:
+                pending.pop(time)()
+            return done()
+
+        return self.session.run(seconds, each_tick)
+
+    @property
+    def path(self):
+        return np.stack(self.commands)
+
+
+def assert_safe(run, jump=0.0):
+    """Check the commands of all ticks, and what the fake arm thinks of them.
+
+    At the start of a hold, the command may jump back to the measured pose [rad].
+    """
+    steps = np.abs(np.diff(run.path, axis=0)[:, :6]).max(axis=1)
+    assert np.sort(steps)[-2] < 1.0 * PERIOD + 1e-9
+    assert steps.max() < max(jump, 1.0 * PERIOD + 1e-9)
+    assert run.bench.fake.unsafe == []
+
+
+def assert_holds(run, words, jump=0.0):
+    """Check that the arm stands still, and that one sentence says why."""
+    bench = run.bench
+    bench.wait(0.5)  # until the servos have caught up
+    before = bench.world.pose
+    bench.wait(0.3)
+    np.testing.assert_allclose(bench.world.pose, before, atol=2e-3)
+    holding = [text for text in run.said if text.startswith("holding")]
+    assert len(holding) == 1, run.said
+    assert words in holding[0]
+    assert_safe(run, jump)

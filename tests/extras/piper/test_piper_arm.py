@@ -1,0 +1,233 @@
+"""The arm's driver and the fake arm, through the unmodified piper_sdk on a virtual CAN bus."""
+
+import numpy as np
+import pytest
+
+from lorasp_jax.extras.piper.arm import PiperArm
+from lorasp_jax.extras.piper.fake import frames
+from lorasp_jax.extras.piper.fake.world import World
+from lorasp_jax.extras.piper.safety import MAX_EFFORT, Governor, Limits, Unsafe, fault
+from tests.extras.piper.benches import Bench, channel
+
+LIMITS = Limits.of()
+
+
+@pytest.fixture(scope="module")
+def world():
+    return World("press")
+
+
+@pytest.fixture
+def bench(world):
+    bench = Bench(world)
+    yield bench.arm, bench.fake, bench.clock
+    bench.close()
+
+
+def ready(bench):
+    arm, fake, clock = bench
+    arm.connect()
+    arm.enable(LIMITS)
+    return arm, fake, clock
+
+
+def wait(clock, seconds):
+    clock.wait_until(clock.now() + seconds)
+
+
+def drive(arm, clock, target, ticks):
+    governor = Governor(LIMITS, 0.005)
+    governor.start(arm.read().pose)
+    for _ in range(ticks):
+        arm.command(governor.step(target))
+        wait(clock, 0.005)
+
+
+def test_feedback_is_in_the_simulations_units_and_zeros(bench):
+    arm, fake, _ = bench
+    arm.connect()
+    np.testing.assert_allclose(arm.read().pose, fake.world.pose, atol=1e-3)
+    assert arm.read().ctrl_mode == 0
+    assert not arm.read().enabled
+
+
+def test_the_arm_moves_where_it_is_told_and_only_there(bench):
+    arm, fake, clock = ready(bench)
+    assert fault(arm.read(), LIMITS) is None
+    target = fake.world.pose + np.array([0.3, 0.1, -0.2, 0.1, -0.1, 0.2, -0.02])
+    drive(arm, clock, target, 500)
+    np.testing.assert_allclose(fake.world.pose, target, atol=5e-3)
+    assert fake.unsafe == []
+
+
+def test_enabling_does_not_move_the_arm(bench):
+    before = bench[1].world.pose
+    _, fake, _ = ready(bench)
+    np.testing.assert_allclose(fake.world.pose, before, atol=2e-3)
+
+
+def test_the_speed_percentage_limits_the_arm_too(bench):
+    arm, fake, clock = ready(bench)
+    start = fake.world.pose
+    for _ in range(40):  # without a governor: one far target
+        arm.command(start + np.array([1.0, 0, 0, 0, 0, 0, 0]))
+        wait(clock, 0.005)
+    assert fake.world.pose[0] - start[0] < 0.2 * 1.02  # 34 % of 3 rad/s for 0.2 s
+
+
+def test_commands_take_the_latency(world):
+    moved = []
+    for latency in (0.0, 0.15):
+        bench = Bench(world, latency=latency).ready(LIMITS)
+        bench.wait(0.3)
+        start = world.pose
+        drive(bench.arm, bench.clock, start + np.array([0.3, 0, 0, 0, 0, 0, 0]), 40)
+        moved.append(world.pose[0] - start[0])
+        bench.close()
+    assert moved[0] > 0.02
+    assert moved[1] < moved[0] / 4
+
+
+def test_a_new_layout_starts_at_its_start_pose_whatever_was_commanded_before(bench):
+    arm, fake, clock = ready(bench)
+    arm.command(fake.world.pose + np.array([0.5, 0, 0, 0, 0, 0, -0.02]))
+    fake.reset(5)
+    start = fake.world.pose
+    wait(clock, 0.3)
+    np.testing.assert_allclose(fake.world.pose, start, atol=2e-3)
+
+
+def test_frames_that_stop_are_noticed_within_60_ms(bench):
+    arm, fake, clock = ready(bench)
+    fake.faults.silent = True
+    wait(clock, 0.045)
+    assert fault(arm.read(), LIMITS) is None
+    wait(clock, 0.015)
+    assert "no feedback from the arm" in fault(arm.read(), LIMITS)
+    fake.faults.silent = False
+    wait(clock, 0.01)
+    assert fault(arm.read(), LIMITS) is None
+
+
+def test_clock_steps_do_not_age_feedback(bench):
+    arm, fake, clock = ready(bench)
+    for step in (-1000.0, 1000.0, 0.0):
+        fake.faults.clock_step = step
+        wait(clock, 0.02)
+        assert fault(arm.read(), LIMITS) is None
+    fake.faults.silent, fake.faults.clock_step = True, -1000.0
+    wait(clock, 0.06)
+    assert "no feedback" in fault(arm.read(), LIMITS)
+
+
+@pytest.mark.parametrize(
+    ("faults", "words"),
+    [
+        ({"status": 7}, "collision"),
+        ({"zeros": True}, "only zeros"),
+        ({"ctrl_mode": 2}, "teaching"),
+        ({"dead_driver": 4}, "driver is off"),
+    ],
+)
+def test_faults_come_through(bench, faults, words):
+    arm, fake, clock = ready(bench)
+    vars(fake.faults).update(faults)
+    wait(clock, 0.06)
+    assert words in fault(arm.read(), LIMITS)
+
+
+def test_a_collision_stops_the_fake_arm(bench):
+    arm, fake, clock = ready(bench)
+    fake.faults.status = 7
+    before = fake.world.pose
+    drive(arm, clock, before + 0.3, 100)
+    np.testing.assert_allclose(fake.world.pose[:6], before[:6], atol=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("faults", "error", "words"),
+    [
+        ({"zeros": True}, Unsafe, "only zeros"),
+        ({"status": 6}, Unsafe, "brake"),
+        ({"dead_driver": 2}, ConnectionError, "drivers are not on"),
+        ({"ctrl_mode": 2}, ConnectionError, "stays in control mode 2"),
+    ],
+)
+def test_enabling_refuses_a_faulty_arm(bench, faults, error, words):
+    arm, fake, _ = bench
+    vars(fake.faults).update(faults)
+    arm.connect()
+    with pytest.raises(error, match=words):
+        arm.enable(LIMITS, timeout=0.2)
+    if error is Unsafe:
+        assert fake.commands == 0
+        assert not fake._enabled.any()
+
+
+def test_a_silent_bus_is_refused(bench):
+    arm, fake, _ = bench
+    fake.faults.silent = True
+    with pytest.raises(ConnectionError, match="the arm sends nothing"):
+        arm.connect(timeout=0.1)
+
+
+def test_corrupted_firmware_limits_are_refused(bench):
+    arm, fake, _ = bench
+    fake.faults.corrupted = True
+    with pytest.raises(Unsafe, match="limits of joint 1 are corrupted"):
+        arm.connect()
+
+
+def test_a_missing_interface_is_one_sentence(capsys):
+    with pytest.raises(
+        ConnectionError, match=r"cannot open can_nowhere: .*can_activate.sh can_nowhere"
+    ):
+        PiperArm("can_nowhere")
+    assert capsys.readouterr() == ("", "")
+
+
+def test_the_grippers_effort_is_capped():
+    with pytest.raises(ValueError, match=f"at most {MAX_EFFORT}, got 5000"):
+        PiperArm(channel(), bus="virtual", effort=5000)
+
+
+def test_the_gripper_frame_has_the_effort(bench, monkeypatch):
+    efforts, unpack = [], frames.unpack_gripper
+
+    def spy(data):
+        efforts.append(unpack(data)[1])
+        return unpack(data)
+
+    monkeypatch.setattr(frames, "unpack_gripper", spy)
+    arm, fake, clock = ready(bench)
+    drive(arm, clock, fake.world.pose, 5)
+    assert set(efforts) == {1000}  # the default, below MAX_EFFORT
+
+
+def test_nan_never_reaches_the_bus(bench):
+    arm, fake, clock = ready(bench)
+    sent = fake.commands
+    with pytest.raises(Unsafe, match="finite"):
+        arm.command(np.full(7, np.nan))
+    wait(clock, 0.01)
+    assert fake.commands == sent
+
+
+def test_the_fake_arm_notices_what_a_client_must_not_send(bench):
+    arm, fake, clock = ready(bench)
+    arm.sdk.JointCtrl(200_000, 0, 0, 0, 0, 0)
+    arm.sdk.GripperCtrl(90_000, 1000, 0x01, 0)
+    arm.sdk.MotionCtrl_2(0x01, 0x01, 30, 0xAD)
+    arm.sdk.EmergencyStop(0x01)
+    wait(clock, 0.02)
+    text = " ".join(fake.unsafe)
+    for words in ("joints 1-2", "gripper 90", "MIT", "emergency stop"):
+        assert words in text
+    assert arm.read().arm_status == 1
+
+
+def test_frames_have_eight_bytes():
+    made = [frames.pair(-1, 2), frames.gripper(7e4, 0, True), frames.status(1, 0, 0)]
+    made += [frames.driver(True), frames.firmware_limits(6, -120, 120, 3)]
+    assert {len(frame) for frame in made} == {8}
+    assert frames.unpack_pair(frames.pair(-90_000, 1)) == (-90_000, 1)

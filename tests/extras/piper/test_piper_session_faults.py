@@ -1,0 +1,170 @@
+"""The control loop on the fake arm when the arm, the server or a camera fails."""
+
+import contextlib
+
+import numpy as np
+import pytest
+
+from lorasp_jax.extras.piper import session as sessions
+from lorasp_jax.extras.piper.cameras import NoPicture, Simulated
+from lorasp_jax.extras.piper.log import Log
+from lorasp_jax.extras.piper.options import Server
+from lorasp_jax.extras.piper.session import PERIOD
+from lorasp_jax.extras.serving.client import PolicyClient
+from tests.extras.piper.piper_runs import Run, Turning, assert_holds, assert_safe
+from tests.extras.serving.stand_in import StandIn, serving
+
+
+def test_frames_that_stop_for_a_while(bench):
+    run = Run(bench, Turning(), hold=5.0)
+    run.at = {
+        0.5: lambda: vars(bench.fake.faults).update(silent=True),
+        0.9: lambda: vars(bench.fake.faults).update(silent=False),
+    }
+    assert run(1.5) is None
+    assert "no feedback from the arm" in run.said[0]
+    assert run.said[1] == "going on"
+    still = run.path[int(0.8 / PERIOD) : int(0.89 / PERIOD)]
+    assert np.ptp(still, axis=0).max() == 0
+    assert_safe(run)
+
+
+def test_frames_that_stop_for_good(bench):
+    run = Run(bench, Turning())
+    run.at = {0.5: lambda: vars(bench.fake.faults).update(silent=True)}
+    assert "no feedback" in run(5.0)
+    assert bench.clock.now() < 3.0
+    assert_holds(run, "no feedback from the arm")
+
+
+def test_going_on_starts_from_the_measured_pose(bench):
+    run, pushed = Run(bench, Turning(), hold=5.0), []
+
+    def push():
+        bench.fake.faults.silent = False
+        bench.world.data.qpos[0] += 0.3  # meanwhile somebody has moved the arm
+        pushed.append(bench.world.pose[0])
+
+    run.at = {0.5: lambda: vars(bench.fake.faults).update(silent=True), 0.7: push}
+    run(0.9)
+    jump = np.abs(np.diff(run.path[:, 0])).argmax() + 1
+    assert run.path[jump, 0] == pytest.approx(pushed[0], abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("faults", "words"),
+    [
+        ({"status": 7}, "collision"),
+        ({"zeros": True}, "only zeros"),
+        ({"dead_driver": 1}, "driver is off"),
+    ],
+)
+def test_an_arm_with_a_fault_holds_where_it_is(bench, faults, words):
+    run, seen = Run(bench, Turning()), []
+
+    def fail():
+        vars(bench.fake.faults).update(faults)
+        seen.append(bench.world.pose)
+
+    run.at = {0.5: fail}
+    assert words in run(5.0)
+    if "zeros" not in faults:  # it does not push on against what stopped it
+        assert run.path[-1, 0] == pytest.approx(seen[0][0], abs=0.012)
+    assert_holds(run, words, jump=0.03)
+    assert np.abs(run.path[-1] - sessions.REST)[:6].max() > 0.5
+
+
+def test_a_collision_does_not_end_by_itself(bench):
+    run = Run(bench, ask := Turning())
+    run.at = {
+        0.52: lambda: vars(bench.fake.faults).update(status=7),
+        0.6: lambda: vars(bench.fake.faults).update(status=0),
+    }
+    assert "collision" in run(30.0)
+    assert "going on" not in run.said
+    assert len(ask.asked) == 2
+
+
+def test_a_person_who_guides_the_arm_gets_it(bench):
+    run = Run(bench, Turning())
+    run.at = {0.5: lambda: bench.arm.teach(True)}
+    assert "control mode 2 (teaching)" in run(5.0)
+    sent = bench.fake.commands
+    bench.wait(0.1)
+    assert bench.fake.commands == sent < 120
+
+
+def test_a_chunk_with_nan_is_refused_and_the_arm_goes_to_rest(bench):
+    ask = Turning()
+    run = Run(bench, ask)
+    last = np.where(np.arange(10) < 9, 1.0, np.nan)[:, None]  # an action that is not executed
+    run.at = {0.3: lambda: setattr(ask, "change", lambda actions: actions * last)}
+    assert "actions must be finite" in run(30.0)
+    np.testing.assert_allclose(bench.world.pose[:6], sessions.REST[:6], atol=0.03)
+    assert run.said == [run.said[0], "moving slowly to the rest pose"]
+    assert_holds(run, "actions must be finite")
+
+
+def test_chunks_too_short_for_the_settings_are_an_error_before_the_arm_moves(bench, tmp_path):
+    settings, start = {"execute": 5, "ahead": 3}, bench.world.pose
+    sentence = "execute 5 and ahead 3 need chunks of at least 8 actions, got 7"
+    with contextlib.closing(Log(tmp_path)) as log:
+        run = Run(bench, Turning(7), settings=settings, log=log, latency=0.2)
+        with pytest.raises(ValueError, match=f"^{sentence}$"):
+            run(1.0)
+    bench.wait(0.5)
+    np.testing.assert_allclose(bench.world.pose, start, atol=2e-3)
+    assert sentence in (tmp_path / "log.jsonl").read_text()
+    assert_safe(run)
+
+
+def test_a_later_chunk_that_is_too_short_is_refused_and_the_arm_goes_to_rest(bench):
+    run = Run(bench, ask := Turning(8), settings={"execute": 5, "ahead": 3})
+    run.at = {0.3: lambda: setattr(ask, "change", lambda actions: actions[:7])}
+    assert "need chunks of at least 8 actions, got 7" in run(30.0)
+    assert run.said[1:] == ["moving slowly to the rest pose"]
+    assert_holds(run, "at least 8 actions")
+
+
+def test_a_server_that_dies_in_mid_chunk(bench):
+    policy = StandIn()
+    policy.prepare = lambda request, index: request.state
+    with contextlib.ExitStack() as stack:
+        client = PolicyClient(stack.enter_context(serving(policy)).address)
+        run = Run(bench, Server(client))
+        run.at = {0.72: stack.close}
+        problem = run(30.0)
+    client.close()
+    assert "closed the connection" in problem
+    assert run.said[1:] == ["moving slowly to the rest pose"]
+    assert_holds(run, "closed the connection")
+
+
+def test_a_server_that_refuses(bench):
+    with serving(StandIn()) as server:
+        client = PolicyClient(server.address)
+        ask = Server(client)
+        run = Run(bench, lambda o: ask({**o, "prompt": 3}))
+        assert "prompt must be text" in run(30.0)
+    assert_holds(run, "prompt must be text")
+
+
+def test_a_server_that_hangs(bench):
+    run = Run(bench, Turning(), latency=9.0, settings={"patience": 0.4})
+    assert "did not answer within 0.4 s" in run(30.0)
+    assert_holds(run, "did not answer")
+
+
+def test_pictures_that_stop(bench):
+    class Blinking(Simulated):
+        seen = 0
+
+        def read(self):
+            self.seen += 1
+            if 1 < self.seen < 20:
+                raise NoPicture("camera wrist shows nothing new")
+            return super().read()
+
+    run = Run(bench, Turning(), cameras=Blinking(bench.world.images))
+    assert run(1.5) is None
+    assert run.said[:2] == ["holding: camera wrist shows nothing new", "going on"]

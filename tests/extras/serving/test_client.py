@@ -1,0 +1,117 @@
+"""Test the client against servers that are late, slow or gone."""
+
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from lorasp_jax.extras.serving.client import PolicyClient, ServerGone
+from tests import ROOT
+from tests.extras.serving.stand_in import StandIn, connect, observation, serving
+
+
+@pytest.fixture
+def free_port():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        return taken.getsockname()[1]
+
+
+def test_no_server(free_port):
+    with pytest.raises(ServerGone, match=f"^no policy server at ws://127.0.0.1:{free_port}: "):
+        PolicyClient(f"ws://127.0.0.1:{free_port}")
+
+
+@pytest.mark.parametrize("address", ["nonsense", "http://127.0.0.1:1", "ws://127.0.0.1:x"])
+def test_addresses_that_are_none(address):
+    with pytest.raises((ServerGone, ValueError)):
+        PolicyClient(address)
+
+
+def test_waiting_for_a_server(free_port):
+    clients = []
+    address = f"ws://127.0.0.1:{free_port}"
+    thread = threading.Thread(target=lambda: clients.append(PolicyClient(address, wait=30)))
+    thread.start()
+    time.sleep(0.5)
+    with serving(StandIn(), port=free_port):
+        thread.join(30)
+        with clients[0] as client:
+            assert client.metadata["action_dim"] == 7
+
+
+def test_a_waiting_client_says_so_once(free_port, monkeypatch):
+    monkeypatch.setattr("lorasp_jax.extras.serving.client.SILENCE", 0.3)
+    said = []
+    with pytest.raises(ServerGone):
+        PolicyClient(f"ws://127.0.0.1:{free_port}", wait=1.5, say=said.append)
+    assert said == ["no server there yet: trying for up to 1.5 s"]
+
+
+def test_a_late_reply_is_never_taken_for_the_next_one():
+    policy = StandIn()
+    with serving(policy) as server, connect(server) as client:
+        policy.gate.clear()
+        with pytest.raises(ServerGone, match=r"did not reply within 0\.2 s"):
+            client.infer(observation(), timeout=0.2)
+        policy.gate.set()
+        with pytest.raises(ServerGone, match=r"the connection to .* is closed"):
+            client.infer(observation())
+
+
+def test_a_server_that_stops():
+    with serving(StandIn()) as server:
+        client = connect(server)
+        client.infer(observation())
+    with pytest.raises(ServerGone, match="closed the connection"):
+        client.infer(observation())
+    client.close()
+
+
+@pytest.fixture
+def interruptible():
+    """Make SIGINT raise KeyboardInterrupt; a shell's background processes ignore it."""
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, previous)
+
+
+@pytest.mark.usefixtures("interruptible")
+def test_an_interrupted_call_closes_the_connection():
+    """As its reply could be taken for the next one."""
+    policy = StandIn()
+    with serving(policy) as server, connect(server) as client:
+        policy.gate.clear()
+
+        def interrupt():
+            while not policy.batches:  # the call waits for its reply
+                time.sleep(0.001)
+            signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+
+        threading.Thread(target=interrupt, daemon=True).start()
+        with pytest.raises(KeyboardInterrupt):
+            client.infer(observation())
+        policy.gate.set()
+        with pytest.raises(ServerGone, match="is closed"):
+            client.infer(observation())
+
+
+def test_values_that_cannot_be_sent_do_not_end_the_connection():
+    with serving(StandIn()) as server, connect(server) as client:
+        client.infer(observation())
+        with pytest.raises(TypeError, match="a message cannot contain a complex"):
+            client.infer(observation(extra=1j))
+        np.testing.assert_array_equal(client.infer(observation())["actions"][0], np.arange(7) + 1)
+
+
+def test_the_client_imports_neither_jax_nor_the_simulation():
+    code = "import sys, lorasp_jax.extras.serving.client; print(*sys.modules)"
+    command = [sys.executable, "-c", code]
+    process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    heavy = {"jax", "flax", "mujoco", "envs", "PIL", "rich"}
+    assert heavy & set(process.stdout.split()) == set()

@@ -1,0 +1,155 @@
+"""Test the command that exports runs, and which policies can be exported."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+import safetensors.numpy
+
+import lorasp_jax
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.extras.serving import export, exported, exporting
+from lorasp_jax.extras.study import transforms
+from lorasp_jax.models.inputs import InputConfig
+from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.models.smolvla import SmolVLAConfig
+from lorasp_jax.training import load_policy
+from lorasp_jax.training.run_folder import to_json, write_json
+from tests.cases import mostly_slow
+from tests.extras.serving.test_exported import arguments, in_process
+from tests.extras.serving.test_policies import make_policy
+from tests.runs import CONFIG, random_episodes
+
+
+def call(capsys, *words):
+    code = export.main([str(word) for word in words])
+    printed = capsys.readouterr()
+    assert "Traceback" not in printed.err
+    return code, printed.out + printed.err
+
+
+def assert_acts_like(policy, folder, atol=2e-5):
+    loaded = exported.load(folder)
+    given = arguments(loaded)
+    np.testing.assert_allclose(loaded.act(**given), in_process(policy, given), atol=atol)
+
+
+@pytest.mark.slow
+def test_a_run_is_exported(run, tmp_path, capsys):
+    out = tmp_path / "new" / "policy"
+    code, printed = call(capsys, run, "--out", out, "--max-batch", 1, "--num-steps", 2)
+    assert (code, printed.split(",")[0]) == (0, f"wrote {out}")
+    assert sorted(path.name for path in out.iterdir()) == [
+        "act-1.bin",
+        "instructions.json",
+        "policy.json",
+        "processor.json",
+        "weights.safetensors",
+    ]
+    assert [path.name for path in out.parent.iterdir()] == ["policy"]
+    described = json.loads((out / "policy.json").read_text())
+    assert described["policy"]["metadata"] == {"robot": "piper", "control_dt": 0.1}
+    assert described["policy"]["continues"] is False
+    assert_acts_like(load_policy(run), out)
+
+
+def test_a_run_trained_to_continue_chunks_can_do_so(run, tmp_path, capsys, monkeypatch):
+    optim = dataclasses.replace(CONFIG.optim, rtc_max_delay=2)
+    write_json(run / "config.json", to_json(dataclasses.replace(CONFIG, optim=optim)))
+    try:
+        assert call(capsys, run, "--out", tmp_path / "policy", "--max-batch", 1)[0] == 0
+    finally:
+        (run / "config.json").unlink()
+    assert (tmp_path / "policy" / "continue-1.bin").is_file()
+
+
+def test_refusals(run, tmp_path, capsys):
+    (tmp_path / "policy").mkdir()
+    (tmp_path / "unfinished").mkdir()
+    for words, sentence in (
+        ((run, "--out", tmp_path / "policy"), "already exists: choose another path"),
+        ((tmp_path / "unfinished", "--out", tmp_path / "new"), "no run has finished there"),
+        ((tmp_path / "nowhere", "--out", tmp_path / "new"), f"is no folder {tmp_path / 'nowhere'}"),
+        ((run, "--out", tmp_path / "new", "--max-batch", 0), "largest batch must be at least 1"),
+        ((run, "--out", tmp_path / "new", "--num-steps", 0), "flow steps must be at least 1"),
+    ):
+        code, printed = call(capsys, *words)
+        assert (code, sentence in printed.replace("\n", " ")) == (2, True), printed
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["policy", "unfinished"]
+    assert not list((tmp_path / "policy").iterdir())
+
+
+def test_policies_that_cannot_be_exported(tmp_path, monkeypatch):
+    policy = make_policy()
+    prompts = policy.processor.prompts.select([])
+    processor = dataclasses.replace(policy.processor, prompts=prompts)
+    with pytest.raises(ValueError, match="a policy without instructions cannot be exported"):
+        exporting.write(dataclasses.replace(policy, processor=processor), tmp_path / "policy")
+    with pytest.raises(ValueError, match="already exists"):
+        exporting.write(policy, tmp_path)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    with pytest.raises(ValueError, match="exported on the CPU: set JAX_PLATFORMS=cpu"):
+        exporting.write(policy, tmp_path / "policy")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_failure_leaves_nothing_behind(tmp_path, monkeypatch):
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(safetensors.numpy, "save", fail)
+    before = jax.config.jax_hlo_source_file_canonicalization_regex
+    with pytest.raises(OSError, match="No space left"):
+        exporting.write(make_policy(), tmp_path / "policy", num_steps=1, max_batch=1)
+    assert not list(tmp_path.iterdir())
+    assert jax.config.jax_hlo_source_file_canonicalization_regex == before
+
+
+def quantized(policy, kind):
+    model, _ = lorasp_jax.quantize(policy.model, [(".*", kind)])
+    return dataclasses.replace(policy, model=model)
+
+
+def pruned(policy):
+    episodes = {"press": random_episodes("press", 5)}
+    return transforms.pruned(policy, episodes, batch_size=4, batches=1, tolerance=0.5)
+
+
+def distilled(policy):
+    episodes = {"press": random_episodes("press", 5)}
+    pairs = transforms.keyed_batches(policy, episodes, 4, 1)["press"]
+    model, _ = lorasp_jax.distill(policy.model, pairs, 4, forward=transforms._forward)
+    return dataclasses.replace(policy, model=model)
+
+
+def merged(policy):
+    return dataclasses.replace(policy, model=adaptation.merge(policy.model))
+
+
+def dummy(config=Pi0Config, **changes):
+    return make_policy(dataclasses.replace(config.dummy(), **changes))
+
+
+POLICIES = {
+    "smolvla": lambda _: dummy(SmolVLAConfig),
+    "state in the prompt": lambda _: dummy(inputs=InputConfig(prompt_state=True), max_tokens=64),
+    "bfloat16": lambda _: dummy(param_dtype="bfloat16"),
+    "int8": lambda _: quantized(dummy(), "int8"),
+    "adapters, nf4": lambda run: quantized(load_policy(run), "nf4"),
+    "pruned": lambda run: pruned(load_policy(run)),
+    "pruned, nf4": lambda run: quantized(pruned(load_policy(run)), "nf4"),
+    "distilled": lambda run: distilled(load_policy(run)),
+    "merged": lambda run: merged(distilled(load_policy(run))),
+    "merged, int8": lambda run: quantized(merged(distilled(load_policy(run))), "int8"),
+}
+
+
+@pytest.mark.parametrize("name", mostly_slow(POLICIES, ["state in the prompt", "int8"]))
+def test_all_kinds_of_policies_are_exported(name, run, tmp_path):
+    policy = POLICIES[name](run)
+    exporting.write(policy, tmp_path / "policy", num_steps=2, max_batch=1)
+    # In bf16, programs that were compiled differently also round differently.
+    atol = 5e-3 if name == "bfloat16" else 2e-5
+    assert_acts_like(policy, tmp_path / "policy", atol)

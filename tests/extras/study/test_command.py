@@ -1,0 +1,244 @@
+import json
+import re
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from lorasp_jax.extras.study import __main__ as command
+from lorasp_jax.extras.study import results, runner, workers
+from lorasp_jax.extras.study.study import load, select
+from tests import ROOT
+from tests.extras.study import fakes
+from tests.extras.study.fakes import NAMES, ran, study
+
+FILE = "from tests.extras.study.fakes import study\n\ndef get_study(scale):\n    return study()\n"
+
+
+class InProcess(workers.Workers):
+    """Run the cells in this process."""
+
+    run_cell = staticmethod(fakes.run)
+
+    def run(self, count):
+        runner.work(self._study, self._folder, self._names, self.run_cell)
+
+
+@pytest.fixture
+def start(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(workers, "Workers", InProcess)
+    (tmp_path / "study.py").write_text(FILE)
+
+    def start(*options):
+        arguments = ["--config", str(tmp_path / "study.py"), "--out", str(tmp_path / "runs")]
+        code = command.main([*arguments, *options])
+        output = capsys.readouterr()
+        return code, re.sub(r"\s+", " ", output.out + output.err)
+
+    return start
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "runs/fake"
+
+
+def test_a_study_runs_once(start, folder):
+    code, text = start()
+    assert code == 0
+    assert "fake: 6 finished" in text
+    assert sorted(results.load(folder / "results.json")) == sorted(NAMES)
+    before = (folder / "results.json").read_bytes()
+    assert start()[0] == 0
+    assert len(ran(folder)) == 6
+    assert (folder / "results.json").read_bytes() == before
+
+
+def test_parts_of_a_study(start, folder):
+    code, text = start("--only", "lora/*")
+    assert (code, ran(folder)) == (0, [])
+    assert "lora/s0: waiting for sp/s0 (runnable), sp/s1 (runnable)" in text
+    assert "waiting for" not in start("--only", "lora/*", "--no-run")[1]
+    assert start("--only", "sp/*")[0] == 0
+    assert ran(folder) == ["sp/s0", "sp/s1"]
+    assert start("--shard", "2/2")[0] == 0
+    assert ran(folder)[2:] == ["lora/s0", "lora/s1", "cut/s0"]
+    assert start("--shard", "1/2")[0] == 0
+    assert ran(folder)[5:] == ["lr"]
+
+
+def test_a_failed_cell_is_reported_and_tried_again(start, folder, monkeypatch):
+    monkeypatch.setattr(InProcess, "run_cell", staticmethod(fail))
+    code, text = start()
+    assert code == 2
+    assert "sp/s1: failed RuntimeError: boom" in text
+    assert "fake: 2 finished, 3 waiting, 1 failed" in text
+    monkeypatch.setattr(InProcess, "run_cell", staticmethod(fakes.run))
+    assert start()[0] == 0
+    assert sorted(ran(folder)) == sorted(NAMES)
+
+
+def fail(job):
+    if job.cell.name == "sp/s1":
+        raise RuntimeError("boom")
+    return fakes.run(job)
+
+
+def test_a_damaged_cell_is_reported(start, folder):
+    start()
+    (folder / "lr/cell.json").write_text("{")
+    code, text = start()
+    assert code == 2
+    assert re.search(r"lr: damaged \S+/lr/cell.json", text)
+    assert "5 finished, 1 damaged" in text
+    assert sorted(results.load(folder / "results.json")) == sorted({*NAMES} - {"lr"})
+
+
+def test_dry_run(start, folder):
+    code, text = start("--dry-run", "--only", "lora/*", "s*")
+    assert code == 0
+    assert re.search(r"sp/s0 │ LoRASP │ 2,000 │ [\d,]+ │ runnable │ \?", text)
+    assert re.search(r"lora/s0 │ LoRA │ 2,000 │ \? │ waiting │ \?", text)
+    assert not folder.exists()
+    start()
+    code, text = start("--dry-run")
+    assert re.search(r"lora/s1 │ LoRA │ 2,000 │ [\d,]+ │ finished │ \d s", text)
+    assert re.search(r"cut/s0 │ from lora/s0 │ 0 │ │ finished │ \d s", text)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--only", "sp/*", "x*"], "error: no cell of fake matches 'x*'; the first cell is sp/s0"),
+        (["--shard", "3/2"], "must be I/N with 1 <= I <= N, got '3/2'"),
+        (["--shard", "1"], "must be I/N with 1 <= I <= N, got '1'"),
+        (["--jobs", "0"], "must be a positive whole number, got '0'"),
+        (["--config", "missing.py"], "error: config missing.py does not exist"),
+    ],
+)
+def test_bad_options(start, options, message, capsys):
+    try:
+        code, text = start(*options)
+    except SystemExit as error:
+        code, text = error.code, re.sub(r"\s+", " ", capsys.readouterr().err)
+    assert code == 2
+    assert message in text
+
+
+def test_every_cell_is_in_one_shard():
+    shards = [select(study(), ["*"], (index, 3)) for index in (1, 2, 3)]
+    assert sorted(shards[0] + shards[1] + shards[2]) == sorted(NAMES)
+    assert shards[1] == ["lora/s0", "lora/s1", "cut/s0"]
+
+
+def test_a_file_must_return_a_study(tmp_path):
+    (tmp_path / "a.py").write_text("def get_study(scale): return 7\n")
+    with pytest.raises(ValueError, match=r"get_study in .*a\.py must return a Study, got int"):
+        load(tmp_path / "a.py", "smoke")
+
+
+def test_a_finished_study_loads_no_model_and_no_simulation(start, tmp_path):
+    start()
+    program = (
+        "import json, sys; from lorasp_jax.extras.study.__main__ import main; code = main({}); "
+    )
+    program += "print(json.dumps([code, [m for m in {} if m in sys.modules]]))"
+    slow = ["mujoco", "lorasp_jax.models", "orbax", "matplotlib", "tyro", "scipy"]
+    arguments = ["--config", str(tmp_path / "study.py"), "--out", str(tmp_path / "runs")]
+    process = subprocess.run(
+        [sys.executable, "-c", program.format(arguments, slow)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert json.loads(process.stdout.splitlines()[-1]) == [0, []]
+
+
+@pytest.fixture
+def committed(start, folder, tmp_path):
+    """Results of a finished study whose folder is gone."""
+    start()
+    file = tmp_path / "docs/study.json"
+    file.parent.mkdir()
+    (folder / "results.json").rename(file)
+    shutil.rmtree(folder)
+    return file
+
+
+def without(file, *names):
+    """Remove cells from a file of results."""
+    found = results.load(file)
+    results.write(file, "fake", {n: r for n, r in found.items() if n not in names})
+
+
+def test_a_study_starts_from_a_file_of_results(start, folder, committed):
+    before = committed.read_bytes()
+    for options in ([], ["--no-run"]):
+        code, text = start("--results", str(committed), *options)
+        assert (code, ran(folder)) == (0, [])
+        assert "fake: 6 finished" in text
+        assert committed.read_bytes() == before
+    without(committed, "lora/s1", "lr")
+    assert "4 finished" in start("--results", str(committed), "--no-run")[1]
+    assert "4 finished" in start("--results", str(committed), "--dry-run")[1]
+    assert ran(folder) == []
+    start("--results", str(committed))
+    assert ran(folder) == ["lora/s1", "lr"]
+    assert committed.read_bytes() == before
+    assert start()[0] == 0  # without the file, the others run
+    assert sorted(ran(folder)) == sorted(NAMES)
+
+
+def test_a_derived_cell_gets_its_source_again(start, folder, committed):
+    before = committed.read_bytes()
+    without(committed, "cut/s0")
+    start("--results", str(committed))
+    assert ran(folder) == ["lora/s0", "cut/s0"]
+    assert committed.read_bytes() == before
+
+
+def test_a_source_that_fails_again_keeps_its_results(start, folder, committed, monkeypatch):
+    without(committed, "cut/s0")
+    before = committed.read_bytes()
+    monkeypatch.setattr(InProcess, "run_cell", staticmethod(fail_source))
+    code, text = start("--results", str(committed))
+    assert code == 2
+    assert "lora/s0: failed RuntimeError: no memory" in text
+    assert "cut/s0: waiting for lora/s0 (failed)" in text
+    assert committed.read_bytes() == before
+
+
+def fail_source(job):
+    if job.cell.name == "lora/s0":
+        raise RuntimeError("no memory")
+    return fakes.run(job)
+
+
+def test_no_result_of_the_file_is_lost(start, folder, committed, tmp_path):
+    before = committed.read_bytes()
+    (folder / "lr").mkdir(parents=True)
+    (folder / "lr/cell.json").write_text("{")
+    code, text = start("--results", str(committed))
+    assert code == 2
+    assert "study.json is left as it is: it has results of lr, which is damaged" in text
+    shutil.rmtree(folder)
+    changed = FILE.replace("study()", 'study(**{"lr": fakes.CONFIG})').replace(
+        "from tests.extras.study.fakes import study",
+        "from tests.extras.study import fakes\nstudy = fakes.study",
+    )
+    (tmp_path / "study.py").write_text(changed)
+    code, text = start("--results", str(committed))
+    assert code == 2
+    assert "lr: changed it was run with other optim.steps" in text
+    assert committed.read_bytes() == before
+
+
+def test_results_of_another_study_are_refused(start, committed):
+    results.write(committed, "other", {})
+    code, text = start("--results", str(committed))
+    assert code == 2
+    assert "has the results of other, not of fake" in text
+    committed.unlink()
+    assert "study.json is missing" in start("--results", str(committed))[1]

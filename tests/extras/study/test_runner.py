@@ -1,0 +1,163 @@
+import dataclasses
+import multiprocessing
+import random
+import threading
+
+import pytest
+
+from lorasp_jax.extras.study import results, runner
+from lorasp_jax.extras.study.status import Board, State, clear_failure
+from lorasp_jax.extras.study.study import Derived
+from tests.extras.study import fakes
+from tests.extras.study.fakes import NAMES, ran, run, states, study
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "fake").mkdir()
+    return tmp_path / "fake"
+
+
+def work(folder, names=NAMES, run_cell=run, of=None):
+    runner.work(of or study(), folder, names, run_cell, poll=0.01)
+
+
+def test_cells_run_once_in_order(folder):
+    work(folder)
+    assert ran(folder) == ["sp/s0", "sp/s1", "lora/s0", "lora/s1", "cut/s0", "lr"]
+    work(folder)
+    assert len(ran(folder)) == 6
+    assert set(states(folder).values()) == {State.FINISHED}
+
+
+def test_configs_and_transformations_get_the_results_they_name(folder):
+    work(folder)
+    found = fakes.results(folder)
+    ranks = [found[name]["active_rank"]["mean"] for name in ("sp/s0", "sp/s1")]
+    assert found["lora/s1"]["config"]["peft"]["rank"] == round(sum(ranks) / 2)
+    assert found["lora/s1"]["config"]["name"] == "s1"
+    assert found["cut/s0"]["measures"]["needs"] == ["lora/s0", "sp/s0"]
+    assert found["cut/s0"]["config"]["source"] == "lora/s0"
+
+
+def test_a_failed_cell_does_not_stop_the_others(folder):
+    def fail(job):
+        if job.cell.name == "sp/s1":
+            raise RuntimeError("boom\nbang")
+        return run(job)
+
+    work(folder, run_cell=fail)
+    assert ran(folder) == ["sp/s0", "lr"]
+    statuses = Board(study(), folder).read()
+    assert (statuses["sp/s1"].state, statuses["sp/s1"].reason) == (
+        State.FAILED,
+        "RuntimeError: boom bang",
+    )
+    assert statuses["cut/s0"].reason == "for lora/s0 (waiting)"
+    assert 'raise RuntimeError("boom' in (folder / "sp/s1" / "failed.txt").read_text()
+    work(folder)
+    assert ran(folder) == ["sp/s0", "lr"]
+    clear_failure(folder / "sp/s1")
+    work(folder)
+    assert sorted(ran(folder)) == sorted(NAMES)
+
+
+def test_shards_are_merged(folder):
+    first = ["sp/s0", "sp/s1"]
+    work(folder, first)
+    assert states(folder)["lora/s0"] == State.RUNNABLE
+    work(folder, set(NAMES) - {*first})
+    assert sorted(ran(folder)) == sorted(NAMES)
+
+
+def test_a_cell_of_another_shard_is_waited_for(folder):
+    work(folder, ["lora/s0", "cut/s0"])
+    assert ran(folder) == []
+    assert states(folder)["lora/s0"] == State.WAITING
+
+
+def test_several_workers_run_every_cell_once(folder):
+    threads = [
+        threading.Thread(target=work, args=(folder,), kwargs={"run_cell": fakes.run_slowly})
+        for _ in range(4)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(ran(folder)) == sorted(NAMES)
+    assert set(states(folder).values()) == {State.FINISHED}
+
+
+def test_workers_share_a_group_that_others_wait_for(folder):
+    both = threading.Barrier(2, timeout=60)
+
+    def meet(job):
+        result = run(job)
+        if job.cell.name.startswith("sp/"):
+            both.wait()  # afterwards, as a worker could go on before the other has noted its run
+        return result
+
+    threads = [
+        threading.Thread(target=work, args=(folder,), kwargs={"run_cell": meet}) for _ in range(2)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert {*ran(folder)[:2]} == {"sp/s0", "sp/s1"}
+    assert set(states(folder).values()) == {State.FINISHED}
+
+
+def test_a_worker_goes_on_with_the_group_that_it_has_compiled(folder):
+    work(folder, ["sp/s0", "sp/s1"])
+    statuses = Board(study(), folder).read()
+    names = ["lora/s0", "lora/s1", "lr"]
+
+    def order(last):
+        return runner._by_urgency(study(), statuses, names, last)
+
+    # cut/s0 waits for lora/s0; of the rest, a fresh worker prefers what no other may be compiling.
+    assert order("lora/s0") == ["lora/s0", "lora/s1", "lr"]
+    assert order("lr") == order("") == ["lora/s0", "lr", "lora/s1"]
+
+
+def test_workers_run_a_missing_source_once(folder, tmp_path):
+    work(folder)
+    finished = fakes.results(folder)
+    for name in ("cut/s0", "cut/s1"):
+        finished.pop(name, None)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    second = Derived("cut/again", "lora/s0", study()["cut/s0"].transform, ("sp/s0",))
+    started = dataclasses.replace(study(), cells=(*study().cells, second), finished=finished)
+    names = ["cut/s0", "cut/again"]
+    threads = [
+        threading.Thread(target=work, args=(empty, names, fakes.run_slowly, started))
+        for _ in range(3)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(ran(empty)) == ["cut/again", "cut/s0", "lora/s0"]
+
+
+def test_kills_do_not_change_the_results(folder, tmp_path):
+    undisturbed = tmp_path / "undisturbed"
+    undisturbed.mkdir()
+    work(undisturbed)
+    context, delays = multiprocessing.get_context("forkserver"), random.Random(0)
+    context.set_forkserver_preload(["tests.extras.study.fakes", "lorasp_jax.extras.study.runner"])
+    for _ in range(8):
+        process = context.Process(target=work, args=(folder, NAMES, fakes.run_slowly))
+        process.start()
+        process.join(delays.uniform(0.01, 0.3))
+        process.kill()
+        process.join()
+    work(folder)
+    files = []
+    for each in (undisturbed, folder):
+        results.write(each / "results.json", "fake", fakes.results(each))
+        files.append((each / "results.json").read_bytes())
+    assert files[0] == files[1]

@@ -1,0 +1,110 @@
+"""Intervals contain the truth as often as stated, and pairing removes what methods share."""
+
+import numpy as np
+import pytest
+
+from lorasp_jax.extras.study import statistics
+
+
+def studies(count, *, spread, seeds=3, tasks=2, layouts=64, rate=0.8):
+    """Return outcomes [count, S, T, N] of policies whose rates differ between seeds."""
+    rng = np.random.default_rng(0)
+    policies = rate + spread * rng.standard_normal((count, seeds, 1, 1))
+    return rng.random((count, seeds, tasks, layouts)) < policies
+
+
+def coverage(methods, truth):
+    estimates = [statistics.success(method) for method in methods]
+    return np.mean([e.low <= truth <= e.high for e in estimates])
+
+
+@pytest.mark.parametrize(
+    ("seeds", "spread", "low", "high"),
+    [(3, 0.0, 0.97, 1.0), (3, 0.06, 0.8, 0.96), (8, 0.06, 0.88, 0.98)],
+)
+def test_coverage(seeds, spread, low, high):
+    covered = coverage(studies(150, seeds=seeds, spread=spread), 0.8)
+    assert low <= covered <= high
+
+
+def test_intervals_widen_with_the_spread_between_seeds():
+    narrow, wide = (studies(1, spread=spread)[0] for spread in (0.0, 0.15))
+    widths = [e.high - e.low for e in map(statistics.success, (narrow, wide))]
+    assert widths[1] > 1.5 * widths[0]
+
+
+def test_pairing_removes_what_seeds_and_layouts_do_to_both():
+    rng = np.random.default_rng(1)
+    difficulty = rng.random((3, 2, 64)) + 0.1 * rng.standard_normal((3, 1, 1))
+    a, b = difficulty < 0.6, difficulty < 0.5
+    paired = statistics.difference(a, b)
+    assert paired.value == pytest.approx(a.mean() - b.mean())
+    alone = [statistics.success(method) for method in (a, b)]
+    assert paired.high - paired.low < 0.6 * sum(e.high - e.low for e in alone)
+    assert statistics.difference(a, a) == (0, 0, 0)
+
+
+def test_a_corrected_standard_deviation_covers_the_true_one():
+    """Tasks at 80, 90, 90 and 100 %, three seeds that do not differ."""
+    rng = np.random.default_rng(0)
+    rates = np.array([0.8, 0.9, 0.9, 1.0])
+    spread = lambda rates: rates.std(-1)  # noqa: E731
+    methods = rng.random((60, 3, 4, 256)) < rates[:, None]
+    found = [statistics.corrected(spread, method) for method in methods]
+    truth = rates.std()
+    assert sum(e.low <= truth <= e.high for e in found) >= 54
+    assert np.mean([e.value for e in found]) == pytest.approx(truth, abs=0.002)
+    assert all(e.low < e.value < e.high for e in found)
+
+
+def test_a_correction_leaves_means_as_they_are():
+    (method,) = studies(1, spread=0.05)
+    plain, mended = (
+        f(statistics.mean, method) for f in (statistics.bootstrap, statistics.corrected)
+    )
+    assert mended.value == pytest.approx(plain.value, abs=1e-3)
+    assert mended.high - mended.low == pytest.approx(plain.high - plain.low)
+
+
+def test_a_sure_method_has_an_interval_of_no_width():
+    assert statistics.success(np.ones((3, 4, 16), bool)) == (1, 1, 1)
+
+
+def test_repeated_estimates_are_equal():
+    (method,) = studies(1, spread=0.05)
+    first = statistics.success(method)
+    statistics._counts.cache_clear()
+    assert statistics.success(method) == first
+
+
+def test_draws_are_uniform():
+    counts = statistics._counts(0, 3)
+    assert (counts.sum(1) == 3).all()
+    np.testing.assert_allclose(counts.mean(0), 1, atol=0.03)
+
+
+def test_tasks_of_separate_cells_are_stacked_by_name():
+    multi = [
+        [{"outcomes": {"press": "10", "pour": "11"}}],
+        [{"outcomes": {"pour": "00", "press": "01"}}],
+    ]
+    single = [
+        [{"outcomes": {task: o}} for task, o in cell["outcomes"].items()] for (cell,) in multi
+    ]
+    expected = [[[1, 1], [1, 0]], [[0, 0], [0, 1]]]
+    np.testing.assert_array_equal(statistics.outcomes(multi), expected)
+    np.testing.assert_array_equal(statistics.outcomes(single), expected)
+
+
+def test_unequal_cells_are_errors():
+    with pytest.raises(ValueError, match="all seeds need the same tasks"):
+        statistics.outcomes([[{"outcomes": {"press": "10"}}], [{"outcomes": {"press": "1"}}]])
+    with pytest.raises(ValueError, match="methods need the same seeds"):
+        statistics.difference(np.ones((3, 2, 4), bool), np.ones((2, 2, 4), bool))
+
+
+def test_student_interval():
+    estimate = statistics.over_seeds([1.0, 2.0, 3.0])
+    assert estimate == pytest.approx((2, 2 - 4.303 / 3**0.5, 2 + 4.303 / 3**0.5))
+    with pytest.raises(ValueError, match="from 2 to 10 seeds are needed, got 1"):
+        statistics.over_seeds([1.0])

@@ -1,0 +1,241 @@
+"""The paper's study has the cells of its tables, trained alike."""
+
+import dataclasses
+import functools
+import re
+from collections import Counter
+
+import jax
+import numpy as np
+import pytest
+
+import envs
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.config import Config
+from lorasp_jax.extras.study import Cell, Derived, claims
+from lorasp_jax.peft import AdaLoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP
+from lorasp_jax.training import setup
+from lorasp_jax.training.base import base_model
+from lorasp_jax.training.cost import preflight
+from studies.paper import naming
+from tests import ROOT
+from tests.studies.paper import synthetic
+
+STUDY = synthetic.study()
+NAMES = [cell.name for cell in STUDY.cells]
+
+
+@functools.cache
+def config(name: str, scale: str = "accelerator") -> Config:
+    cell = synthetic.study(scale)[name]
+    assert isinstance(cell, Cell)
+    return cell.config if isinstance(cell.config, Config) else cell.config(synthetic.results(scale))
+
+
+def test_number_of_cells(capsys):
+    counts = Counter(re.sub(r"^[a-z0-9]+/|/[^/]+$", "", name).split("/")[0] for name in NAMES)
+    trained = sum(isinstance(cell, Cell) for cell in STUDY.cells)
+    with capsys.disabled():
+        print(f"\n{len(NAMES)} cells, {trained} trained: {dict(counts)}")
+    assert counts == {"pilot": 42, "multi": 117, "single": 192, "panda": 6}
+    assert trained == 333
+
+
+def test_the_page_needs_measures_of_policies_for_all_tasks():
+    for cell in STUDY.cells:
+        if isinstance(cell, Cell):
+            assert cell.measured == (cell.name.split("/")[1] in ("multi", "panda")), cell.name
+
+
+@pytest.mark.parametrize("backbone", ["pi0", "smolvla"])
+def test_tables_have_three_seeds(backbone):
+    methods = ["lora_moe_top1", "lora_moe_weighted", "ada_lora", "full", "lora_sp", "dora"]
+    methods += ["lora_same_rank", "lora_cut", *(f"lora_r{2**n}" for n in range(1, 7))]
+    for method in methods:
+        assert len(naming.seeds(NAMES, f"{backbone}/multi/{method}")) == 3
+    for method in ("lora_r2", "lora_r64", "full", "lora_sp"):
+        assert [len(s) for s in naming.seeds(NAMES, f"{backbone}/single/{method}")] == [4, 4, 4]
+
+
+def test_ablations_are_on_smolvla():
+    etas = [f"lora_sp_eta_{eta}" for eta in (0.5, 0.7, 0.8, 0.99)]
+    for method in ("lora_sp_no_spectral", *etas):
+        assert len(naming.seeds(NAMES, f"smolvla/multi/{method}")) == 3
+        assert len(naming.seeds(NAMES, f"smolvla/multi/{method}_pruned")) == 3
+        assert not naming.seeds(NAMES, f"pi0/multi/{method}")
+    assert config("smolvla/multi/lora_sp_no_spectral/s0").auxiliary.spectral == 0
+    assert config("smolvla/multi/lora_sp_eta_0.7/s0").peft == LoRASP(rank=64, energy_target=0.7)
+
+
+def test_methods_differ_only_in_method_and_rate():
+    base = config("pi0/multi/lora_sp/s1")
+    for name in NAMES:
+        if name.startswith("pi0/multi/") and isinstance(STUDY[name], Cell) and name.endswith("/s1"):
+            other = config(name)
+            optim = dataclasses.replace(other.optim, learning_rate=base.optim.learning_rate)
+            assert dataclasses.replace(other, peft=base.peft, optim=optim) == base
+
+
+def test_single_tasks_see_as_many_samples():
+    multi, single = config("pi0/multi/lora_r8/s2"), config("pi0/single/lora_r8/pour/s2")
+    assert (multi.optim.steps, single.optim.steps) == (5000, 1250)
+    assert single.tasks == ("pour",)
+    assert single.optim.batch_size == multi.optim.batch_size == 128
+    assert single.optim.learning_rate == multi.optim.learning_rate
+
+
+def test_banks_and_budgets():
+    results = synthetic.results()
+    ranked = [f"pi0/multi/lora_sp/s{seed}" for seed in range(3)]
+    rank = round(np.mean([results[name]["active_rank"]["mean"] for name in ranked]))
+    expected = {
+        "lora_sp": LoRASP(rank=64),
+        "lora_moe_top1": LoRAMoE(experts=4, rank=16, routing="top1"),
+        "ada_lora": AdaLoRA(rank=64, target_rank=rank),
+        "lora_same_rank": LoRA(rank=rank),
+        "full": FullFineTuning(),
+    }
+    for method, peft in expected.items():
+        assert config(f"pi0/multi/{method}/s0").peft == peft
+    assert set(ranked) <= set(STUDY["pi0/multi/ada_lora/s0"].needs)
+    cut = STUDY["pi0/multi/lora_cut/s1"]
+    assert isinstance(cut, Derived)
+    assert cut.source == "pi0/multi/lora_r64/s1"
+    assert set(ranked) <= set(cut.needs)
+
+
+def test_pilots_choose_the_rate_on_other_layouts():
+    pilots = [name for name in NAMES if name.startswith("pi0/pilot/dora/")]
+    rates = [config(name).optim.learning_rate for name in pilots]
+    assert rates == [3e-4, 1e-3, 3e-3]
+    seeds = {
+        config(name).seed for name in NAMES if isinstance(STUDY[name], Cell) and "pilot" not in name
+    }
+    assert seeds == {0, 1, 2}
+    assert config(pilots[0]).seed not in seeds
+    for best, rate in zip(pilots, rates, strict=True):
+        outcomes = {True: {"press": "11"}, False: {"press": "10"}}
+        results = {name: {"outcomes": outcomes[name == best]} for name in pilots}
+        cell = STUDY["pi0/multi/dora/s0"]
+        assert cell.config(results).optim.learning_rate == rate
+
+
+def test_one_cell_per_backbone_and_robot_evaluates_the_base():
+    cells = [cell.name for cell in STUDY.cells if isinstance(cell, Cell)]
+    before = [name for name in cells if config(name).evaluation.before]
+    both = ("multi/lora_sp/s0", "panda/full/s0")
+    assert sorted(before) == [f"{b}/{name}" for b in ("pi0", "smolvla") for name in both]
+
+
+@pytest.mark.parametrize("backbone", ["pi0", "smolvla"])
+def test_the_panda_differs_only_in_robot_and_scene(backbone):
+    """Its cells come last, so that the others keep their places in shards."""
+    assert NAMES[-6:] == [f"{b}/panda/full/s{s}" for b in ("pi0", "smolvla") for s in range(3)]
+    for seed in range(3):
+        panda, piper = (config(f"{backbone}/{r}/full/s{seed}") for r in ("panda", "multi"))
+        assert panda.robot == "panda"
+        assert {*panda.scene.changed()} == {
+            "camera_position", "camera_turn", "table_height", "position", "turn"
+        }  # fmt: skip
+        evaluation = dataclasses.replace(panda.evaluation, before=False)
+        same = {"robot": "piper", "scene": piper.scene, "evaluation": evaluation}
+        assert dataclasses.replace(panda, **same) == piper
+        assert piper.ranges is None
+
+
+def test_the_page_has_the_numbers_of_the_settings():
+    text = " ".join((ROOT / "studies/paper/page.md").read_text().split())
+    scene = {name: low for name, (low, _) in config("pi0/panda/full/s0").scene.changed().items()}
+    assert (
+        f"cameras shifted by {100 * scene['camera_position']:g} cm along each of their axes and "
+        f"rotated by {scene['camera_turn']:g} rad about each, a table "
+        f"{100 * scene['table_height']:g} cm higher, and objects shifted by "
+        f"{100 * scene['position']:g} cm each way and rotated by {scene['turn']:g} rad."
+    ) in text
+    (scale,) = {config(f"pi0/multi/lora_r{rank}/s0").peft.scale for rank in (2, 16, 64)}
+    assert f"LoRA's scale is {scale:g} at every rank." in text
+
+
+def test_seeds_of_a_method_are_one_group():
+    for group, cells in STUDY.groups.items():
+        assert len({cell.name.split("/")[2] for cell in cells if isinstance(cell, Cell)}) == 1, (
+            group
+        )
+
+
+def test_smoke_has_the_same_structure():
+    smoke = synthetic.study("smoke")
+    methods = Counter("/".join(cell.name.split("/")[1:3]) for cell in smoke.cells)
+    assert methods == {
+        "pilot/lora_sp": 2,
+        "pilot/lora_r4": 2,
+        "multi/lora_sp": 2,
+        "multi/lora_r4": 2,
+        "multi/lora_cut": 2,
+    }
+    assert len(config("pi0/multi/lora_sp/s0", "smoke").tasks) == 2
+    assert [claim.number for claim in smoke.claims if claim.tests] == [1, 8, 10]
+
+
+def test_smoke_adapts_every_module():
+    """Claims and figures compare them."""
+    smoke = config("pi0/multi/lora_sp/s0", "smoke")
+    base = base_model(smoke, abstract=True)[0].config
+    paths = adaptation.methods(preflight.abstract_model(smoke, base))
+    assert {path.partition("/")[0] for path in paths} == {*naming.TOWERS}
+
+
+def test_unknown_scale():
+    with pytest.raises(
+        ValueError, match="the study has the scales accelerator and smoke, got 'cpu'"
+    ):
+        synthetic.study("cpu")
+
+
+def test_claim_on_embodiments_compares_every_module():
+    tests = STUDY.claims[4].tests["pi0"]
+    assert [test.measure.split(":")[0] for test in tests] == ["vision", "language", "action"]
+    for test in tests:
+        outcome = claims.judge(test, synthetic.results())
+        assert outcome.verdict == "holds"
+        assert outcome.estimate.value == pytest.approx(0.2, abs=0.05)
+
+
+def test_claim_on_ranks_names_those_that_it_averages():
+    losses, spreads = (test.measure for test in STUDY.claims[3].tests["smolvla"])
+    assert "averaged over r = 4, 8, 16, 32: multi" in losses
+    assert "averaged over r = 4, 8, 16, 32, 64: multi" in spreads
+    cells = STUDY.claims[3].tests["smolvla"][0].cells
+    assert {name.split("/")[2] for name in cells} == {
+        "full",
+        *(f"lora_r{2**n}" for n in range(2, 6)),
+    }
+
+
+def test_numbers_know_how_large_they_can_be():
+    largest = {t.maximum for claim in STUDY.claims for t in claim.tests["smolvla"]}
+    assert largest == {1.0, 64.0}
+    assert {test.maximum for test in STUDY.claims[7].tests["pi0"]} == {64.0}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["open_pot", "pour", "press", "pick_place"])
+def test_the_side_camera_sees_all_objects_in_the_new_scene(task):
+    ranges = config("pi0/panda/full/s0").ranges
+    env = envs.make(task, "panda", num_envs=256, image_size=8, backend="jax")
+    state = env.reset(jax.random.key(0), ranges)
+    objects = [env.model.body(name).id for name in state.info["layout"]]
+    camera = env.cameras.index("side")
+    offset = state.data.xpos[:, objects] - state.data.cam_xpos[:, camera, None]
+    x, y, z = np.einsum("wji,wbj->iwb", state.data.cam_xmat[:, camera], offset)
+    edge = -z * np.tan(np.deg2rad(env.model.cam_fovy[camera] / 2))
+    assert np.all(np.maximum(np.abs(x), np.abs(y)) < edge)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "method", ["lora_sp", "lora_moe_top1", "ada_lora", "full", "dora", "lora_r2"]
+)
+def test_cells_can_be_built(method, tmp_path):
+    for backbone in ("pi0", "smolvla"):
+        setup.build(config(f"{backbone}/multi/{method}/s0"), tmp_path, abstract=True)
