@@ -6,7 +6,9 @@ bugs. Nothing is reported if the reader of stdout has closed the pipe.
 
 import argparse
 import errno
+import importlib.metadata
 import os
+import re
 import select
 import sys
 from collections.abc import Callable, Sequence
@@ -24,6 +26,8 @@ MAX_LENGTH = 1000
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Error numbers of writes that ran out of space."""
 _STDOUT = 1
+_REQUIREMENTS = {"PIL": "pillow", "can": "piper-sdk", "warp": "mujoco-mjx[warp]"}
+"""Requirements that bring modules of another name."""
 
 
 def parse_arguments(
@@ -99,12 +103,30 @@ def describe(error: Exception, remedy: str = "") -> str | None:
         return f"{text} ({_one_line(error)[:200]}){remedy}" if str(error) else f"{text}{remedy}"
     if isinstance(error, ValueError):
         return _one_line(error)
+    if isinstance(error, ModuleNotFoundError):
+        return missing_group(error)
     if not isinstance(error, OSError):
         return None
     if error.strerror is None:  # raised with only a message
         return _one_line(error)
     prefix = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
     return f"{prefix}{error.strerror}{remedy if error.errno in DISK_FULL else ''}"
+
+
+def missing_group(error: ModuleNotFoundError) -> str | None:
+    """Say how to install an optional dependency; return None if the module is not one."""
+    module = (error.name or "").partition(".")[0]
+    name = re.escape(_REQUIREMENTS.get(module, module.replace("_", "-")))
+    requirement = re.compile(rf"{name}(?![\w\[-])", re.IGNORECASE)
+    groups: dict[str, list[str]] = {}
+    for line in importlib.metadata.requires("lorasp_jax") or ():
+        if group := re.search(r"extra == ['\"]([\w-]+)", line):
+            groups.setdefault(group[1], []).append(line)
+    having = [name for name, lines in groups.items() if any(map(requirement.match, lines))]
+    if not having:
+        return None
+    smallest = min(having, key=lambda name: len(groups[name]))
+    return f'{module} is not installed: pip install "lorasp_jax[{smallest}]"'
 
 
 def _stdout_is_closed() -> bool:

@@ -67,10 +67,17 @@ def exit_on_signals() -> None:
 
 def run(command: str, arguments: Sequence[str], program: str) -> NoReturn:
     """Run one of `COMMANDS` and exit with its exit code."""
+    from rich.console import Console
+
     from lorasp_jax.base import alarms
+    from lorasp_jax.base.errors import report_error
 
     alarms.silence()
-    if code := importlib.import_module(COMMANDS[command][0]).main(arguments, program):
+    try:
+        module = importlib.import_module(COMMANDS[command][0])
+    except ModuleNotFoundError as error:
+        sys.exit(report_error(error, Console(stderr=True)))
+    if code := module.main(arguments, program):
         from lorasp_jax.training.distributed import processes
 
         processes.exit_all(code)  # without waiting for compilation threads, which cannot be stopped

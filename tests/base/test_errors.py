@@ -43,3 +43,27 @@ def test_an_interruption_says_what_is_left():
     assert end(fail(KeyboardInterrupt()), interrupted="stopped [1/2]")[1] == "stopped [1/2]\n"
     saved = fail(KeyboardInterrupt("8 of 10 are saved"))
     assert end(saved, interrupted="stopped")[1] == "interrupted; 8 of 10 are saved\n"
+
+
+@pytest.mark.parametrize(
+    ("module", "group"),
+    [
+        ("mujoco.mjx", "train"),
+        ("array_record", "train"),
+        ("PIL.Image", "train"),
+        ("warp", "warp"),
+        ("msgpack", "serving"),
+        ("piper_sdk", "piper"),
+        ("brax.envs", "brax"),
+    ],
+)
+def test_a_missing_group_is_named(module, group):
+    missing = ModuleNotFoundError("missing", name=module)
+    code, text = end(fail(missing))
+    assert code == REFUSED
+    assert f'pip install "lorasp_jax[{group}]"' in text
+
+
+def test_a_missing_module_of_ours_is_a_bug():
+    with pytest.raises(ModuleNotFoundError):
+        end(fail(ModuleNotFoundError("missing", name="lorasp_jax.nothing")))

@@ -119,3 +119,11 @@ def test_bash_completion(words, expected, bash_script, tmp_path):
 def test_other_shells(shell, capsys):
     assert completion.main([shell], "lorasp-jax completion") == 0
     assert "peft.granularity" in capsys.readouterr().out
+
+
+def test_a_command_without_its_dependencies_says_how_to_install_them():
+    code = "import sys; sys.modules['mujoco'] = None; from lorasp_jax.cli import commands\n"
+    code += "commands.run('envs', ['collect'], 'lorasp-jax envs')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.strip().endswith('pip install "lorasp_jax[train]"')
