@@ -36,7 +36,7 @@ Record = Callable[
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class Rollout:
+class Demonstrations:
     """One expert episode of T control steps in each of W worlds.
 
     Attributes:
@@ -63,7 +63,7 @@ def rollout(
     key: jax.Array,
     action_noise: float | jax.Array = 0.0,
     ranges: Randomization | None = None,
-) -> Rollout:
+) -> Demonstrations:
     """Run the expert on fresh random layouts; call this function under jit.
 
     Args:
@@ -86,7 +86,7 @@ def rollout(
 
     keys = jax.random.split(noise_key, env.expert_steps)
     last, (state, action, poses, alive) = jax.lax.scan(body, first, keys)
-    return Rollout(
+    return Demonstrations(
         state=state,
         action=action,
         poses=poses,

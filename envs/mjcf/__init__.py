@@ -101,7 +101,7 @@ def _positive(name: str, value: float | Sequence[float], count: int) -> np.ndarr
     return np.broadcast_to(numbers, count).copy()
 
 
-def _guess_home(model: mujoco.MjModel, arm: reading.Arm, mid_range: np.ndarray) -> np.ndarray:
+def _guess_home(model: mujoco.MjModel, arm: reading.ArmIds, mid_range: np.ndarray) -> np.ndarray:
     """Guess the start pose [J]: the keyframe "home" if it exists, else mid-range."""
     for i in range(model.nkey):
         if model.key(i).name == "home":

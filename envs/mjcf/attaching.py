@@ -9,7 +9,7 @@ import numpy as np
 from envs import robots
 from envs.mjcf import fitting
 from envs.mjcf.hands import Hand, Pad
-from envs.mjcf.reading import Arm, Gripper
+from envs.mjcf.reading import ArmIds, Gripper
 from envs.rendering.model import STAND_IN_GROUP, is_visible
 from envs.robots import Robot
 
@@ -71,7 +71,7 @@ class UserBody:
 
 
 def prepare(
-    spec: mujoco.MjSpec, model: mujoco.MjModel, arm: Arm, gripper: Gripper, hand: Hand
+    spec: mujoco.MjSpec, model: mujoco.MjModel, arm: ArmIds, gripper: Gripper, hand: Hand
 ) -> UserBody:
     """Prepare the body of a user's robot, modifying `spec`, the source of `model`, in place.
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from envs.mjcf.reading import Arm
+from envs.mjcf.reading import ArmIds
 from envs.robots import TIP_LENGTH, TIP_RADIUS
 
 _PARALLEL = 0.99  # smallest cosine between parallel directions (8 deg); our choice
@@ -37,7 +37,7 @@ class Hand(NamedTuple):
     pads: list[Pad]
 
 
-def find(model: mujoco.MjModel, arm: Arm, tcp: str | None) -> Hand:
+def find(model: mujoco.MjModel, arm: ArmIds, tcp: str | None) -> Hand:
     """Locate the hand of an arm; `tcp` is as in `envs.mjcf.load`.
 
     Raises:
@@ -72,7 +72,7 @@ def find(model: mujoco.MjModel, arm: Arm, tcp: str | None) -> Hand:
     )
 
 
-def _open(model: mujoco.MjModel, data: mujoco.MjData, arm: Arm) -> tuple[np.ndarray, np.ndarray]:
+def _open(model: mujoco.MjModel, data: mujoco.MjData, arm: ArmIds) -> tuple[np.ndarray, np.ndarray]:
     """Open the fingers in `data`.
 
     Returns:
@@ -128,7 +128,7 @@ def _site(model: mujoco.MjModel, tcp: str | None) -> str | None:
 
 
 def _axes(
-    model: mujoco.MjModel, data: mujoco.MjData, arm: Arm, across: np.ndarray, site: str | None
+    model: mujoco.MjModel, data: mujoco.MjData, arm: ArmIds, across: np.ndarray, site: str | None
 ) -> np.ndarray:
     """Compute the axes [3, 3] of the hand in the world, as columns; y is `across`."""
     last = arm.joints[-1]

@@ -18,7 +18,7 @@ _RADIANS_AS_DEGREES = np.deg2rad(4 * np.pi)  # width of +-2 pi, read as degrees
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
-class Arm(NamedTuple):
+class ArmIds(NamedTuple):
     """Ids in the user's model."""
 
     root: int  # body of the base
@@ -65,7 +65,7 @@ def read(
         raise ValueError(f"MuJoCo cannot read it: {error}") from error
 
 
-def find_arm(model: mujoco.MjModel) -> Arm:
+def find_arm(model: mujoco.MjModel) -> ArmIds:
     """Find the arm's joints and their servos.
 
     Raises:
@@ -94,10 +94,10 @@ def find_arm(model: mujoco.MjModel) -> Arm:
     if unlimited := [joint for joint in (*joints, *fingers) if not model.jnt_limited[joint]]:
         raise ValueError(f"every joint needs a range; it is missing for {_names(model, unlimited)}")
     servos, gears = zip(*(_servo(model, joint) for joint in joints), strict=True)
-    return Arm(base, joints, fingers, list(servos), list(gears))
+    return ArmIds(base, joints, fingers, list(servos), list(gears))
 
 
-def find_limits(model: mujoco.MjModel, arm: Arm) -> tuple[np.ndarray, np.ndarray]:
+def find_limits(model: mujoco.MjModel, arm: ArmIds) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and highest angles [J] allowed by both hinges and servos [rad].
 
     Raises:
@@ -122,7 +122,7 @@ def find_limits(model: mujoco.MjModel, arm: Arm) -> tuple[np.ndarray, np.ndarray
     return lower, upper
 
 
-def find_gripper(model: mujoco.MjModel, arm: Arm, signs: np.ndarray) -> Gripper:
+def find_gripper(model: mujoco.MjModel, arm: ArmIds, signs: np.ndarray) -> Gripper:
     """Combine the fingers' actuators, which may act on one finger, on both, or on a tendon.
 
     `signs` [2] is 1 for a finger joint whose positive direction opens the hand, else -1.

@@ -24,7 +24,7 @@ import numpy as np
 from envs.rendering import intersections, shading
 from envs.rendering.intersections import Geom, Geoms, Matrix, Vec, dot
 from envs.rendering.model import Appearance, RenderModel, build, unit_shapes
-from envs.rendering.shading import Raster, View
+from envs.rendering.shading import Raster, RayCamera
 from envs.state import Poses
 
 __all__ = [
@@ -69,7 +69,7 @@ def render(
     raster = Raster(height, width, samples)
     geoms, views = in_camera_frames(model, appearance, size, poses, height)
 
-    def image(geoms: Geom, view: View) -> jax.Array:
+    def image(geoms: Geom, view: RayCamera) -> jax.Array:
         pixel = jnp.arange(height * width, dtype=jnp.int32)
         rgb = shading.colors(_table(geoms), model.kinds, view, raster, pixel)
         return jnp.stack(rgb, axis=-1).reshape(height, width, 3)
@@ -172,7 +172,7 @@ def cast(
     size = model.size if size is None else size
     raster = Raster(height, width, samples=1)
 
-    def first_hit(geoms: Geom, view: View) -> tuple[jax.Array, jax.Array]:
+    def first_hit(geoms: Geom, view: RayCamera) -> tuple[jax.Array, jax.Array]:
         x, y = shading.slopes(view, raster, jnp.arange(height * width, dtype=jnp.int32))
         number, depth = intersections.nearest(_table(geoms), model.kinds, x, y)
         geom = jnp.where(jnp.isfinite(depth), jnp.array(model.geoms, jnp.int32)[number], -1)
@@ -195,7 +195,7 @@ def in_camera_frames(
     size: jax.Array | np.ndarray,
     poses: Poses,
     height: int,
-) -> tuple[Geom, View]:
+) -> tuple[Geom, RayCamera]:
     """Compute the `Geom` of all cameras and geoms, leaves `[K, V]`, and the views, leaves `[K]`."""
     geom_xpos, geom_xmat, cam_xpos, cam_xmat = poses
     _check_shapes(appearance, geom_xpos=geom_xpos, cam_xpos=cam_xpos, size=size)
@@ -205,7 +205,7 @@ def in_camera_frames(
     light = _vec(jnp.asarray(appearance.light) / jnp.linalg.norm(appearance.light))
     rgb = jnp.asarray(appearance.rgba)[visible, :3]
 
-    def view(position: jax.Array, rotation: jax.Array, fovy: jax.Array) -> tuple[Geom, View]:
+    def view(position: jax.Array, rotation: jax.Array, fovy: jax.Array) -> tuple[Geom, RayCamera]:
         rotated = [_product(to_unit, axis) for axis in _rows(rotation.T)]
         geoms = Geom(
             axes=tuple(zip(*rotated, strict=True)),
@@ -226,8 +226,8 @@ def in_camera_frames(
 
 def _camera(
     appearance: Appearance, position: jax.Array, rotation: jax.Array, pixel: jax.Array
-) -> View:
-    return View(
+) -> RayCamera:
+    return RayCamera(
         position=_vec(position),
         rotation=_rows(rotation),
         pixel=pixel,

@@ -9,7 +9,7 @@ from envs.rendering import intersections
 from envs.rendering.intersections import PLANE, Geoms, Matrix, Vec, along, dot, ray
 
 
-class View(NamedTuple):
+class RayCamera(NamedTuple):
     """One camera and its light; every leaf is a scalar.
 
     Shares and colors are as in `Appearance`.
@@ -41,7 +41,7 @@ def pack(tree: Any) -> jax.Array:
 
 
 def colors(
-    geoms: Geoms, kinds: tuple[int, ...], view: View, raster: Raster, pixel: jax.Array
+    geoms: Geoms, kinds: tuple[int, ...], view: RayCamera, raster: Raster, pixel: jax.Array
 ) -> Vec:
     """Compute pixel colors, a triple of uint8 `[P]`: the mean of `samples` x `samples` rays.
 
@@ -70,7 +70,7 @@ def colors(
     return tuple((t * (255 / n**2) + 0.5).astype(jnp.uint8) for t in total)
 
 
-def slopes(view: View, raster: Raster, pixel: jax.Array) -> tuple[jax.Array, jax.Array]:
+def slopes(view: RayCamera, raster: Raster, pixel: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Compute the rightward and upward slopes of each pixel's ray, both `[P]`."""
     row = jax.lax.div(pixel, jnp.int32(raster.width))
     column = pixel - raster.width * row
@@ -79,7 +79,9 @@ def slopes(view: View, raster: Raster, pixel: jax.Array) -> tuple[jax.Array, jax
     return view.pixel * x, view.pixel * y
 
 
-def _color(geoms: Geoms, kinds: tuple[int, ...], view: View, x: jax.Array, y: jax.Array) -> Vec:
+def _color(
+    geoms: Geoms, kinds: tuple[int, ...], view: RayCamera, x: jax.Array, y: jax.Array
+) -> Vec:
     """Compute the color that each ray sees, a triple of `[P]`."""
     number, depth = intersections.nearest(geoms, kinds, x, y)
     hit = depth < jnp.inf

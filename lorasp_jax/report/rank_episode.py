@@ -26,7 +26,7 @@ from lorasp_jax.training.run_folder import recorded_ranges
 
 
 @dataclass(frozen=True)
-class Episode:
+class RankEpisode:
     """An episode of T control steps in one world.
 
     The policy runs at every step, so that ranks belong to the images shown; as in evaluation, the
@@ -49,7 +49,7 @@ class Episode:
     draw: Draw | None = None
 
 
-class Recorder:
+class RankRecorder:
     """Records episodes of a run's policy; all tasks share one compilation of the policy."""
 
     def __init__(self, policy: Policy, config: Mapping[str, Any]) -> None:
@@ -66,7 +66,7 @@ class Recorder:
         options = fast_cpu.without_simulation()
         self._run_policy = jax.jit(run_policy, compiler_options=options)
 
-    def record(self, env: Env) -> Episode:
+    def record(self, env: Env) -> RankEpisode:
         """Record the first successful episode of the final evaluation, or else its first episode.
 
         Tries only the episodes from which the run's own video was chosen.
@@ -83,7 +83,7 @@ class Recorder:
         first = next(episodes)
         return next((e for e in itertools.chain([first], episodes) if e.success), first)
 
-    def play(self, env: Env, key: jax.Array, world: int) -> Episode:
+    def play(self, env: Env, key: jax.Array, world: int) -> RankEpisode:
         """Repeat the episode that `evaluation.make_rollout` runs in one world with this key."""
         reset_key, sample_key = jax.random.split(key)
         worlds = dataclasses.replace(env, num_envs=self._worlds).reset(reset_key, self._ranges)
@@ -106,7 +106,7 @@ class Recorder:
         poses = jax.tree.map(lambda x: x[:, 0], poses)
         text = env.instructions[instruction]
         draw = jax.tree.map(lambda x: x[0], state.info["draw"])
-        return Episode(text, bool(state.info["success"][0]), poses, patches, towers, draw)
+        return RankEpisode(text, bool(state.info["success"][0]), poses, patches, towers, draw)
 
     def _call(
         self, key: jax.Array, world: int, observation: RawObservation, row: jax.Array

@@ -13,7 +13,7 @@ from lorasp_jax.base.files import check_local
 from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.evaluation.video import render_episode
 from lorasp_jax.report import rank_film
-from lorasp_jax.report.rank_episode import Episode, Recorder
+from lorasp_jax.report.rank_episode import RankEpisode, RankRecorder
 from lorasp_jax.training import records
 from lorasp_jax.training.export import load_policy
 from lorasp_jax.training.run_folder import CONFIG_FILE, read_json
@@ -50,7 +50,7 @@ def write(run: Path, task: str | None = None, gif: Path | None = None) -> Iterat
             raise ValueError(f"{gif} already exists: choose another --gif")
         gif.parent.mkdir(parents=True, exist_ok=True)
     config = read_json(run / CONFIG_FILE, _CONFIG)
-    recorder = Recorder(load_policy(run), config)
+    recorder = RankRecorder(load_policy(run), config)
     robot = native.read_description(run)["metadata"]["robot"]
     sizes = {"image_size": config["image_size"], "control_dt": config["control_dt"]}
     for task in tasks:
@@ -80,7 +80,7 @@ def _tasks(run: Path, task: str | None) -> list[str]:
     return [task] if task else tasks
 
 
-def film(env: Env, episode: Episode) -> np.ndarray:
+def film(env: Env, episode: RankEpisode) -> np.ndarray:
     """Draw an episode, uint8 `[T, H, W, 3]`."""
     images = render_episode(env, episode.poses, episode.draw, _PIXELS)
     outcome = "success" if episode.success else "failure"

@@ -11,7 +11,7 @@ from flax import nnx
 
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.models.pi0.pi0 import Pi0, Prefix
+from lorasp_jax.models.pi0.pi0 import Pi0, Pi0Prefix
 from lorasp_jax.models.transformer.layers import block_mask, positions
 from tests.models.random_models import observation, random_backbone, with_random_parameters
 
@@ -137,7 +137,7 @@ class Masked(Pi0):
         block = np.zeros(valid.shape[1], int)
         mask = block_mask(block, block, valid, valid)
         out, cache, aux = self.language(tokens, positions(valid), mask, token_mask=valid)
-        return Prefix(cache, valid, out), {**vision_aux, "language": aux}
+        return Pi0Prefix(cache, valid, out), {**vision_aux, "language": aux}
 
 
 def test_a_masked_prefix_gives_the_same_loss_gradients_and_samples():

@@ -18,7 +18,7 @@ from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Offline
 from lorasp_jax.report import rank_episode
-from lorasp_jax.report.rank_episode import Episode, Recorder, patch_ranks
+from lorasp_jax.report.rank_episode import RankEpisode, RankRecorder, patch_ranks
 from lorasp_jax.training.run_folder import to_json
 from tests.models.random_models import random_backbone
 from tests.runs import CONFIG, make_run
@@ -127,7 +127,7 @@ CONFIG_JSON = {
 
 
 def episode(success):
-    return Episode("press", success, (), {}, {})  # never drawn
+    return RankEpisode("press", success, (), {}, {})  # never drawn
 
 
 @pytest.mark.parametrize(
@@ -140,9 +140,9 @@ def test_the_first_success_is_chosen(outcomes, chosen, monkeypatch, policy):
         keys.append(key)
         return episodes[world]
 
-    monkeypatch.setattr(Recorder, "play", play)
+    monkeypatch.setattr(RankRecorder, "play", play)
     env = SimpleNamespace(task=SimpleNamespace(name="press"))
-    assert Recorder(policy, CONFIG_JSON).record(env) is episodes[chosen]
+    assert RankRecorder(policy, CONFIG_JSON).record(env) is episodes[chosen]
     final = rank_episode.RandomStream.FINAL_EVALUATION.key(3, "press")
     assert {*map(str, keys)} == {str(jax.random.split(final, 2)[0])}
 
@@ -157,7 +157,7 @@ def test_the_episode_is_that_of_the_evaluation(tmp_path):
     key, settings = jax.random.key(5), CONFIG_JSON["evaluation"]
     rollout = jax.jit(make_rollout(env, execute_steps=3, denoise_steps=2))(policy, key)
     one = dataclasses.replace(env, num_envs=1)
-    recorder = Recorder(policy, {**to_json(CONFIG), "evaluation": settings})
+    recorder = RankRecorder(policy, {**to_json(CONFIG), "evaluation": settings})
     for world in range(2):
         found = recorder.play(one, key, world)
         steps = int(rollout.steps[world])

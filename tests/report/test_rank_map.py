@@ -10,7 +10,7 @@ from PIL import Image
 from envs.scene.ranges import Randomization
 from lorasp_jax.report import __main__ as command
 from lorasp_jax.report import rank_map
-from lorasp_jax.report.rank_episode import Recorder
+from lorasp_jax.report.rank_episode import RankRecorder
 from lorasp_jax.training import export
 from lorasp_jax.training.run_folder import to_json, write_json
 from tests.runs import CONFIG, RESULTS, finish, make_run
@@ -79,7 +79,7 @@ def test_every_task_gets_a_film_and_the_first_a_gif(folder, capsys, monkeypatch)
     read = lambda run: {"metadata": {"robot": "panda"}}  # noqa: E731
     monkeypatch.setattr(rank_map.native, "read_description", read)
     recorder = SimpleNamespace(record=recorded.append)
-    monkeypatch.setattr(rank_map, "Recorder", lambda policy, config: recorder)
+    monkeypatch.setattr(rank_map, "RankRecorder", lambda policy, config: recorder)
     monkeypatch.setattr(rank_map, "film", lambda env, episode: frames)
     gif = folder / "new" / "map.gif"
     assert command.main(["rank-map", str(folder), "--gif", str(gif)]) == 0
@@ -124,8 +124,8 @@ def test_a_run_is_filmed(folder, monkeypatch):
     film = rank_map.film
     monkeypatch.setattr(rank_map, "film", lambda *a: films.append(a[1]) or film(*a))
     tried = []
-    play = Recorder.play
-    monkeypatch.setattr(Recorder, "play", lambda *a: tried.append(a[-1]) or play(*a))
+    play = RankRecorder.play
+    monkeypatch.setattr(RankRecorder, "play", lambda *a: tried.append(a[-1]) or play(*a))
     prompts = run.policy.processor.prompts
     monkeypatch.setattr(type(prompts), "rows", lambda _, texts: np.zeros(len(texts), np.int32))
     gif = folder / "map.gif"

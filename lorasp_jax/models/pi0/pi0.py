@@ -106,7 +106,7 @@ class Pi0Config(BackboneConfig):
         )
 
 
-class Prefix(NamedTuple):
+class Pi0Prefix(NamedTuple):
     """Encoded images and instruction, valid tokens first.
 
     Attributes:
@@ -119,7 +119,7 @@ class Prefix(NamedTuple):
     valid: jax.Array
     out: jax.Array
 
-    def by_layer(self) -> Prefix:
+    def by_layer(self) -> Pi0Prefix:
         """Split the cache into layers, so that a loop of flow steps slices nothing."""
         return self._replace(cache=ByLayer.of(self.cache))
 
@@ -163,18 +163,18 @@ class Pi0(Backbone):
         h, aux = self.embed_actions(x_t, flow_time, action_valid)
         return jnp.concatenate([state_token, h], axis=1), {"state_proj": state_aux, **aux}
 
-    def run_prefix(self, obs: Observation) -> tuple[Prefix, ModelAux]:
+    def run_prefix(self, obs: Observation) -> tuple[Pi0Prefix, ModelAux]:
         """Encode images and instruction."""
         tokens, valid, vision_aux = self.embed_prefix(obs)
         # All tokens attend to the valid ones. With these first, attention needs only their number.
         tokens, valid = valid_first(tokens, valid)
         count = jnp.sum(valid, axis=1, dtype=jnp.int32)
         out, cache, aux = self.language(tokens, positions(valid), count, token_mask=valid)
-        return Prefix(cache, valid, out), {**vision_aux, "language": aux}
+        return Pi0Prefix(cache, valid, out), {**vision_aux, "language": aux}
 
     def run_suffix(
         self,
-        prefix: Prefix,
+        prefix: Pi0Prefix,
         obs: Observation,
         x_t: jax.Array,
         flow_time: jax.Array,

@@ -106,7 +106,7 @@ class SmolVLAConfig(BackboneConfig):
         )
 
 
-class Prefix(NamedTuple):
+class SmolVLAPrefix(NamedTuple):
     """Encoded images, instruction and state.
 
     Attributes:
@@ -119,7 +119,7 @@ class Prefix(NamedTuple):
     cross: KeysValues | ByLayer
     valid: jax.Array
 
-    def by_layer(self) -> Prefix:
+    def by_layer(self) -> SmolVLAPrefix:
         """Split cache and cross into layers, so that a loop of flow steps slices nothing."""
         return self._replace(cache=ByLayer.of(self.cache), cross=ByLayer.of(self.cross))
 
@@ -167,19 +167,19 @@ class SmolVLA(Backbone):
         del obs
         return self.embed_actions(x_t, flow_time, action_valid)
 
-    def run_prefix(self, obs: Observation) -> tuple[Prefix, ModelAux]:
+    def run_prefix(self, obs: Observation) -> tuple[SmolVLAPrefix, ModelAux]:
         """Encode images, instruction and state."""
         tokens, valid, aux = self.embed_prefix(obs)
         block = _prefix_block(valid.shape[1])
         mask = block_mask(block, block, valid, valid)
         _, cache, language_aux = self.language(tokens, positions(valid), mask, token_mask=valid)
         even, cross, action_aux = self.action.project_cache(cache, valid)
-        prefix = Prefix(even, cross, valid)
+        prefix = SmolVLAPrefix(even, cross, valid)
         return prefix, merge_action_aux({**aux, "language": language_aux}, action_aux)
 
     def run_suffix(
         self,
-        prefix: Prefix,
+        prefix: SmolVLAPrefix,
         obs: Observation,
         x_t: jax.Array,
         flow_time: jax.Array,
