@@ -3,6 +3,7 @@
 import threading
 import time
 
+from lorasp_jax.serving.fake_piper import frames
 from lorasp_jax.serving.fake_piper.firmware import PERIOD, FakePiper
 from lorasp_jax.serving.piper.arm import PiperArm
 
@@ -44,7 +45,7 @@ class Lockstep:
             return
         _discard(self._arm)
         end = time.monotonic() + _PATIENCE
-        while self._arm.sdk.GetArmStatus().time_stamp != self._fake.stamp:
+        while self._arm.heard.get(frames.STATUS) != self._fake.time:
             if time.monotonic() > end:
                 raise TimeoutError("piper_sdk does not read the virtual bus")
             time.sleep(0)
