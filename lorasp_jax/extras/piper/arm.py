@@ -1,13 +1,15 @@
 """The PiPER on its CAN bus, through the vendor's unmodified piper_sdk.
 
 Order and units are those of the SDK's examples: connect, enable until all drivers report it, then
-in every cycle mode, joints and gripper. The SDK logs bus errors and goes on, so every frame's age
-is measured here. MIT mode (0xAD), which can damage the arm, is never used.
+in every cycle mode, joints and gripper. The SDK logs bus errors and goes on, and one of its stamps
+serves several frames, so the age of every kind of frame is measured here. MIT mode (0xAD), which
+can damage the arm, is never used.
 """
 
 import contextlib
 import io
 import warnings
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -29,6 +31,17 @@ _PER_DEGREE, _PER_METER = 1000.0, 1e6  # the bus counts 0.001 degrees and 0.001 
 _MOVE_J = 0x01
 _GRIPPER_ON = 0x01
 _START_TEACHING, _STOP_TEACHING = 0x01, 0x02  # of the frame 0x150
+_POSE_AND_STATUS = {
+    0x2A1: "GetArmStatus",
+    **dict.fromkeys((0x2A5, 0x2A6, 0x2A7), "GetArmJointMsgs"),
+    0x2A8: "GetArmGripperMsgs",
+}
+_DRIVERS = dict.fromkeys(range(0x261, 0x267), "GetArmLowSpdInfoMsgs")
+_LEADER = {
+    **dict.fromkeys((0x155, 0x156, 0x157), "GetArmJointCtrl"),
+    0x159: "GetArmGripperCtrl",
+}
+_GETTERS = _POSE_AND_STATUS | _DRIVERS | _LEADER  # what the SDK makes of each kind of frame
 _POLL = 0.01  # s between two attempts to connect or enable
 # Firmware limits have been found corrupted: all angles -0.1 degrees. Slower is still plausible.
 _LEAST_RANGE, _LEAST_SPEED = 30.0, 0.1  # degrees, rad/s; our choices
@@ -39,6 +52,7 @@ class PiperArm:
 
     Attributes:
         sdk: the `C_PiperInterface_V2`.
+        heard: when each kind of frame last came, by identifier [s].
     """
 
     def __init__(
@@ -70,8 +84,9 @@ class PiperArm:
         self._effort, self._percent = effort, int(np.clip(np.ceil(speed / 3 * 100), 1, 100))
         self._offset = SDK_OFFSET if zeros == "sdk" else np.zeros(6)
         self._clock = clock or RealClock()
-        self._seen: dict[str, tuple[float, float]] = {}
+        self.heard: dict[int, float] = {}
         self.sdk = _open(can, bus)
+        self.sdk.GetCanBus().callback_function = self._hear
 
     def connect(self, timeout: float = 2.0) -> None:
         """Start reading, and wait for the first complete feedback.
@@ -82,10 +97,11 @@ class PiperArm:
         """
         self.sdk.ConnectPort()
         end = self._clock.now() + timeout
-        while self._age() > _POLL:
+        while missing := [hex(x) for x in (*_POSE_AND_STATUS, *_DRIVERS) if x not in self.heard]:
             if self._clock.now() > end:
                 raise ConnectionError(
-                    "the arm sends nothing: check its power, the cable and the bitrate (1000000)"
+                    f"the arm does not send {', '.join(missing)}: check its power, the cable and "
+                    "the bitrate (1000000)"
                 )
             self._clock.wait_until(self._clock.now() + _POLL / 2)
         self._check_firmware()
@@ -118,7 +134,8 @@ class PiperArm:
         status = self.sdk.GetArmStatus().arm_status
         return Reading(
             pose=np.append(angles, opening),
-            age=self._age(),
+            age=self._age(_POSE_AND_STATUS),
+            driver_age=self._age(_DRIVERS),
             ctrl_mode=int(status.ctrl_mode),
             arm_status=int(status.arm_status),
             enabled=all(self.sdk.GetArmEnableStatus()),
@@ -126,11 +143,10 @@ class PiperArm:
 
     def leader(self) -> np.ndarray | None:
         """Return the target [7] that another arm on the bus sends to this one; None: none does."""
-        message = self.sdk.GetArmJointCtrl()
-        if self._since("leader", message.time_stamp) > MAX_AGE:
+        if self._age(_LEADER) > MAX_AGE:
             return None
         opening = self.sdk.GetArmGripperCtrl().gripper_ctrl.grippers_angle / _PER_METER
-        return np.append(_angles(message.joint_ctrl) + self._offset, opening)
+        return np.append(_angles(self.sdk.GetArmJointCtrl().joint_ctrl) + self._offset, opening)
 
     def command(self, pose: np.ndarray) -> None:
         """Send one target [7]; it stays in force until the next, as the arm has no watchdog.
@@ -169,25 +185,20 @@ class PiperArm:
             raise ConnectionError(problem)
         self._clock.wait_until(self._clock.now() + _POLL)
 
-    def _age(self) -> float:
-        """Return the age of the oldest kind of feedback [s].
+    def _hear(self, message: Any) -> None:
+        """Give the SDK a frame, and note the time unless it refuses it as implausible.
 
-        Frames are stamped by the system's clock, which may jump, so we note when stamps change.
-        The SDK's own `isOk` notices a silent bus only after 250 ms.
+        Frames are stamped by the system's clock, which may jump, so we use our own. The SDK's
+        `isOk` notices a silent bus only after 250 ms.
         """
-        messages = {
-            "joints": self.sdk.GetArmJointMsgs(),
-            "gripper": self.sdk.GetArmGripperMsgs(),
-            "status": self.sdk.GetArmStatus(),
-        }
-        return max(self._since(name, message.time_stamp) for name, message in messages.items())
+        self.sdk.ParseCANFrame(message)
+        getter = _GETTERS.get(message.arbitration_id)
+        if getter and getattr(self.sdk, getter)().time_stamp == message.timestamp:
+            self.heard[message.arbitration_id] = self._clock.now()
 
-    def _since(self, name: str, stamp: float) -> float:
-        """Return the time since a kind of frame last had a new stamp [s]; 0 if that is now."""
-        now = self._clock.now()
-        if name not in self._seen or self._seen[name][0] != stamp:
-            self._seen[name] = stamp, now if stamp else -np.inf
-        return now - self._seen[name][1]
+    def _age(self, kinds: Iterable[int]) -> float:
+        """Return the age of the oldest of some kinds of frames [s]."""
+        return self._clock.now() - min(self.heard.get(kind, -np.inf) for kind in kinds)
 
     def _check_firmware(self) -> None:
         """Refuse joint limits that no arm has; old firmware reports none."""

@@ -7,12 +7,13 @@ from typing import Any, Protocol
 import numpy as np
 
 from lorasp_jax.extras.piper.clock import Clock
+from lorasp_jax.extras.serving.client import PolicyError
 
 Observation = Mapping[str, Any]
 """`image`: camera -> uint8 [H, W, 3]; `state`: f32 [7]; `prompt`: the request in words; `executed`
 and `delay` as in `lorasp_jax.extras.serving.requests`, if the arm does not wait for the answer."""
 Ask = Callable[[Observation], Any]
-"""Return actions [C, 7] for an observation; may raise what `PolicyClient.infer` raises."""
+"""Return actions [C, 7] for an observation; may raise anything."""
 
 
 class Asker(Protocol):
@@ -23,7 +24,11 @@ class Asker(Protocol):
         ...
 
     def answer(self) -> Any | None:
-        """Return the actions once they are there, else None; raise what asking raised."""
+        """Return the actions once they are there, else None.
+
+        Raises:
+            PolicyError: asking raised something.
+        """
         ...
 
 
@@ -32,23 +37,20 @@ class InThread:
 
     def __init__(self, ask: Ask) -> None:
         """Wrap a function that waits for the answer."""
-        self._ask, self._lock = ask, threading.Lock()
+        self._ask = ask
         self._outcome: list | None = None
 
     def ask(self, observation: Observation) -> None:
         """Send a question."""
         self._outcome = outcome = []
-        arguments = (observation, outcome)
-        self._thread = threading.Thread(target=self._run, args=arguments, daemon=True)
+        self._thread = threading.Thread(
+            target=lambda: outcome.append(_outcome(self._ask, observation)), daemon=True
+        )
         self._thread.start()
 
     def answer(self) -> Any | None:
-        """Return the actions once they are there, else None; raise what asking raised."""
+        """Return the actions once they are there, else None; raise `PolicyError`."""
         return _unpack(self._outcome)
-
-    def _run(self, observation: Observation, outcome: list) -> None:
-        with self._lock:  # a question that nobody waits for any more may still be open
-            outcome.append(_outcome(self._ask, observation))
 
 
 class InTurn:
@@ -71,7 +73,7 @@ class InTurn:
         self._due = self._clock.now() + self._latency
 
     def answer(self) -> Any | None:
-        """Return the actions once they are due, else None; raise what asking raised."""
+        """Return the actions once they are due, else None; raise `PolicyError`."""
         return _unpack(self._outcome) if self._clock.now() >= self._due - 1e-9 else None
 
 
@@ -87,5 +89,5 @@ def _unpack(outcome: list | None) -> Any | None:
         return None
     actions, error = outcome[0]
     if error:
-        raise error
+        raise PolicyError(str(error) or type(error).__name__) from error
     return actions

@@ -5,6 +5,7 @@ import contextlib
 import functools
 import importlib
 import signal
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -87,13 +88,13 @@ def opened_log(options: argparse.Namespace) -> Iterator[Log]:
 
 
 def stop_on_signals(session: Session | Lesson) -> None:
-    """Let Ctrl-C and SIGTERM stop a session, in which the arm brakes and holds, or a lesson."""
-    for number in (signal.SIGINT, signal.SIGTERM):
+    """Let signals stop a session, in which the arm brakes and holds, or a lesson."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: session.stop())
 
 
 class Server:
-    """A policy server as the function that a session asks.
+    """A policy server as the function that a session asks, one question at a time.
 
     Attributes:
         ended: why the connection has ended, in a sentence; None while it has not.
@@ -110,6 +111,7 @@ class Server:
         answering = adapter or next(iter(known), "")
         self._instructions = trained.get(answering, []) if isinstance(trained, dict) else []
         self._client = client
+        self._lock = threading.Lock()  # a question that nobody waits for any more may be open
         self.ended: str | None = None
         self._size = client.metadata.get("image_size")
         continues = client.metadata.get("execution", "naive") != "naive"
@@ -131,8 +133,9 @@ class Server:
             )
 
     def reset(self) -> None:
-        """Begin an episode with the next question."""
-        self._client.reset()
+        """Begin an episode with the next question, once no earlier one is open."""
+        with self._lock:
+            self._client.reset()
 
     def __call__(self, observation: Observation) -> np.ndarray:
         """Return the server's actions [C, 7]; its pictures are resized here, so less is sent.
@@ -145,12 +148,15 @@ class Server:
             pictures = {name: to_square(name, x, self._size) for name, x in pictures.items()}
         known = {key: x for key, x in observation.items() if key not in self._unknown}
         try:
-            reply = self._client.infer({**known, **self._choice, "image": pictures})
+            with self._lock:
+                reply = self._client.infer({**known, **self._choice, "image": pictures})
         except (ServerGone, PolicyError) as error:
             self.ended = self.ended or str(error)
             raise
         if "actions" not in reply:
-            raise PolicyError(f"the server's reply has no actions, only {', '.join(reply)}")
+            raise PolicyError(
+                f"the server's reply has no actions, only {', '.join(map(str, reply))}"
+            )
         return reply["actions"]
 
 

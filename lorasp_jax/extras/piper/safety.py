@@ -20,6 +20,9 @@ MAX_EFFORT = 1500
 """Highest gripper effort that we command [0.001 N m]; the firmware takes up to 5000. Our choice."""
 MAX_AGE = 0.05
 """Age beyond which feedback is stale [s]: ten frames of a bus that sends at 200 Hz."""
+MAX_DRIVER_AGE = 0.25
+"""The same for the drivers' states [s]: ten frames at 40 Hz, which we infer from the 3040 frames
+per second of a full bus (piper_sdk's issue 42), as 14 kinds come at 200 Hz."""
 CAN_CONTROL = 1
 """Control mode in which the arm obeys the bus."""
 _NEAR = np.deg2rad(5.0)  # rad; a target this close to the measured pose needs no slow approach
@@ -53,13 +56,15 @@ class Reading(NamedTuple):
 
     Attributes:
         pose: [7] measured joints [rad] and opening [m].
-        age: time since the last feedback [s].
+        age: of the oldest of the frames that the pose and the status came in [s].
+        driver_age: of the oldest of the six drivers' states [s].
         ctrl_mode, arm_status: as in the frame 0x2A1.
         enabled: whether all six drivers are on.
     """
 
     pose: np.ndarray
     age: float
+    driver_age: float
     ctrl_mode: int
     arm_status: int
     enabled: bool
@@ -142,6 +147,8 @@ def fault(reading: Reading, limits: Limits) -> str | None:
     joints = reading.pose[:6]
     if reading.age > MAX_AGE:
         return f"no feedback from the arm for {1000 * reading.age:.0f} ms"
+    if reading.driver_age > MAX_DRIVER_AGE:
+        return f"no state of a joint's driver for {1000 * reading.driver_age:.0f} ms"
     if not joints.any() or not np.isfinite(reading.pose).all():
         return "the arm reports no joint angles, only zeros: is it another arm's leader?"
     beyond = np.maximum(limits.lower[:6] - joints, joints - limits.upper[:6])

@@ -1,9 +1,9 @@
 """The control loop: read the arm, ask the policy, command the arm, 200 times a second.
 
-Whatever goes wrong, the arm holds. If feedback or pictures come back soon, it goes on from the
-measured pose. Otherwise, and after a refused chunk or a lost server, it moves slowly to its rest
-pose and stays there, powered; it does not move again while it reports a fault itself. Ctrl-C stops
-it where it is.
+Whatever goes wrong, the arm brakes and holds. If feedback or pictures come back soon, it goes on
+from the measured pose. Otherwise, and after a refused chunk or a policy's error, it moves slowly to
+its rest pose and stays there, powered; it does not move again while it reports a fault itself.
+Signals and all other errors stop it where it is.
 """
 
 import math
@@ -28,7 +28,7 @@ from lorasp_jax.extras.piper.safety import (
     check_chunk,
     fault,
 )
-from lorasp_jax.extras.serving.client import PolicyError, ServerGone
+from lorasp_jax.extras.serving.client import PolicyError
 
 PERIOD = 0.005
 """Time between two commands [s], as in piper_sdk's examples (200 Hz)."""
@@ -133,36 +133,46 @@ class Session:
     def run(self, seconds: float, done: Callable[[], bool] = lambda: False) -> str | None:
         """Run the policy until the time is over, `done` says so, or a problem lasts.
 
+        However it ends, the arm has braked and holds.
+
         Returns:
             The problem in a sentence, or None.
 
         Raises:
             ValueError: the first chunk has fewer actions than the settings need; the arm has not
                 moved.
+            BaseException: whatever else a camera, the log, `say` or `done` raised.
         """
         self._governor.start(self._arm.read().pose)
+        try:
+            self._follow(seconds, done)
+        except BaseException as error:
+            self._settle()
+            self._hold(str(error) or type(error).__name__)
+            raise
+        self._settle()
+        if self.stopped:
+            self._say("stopped")
+        return self.problem
+
+    def _follow(self, seconds: float, done: Callable[[], bool]) -> None:
         self._next = start = self._clock.now()
         while self._clock.now() - start < seconds and not self.stopped and not done():
             self._tick()
             if self.problem and self._clock.now() - self._since > self._settings.hold:
                 self._rest()
                 break
-        self._settle()
-        return self.problem
 
     def _tick(self) -> None:
         reading, now = self._read(), self._clock.now()
         try:
             if problem := fault(reading, self._limits):
-                self._hold(problem, reading, now)
-                self._final |= bool(reading.arm_status) or reading.ctrl_mode != CAN_CONTROL
+                self._fail(problem, reading)
             elif not self._final:
                 self._drive(reading, now)
-        except NoPicture as error:
-            self._hold(str(error), reading, now)
-        except (Unsafe, ServerGone, PolicyError) as error:
-            self._hold(str(error), reading, now)
-            self._final = True
+        except (Unsafe, PolicyError) as error:
+            self._hold(str(error))
+            self._final |= not isinstance(error, NoPicture)
         if self.problem:
             self._send(self._governor.brake(), reading)
         self._wait()
@@ -179,7 +189,7 @@ class Session:
             self._ask(reading, now)
             self._receive(now)
         if self._asked is not None and now - self._asked > self._settings.patience:
-            raise ServerGone(f"the server did not answer within {self._settings.patience:g} s")
+            raise PolicyError(f"the server did not answer within {self._settings.patience:g} s")
         if self._path is None:
             self._send(self._governor.brake(), reading)
             return
@@ -219,7 +229,7 @@ class Session:
         if self._asked is None or (actions := self._asker.answer()) is None:
             return
         settings, chunk = self._settings, check_chunk(actions)
-        self._check_length(chunk, now)
+        self._check_length(chunk)
         own = chunk[: settings.execute + settings.ahead]
         if self._path is None:
             self._path = Path(self._governor.pose.copy(), own, settings.control_dt)
@@ -230,7 +240,7 @@ class Session:
         self.chunks += 1
         self._write(now, chunk=chunk)
 
-    def _check_length(self, chunk: np.ndarray, now: float) -> None:
+    def _check_length(self, chunk: np.ndarray) -> None:
         """Refuse a chunk that is too short; ValueError if it is the first, as no arm moves yet."""
         execute, ahead = self._settings.execute, self._settings.ahead
         if len(chunk) >= execute + ahead:
@@ -239,7 +249,6 @@ class Session:
         problem = f"execute {execute} and ahead {ahead} {needed}"
         if self.chunks:
             raise Unsafe(problem)
-        self._write(now, problem=problem)
         raise ValueError(problem)
 
     def _switch(self, chunk: np.ndarray, now: float) -> None:
@@ -264,15 +273,21 @@ class Session:
         """Return the time on the path in control steps."""
         return (now - self._start) / self._settings.control_dt
 
-    def _hold(self, problem: str, reading: Reading, now: float) -> None:
-        """Begin to hold, unless the arm holds already: where it is if it reports where that is."""
+    def _fail(self, problem: str, reading: Reading) -> None:
+        """Hold because of what the arm reports: where it is, if it may stand still already."""
+        stands = reading.age <= MAX_AGE and (reading.arm_status or not reading.enabled)
+        if stands and not self.problem:
+            self._governor.start(reading.pose)
+        self._final |= bool(reading.arm_status) or reading.ctrl_mode != CAN_CONTROL
+        self._hold(problem)
+
+    def _hold(self, problem: str) -> None:
+        """Begin to hold, unless the arm holds already."""
         if self.problem:
             return
-        self.problem, self._since = problem, now
+        self.problem, self._since = problem, self._clock.now()
+        self._write(self._since, problem=problem)
         self._say(f"holding: {problem}")
-        self._write(now, problem=problem)
-        if reading.age <= MAX_AGE and (reading.arm_status or not reading.enabled):
-            self._governor.start(reading.pose)
 
     def _rest(self) -> None:
         """Move slowly to the rest pose, unless the arm itself reports a fault."""
@@ -305,7 +320,6 @@ class Session:
 
     def _send(self, command: np.ndarray, reading: Reading) -> None:
         now = self._clock.now()
-        self._write(now, pose=reading.pose, command=command, age=reading.age)
         if self._settings.dry_run:
             if now - self._printed >= self._settings.control_dt - 1e-6:
                 degrees = " ".join(f"{angle:7.2f}" for angle in np.rad2deg(command[:6]))
@@ -313,6 +327,7 @@ class Session:
                 self._printed = now
         elif reading.ctrl_mode == CAN_CONTROL:  # else a person or another program has the arm
             self._arm.command(command)
+        self._write(now, pose=reading.pose, command=command, age=reading.age)
 
     def _record(self, reading: Reading, now: float) -> None:
         """Record the first tick of every action."""

@@ -36,7 +36,7 @@ class ServerGone(ConnectionError):
 
 
 class PolicyClient:
-    """A connection to a policy server. Not thread-safe.
+    """A connection to a policy server. Not thread-safe, but for `close`.
 
     The connection lives in a thread of its own, which answers the server's pings between requests.
     Only that thread touches it, since Python's encrypted sockets do not tolerate two.
@@ -72,6 +72,7 @@ class PolicyClient:
         """
         self.address: str = address
         self._timeout, self._reset = timeout, False
+        self._closing = threading.Lock()
         context = ssl.create_default_context(cafile=certificate or None)
         self._options: dict[str, Any] = {
             "additional_headers": {"Authorization": f"Api-Key {token}"} if token else {},
@@ -103,7 +104,8 @@ class PolicyClient:
             timeout: how long to wait for the reply [s]; None is the client's default.
 
         Raises:
-            PolicyError: the server refused the observation. It then closes the connection.
+            PolicyError: the server refused the observation, after which it closes the connection,
+                or its reply is malformed.
             ServerGone: the connection is lost, or no reply came in time. The connection is closed,
                 since a late reply could be mistaken for the next one.
             TypeError: the observation contains something else than numbers, text and arrays.
@@ -123,13 +125,14 @@ class PolicyClient:
 
     def close(self) -> None:
         """Close the connection and stop its thread."""
-        if not self._thread.is_alive():
-            return
-        if self._socket is not None:
-            self._run(self._socket.close())
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join()
-        self._loop.close()
+        with self._closing:  # a call that this ends closes the connection, too
+            if not self._thread.is_alive():
+                return
+            if self._socket is not None:
+                self._run(self._socket.close())
+            self._loop.call_soon_threadsafe(self._loop.stop)
+            self._thread.join()
+            self._loop.close()
 
     def __enter__(self) -> Self:
         """Return the client."""
@@ -179,7 +182,13 @@ class PolicyClient:
             raise ServerGone(text) from error
         if isinstance(reply, str):
             raise PolicyError(reply)
-        return wire.unpack(reply)
+        try:
+            message = wire.unpack(reply)
+        except wire.FrameError as error:
+            raise PolicyError(f"the server's reply is malformed: {error}") from error
+        if not isinstance(message, dict):
+            raise PolicyError(f"the server's reply must be a map, got a {type(message).__name__}")
+        return message
 
     async def _send_and_receive(self, frame: bytes | None, timeout: float) -> bytes | str:
         assert self._socket is not None

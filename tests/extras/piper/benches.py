@@ -34,6 +34,11 @@ class Bench(types.SimpleNamespace):
     def wait(self, seconds):
         self.clock.wait_until(self.clock.now() + seconds)
 
+    def lose(self, kinds):
+        """Drop some kinds of the arm's frames from now on."""
+        send = self.fake._send
+        self.fake._send = lambda kind, data: kind in kinds or send(kind, data)
+
     def close(self):
         self.arm.close()
         self.fake.close()

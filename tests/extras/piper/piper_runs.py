@@ -27,7 +27,7 @@ class Run:
     """A session whose sentences are kept; `at` calls functions at times since the start."""
 
     def __init__(self, bench, ask, *, cameras=None, latency=0.0, **options):
-        self.bench, self.said, self.at, self.commands = bench, [], {}, []
+        self.bench, self.said, self.at, self.commands, self.sent = bench, [], {}, [], []
         settings = Settings("turn", hold=options.pop("hold", 0.5), **options.pop("settings", {}))
         asker = options.pop("asker", None) or InTurn(ask, bench.clock, latency)
         cameras = cameras or Simulated(bench.world.images)
@@ -38,12 +38,14 @@ class Run:
             LIMITS,
             settings,
             bench.clock,
-            say=self.said.append,
+            say=options.pop("say", self.said.append),
             **options,
         )
 
     def __call__(self, seconds, done=lambda: False):
         start, pending = self.bench.clock.now(), dict(self.at)
+        command = self.bench.arm.command
+        self.bench.arm.command = lambda pose: self.sent.append(pose.copy()) or command(pose)
 
         def each_tick():
             self.commands.append(self.session._governor.pose.copy())
@@ -67,6 +69,15 @@ def assert_safe(run, jump=0.0):
     assert np.sort(steps)[-2] < 1.0 * PERIOD + 1e-9
     assert steps.max() < max(jump, 1.0 * PERIOD + 1e-9)
     assert run.bench.fake.unsafe == []
+
+
+def assert_braked(run):
+    """Check that the arm moved, and was stopped within the limits by what was sent to it."""
+    velocity = np.diff(np.stack(run.sent), axis=0)[:, :6] / PERIOD
+    assert np.abs(velocity).max() > 0.25
+    assert np.abs(np.diff(velocity, axis=0)).max() <= LIMITS.acceleration[0] * PERIOD + 1e-9
+    assert not velocity[-1].any()
+    assert_safe(run)
 
 
 def assert_holds(run, words, jump=0.0):

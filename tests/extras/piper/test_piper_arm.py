@@ -6,7 +6,15 @@ import pytest
 from lorasp_jax.extras.piper.arm import PiperArm
 from lorasp_jax.extras.piper.fake import frames
 from lorasp_jax.extras.piper.fake.world import World
-from lorasp_jax.extras.piper.safety import MAX_EFFORT, Governor, Limits, Unsafe, fault
+from lorasp_jax.extras.piper.safety import (
+    MAX_AGE,
+    MAX_DRIVER_AGE,
+    MAX_EFFORT,
+    Governor,
+    Limits,
+    Unsafe,
+    fault,
+)
 from tests.extras.piper.benches import Bench, channel
 
 LIMITS = Limits.of()
@@ -109,6 +117,41 @@ def test_frames_that_stop_are_noticed_within_60_ms(bench):
     assert fault(arm.read(), LIMITS) is None
 
 
+@pytest.mark.parametrize("kind", [*frames.JOINTS, frames.GRIPPER, *frames.DRIVERS])
+def test_every_kind_of_frame_must_come(world, kind):
+    bench, words = Bench(world).ready(LIMITS), "no feedback"
+    slack = 0.0
+    if kind in frames.DRIVERS:
+        words, slack = "no state of a joint's driver", MAX_DRIVER_AGE - MAX_AGE
+    bench.lose({kind})
+    bench.wait(slack)
+    assert fault(bench.arm.read(), LIMITS) is None
+    bench.wait(MAX_AGE + 0.01)
+    assert words in fault(bench.arm.read(), LIMITS)
+    bench.close()
+
+
+def test_frames_that_the_sdk_refuses_are_no_feedback(bench):
+    arm, fake, clock = ready(bench)
+    send = fake._send
+
+    def implausible(kind, data):
+        fake.faults.clock_step += 1e-6  # each frame of a real bus has a stamp of its own
+        send(kind, frames.pair(4e6, 0) if kind == frames.JOINTS[1] else data)
+
+    fake._send = implausible
+    wait(clock, 0.06)
+    assert "no feedback" in fault(arm.read(), LIMITS)
+
+
+def test_an_arm_that_lacks_a_kind_of_frame_is_refused(world):
+    bench = Bench(world)
+    bench.lose({frames.GRIPPER})
+    with pytest.raises(ConnectionError, match="does not send 0x2a8:"):
+        bench.arm.connect(timeout=0.1)
+    bench.close()
+
+
 def test_clock_steps_do_not_age_feedback(bench):
     arm, fake, clock = ready(bench)
     for step in (-1000.0, 1000.0, 0.0):
@@ -167,7 +210,7 @@ def test_enabling_refuses_a_faulty_arm(bench, faults, error, words):
 def test_a_silent_bus_is_refused(bench):
     arm, fake, _ = bench
     fake.faults.silent = True
-    with pytest.raises(ConnectionError, match="the arm sends nothing"):
+    with pytest.raises(ConnectionError, match="the arm does not send 0x2a1, 0x2a5"):
         arm.connect(timeout=0.1)
 
 

@@ -66,11 +66,22 @@ def test_a_served_policy_on_the_fake_arm(server, tmp_path, capsys, monkeypatch, 
     short = dataclasses.replace(press.TASK, time_limit=1.0)
     monkeypatch.setattr(press, "TASK", short)
     monkeypatch.setattr(safety, "MAX_AGE", 60.0)  # a busy machine pauses the arm's thread
+    monkeypatch.setattr(safety, "MAX_DRIVER_AGE", 60.0)
     words = ["--server", server.address, "--log", str(tmp_path / "log"), *more]
     assert fake([*words, "--latency", "0.1", "--thinking", "0.1"]) == 0
     assert "episode 0: failure\n" in capsys.readouterr().out
     assert server.policy.last_request.images["wrist"].shape == (16, 16, 3)
     assert server.policy.last_request.prompt
+
+
+def test_an_episode_may_end_with_an_open_question(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(press, "TASK", dataclasses.replace(press.TASK, time_limit=0.4))
+    monkeypatch.setattr(safety, "MAX_AGE", 60.0)  # a busy machine pauses the arm's thread
+    monkeypatch.setattr(safety, "MAX_DRIVER_AGE", 60.0)
+    with serving(Still(seconds=0.9)) as server:
+        words = ["--server", server.address, "--log", str(tmp_path), "--realtime"]
+        assert fake([*words, "--episodes", "3"]) == 0
+    assert "0 of 3 succeeded" in capsys.readouterr().out
 
 
 class Leaving(Still):
@@ -220,6 +231,7 @@ def linked(monkeypatch, film):
     monkeypatch.setattr("lorasp_jax.extras.piper.__main__.PiperArm", LinkedArm)
     monkeypatch.setattr("lorasp_jax.extras.piper.cameras.MAX_AGE", 60.0)
     monkeypatch.setattr(safety, "MAX_AGE", 60.0)  # a busy machine pauses the arm's thread
+    monkeypatch.setattr(safety, "MAX_DRIVER_AGE", 60.0)
     return ["--camera", f"side={film}", "--camera", f"wrist={film}", "--task", "press"]
 
 

@@ -16,7 +16,7 @@ from lorasp_jax.extras.piper.safety import Governor, Limits, Reading, Unsafe, ch
 DT = 0.005
 HOME = np.append(ROBOT.home, 0.04)
 LIMITS = Limits.of()
-FINE = Reading(HOME, age=0.0, ctrl_mode=1, arm_status=0, enabled=True)
+FINE = Reading(HOME, age=0.0, driver_age=0.0, ctrl_mode=1, arm_status=0, enabled=True)
 
 
 def shifted(joint, angle):

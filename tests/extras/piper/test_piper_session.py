@@ -14,9 +14,9 @@ from lorasp_jax.extras.piper.fake.demonstrator import Demonstrator
 from lorasp_jax.extras.piper.log import Log
 from lorasp_jax.extras.piper.options import stop_on_signals
 from lorasp_jax.extras.piper.session import PERIOD, Settings
-from lorasp_jax.extras.serving.client import ServerGone
+from lorasp_jax.extras.serving.client import PolicyError, ServerGone
 from tests.extras.piper.benches import Bench
-from tests.extras.piper.piper_runs import ARM_STEP, Run, Turning, assert_safe
+from tests.extras.piper.piper_runs import ARM_STEP, Run, Turning, assert_braked, assert_safe
 
 
 def test_actions_are_executed_at_their_pace(bench):
@@ -154,9 +154,12 @@ def test_stop_brakes_and_holds_without_resting(bench):
     assert bench.fake.unsafe == []
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@pytest.mark.parametrize("number", SIGNALS)
 def test_signals_brake_and_hold(bench, number):
-    handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {each: signal.getsignal(each) for each in SIGNALS}
     run = Run(bench, Turning())
     run.at = {0.5: lambda: signal.raise_signal(number)}
     start = bench.world.pose
@@ -167,10 +170,11 @@ def test_signals_brake_and_hold(bench, number):
         for each, handler in handlers.items():
             signal.signal(each, handler)
     assert run.session.stopped
+    assert run.said == ["stopped"]
     assert bench.clock.now() < 3.0
     bench.wait(0.5)
     assert 0.1 < bench.world.pose[0] - start[0] < 0.25
-    assert_safe(run)
+    assert_braked(run)
 
 
 def test_a_dry_run_sends_nothing(world):
@@ -218,7 +222,7 @@ def test_asking_in_a_thread(bench):
     asker = InThread(gone)
     asker.ask({})
     asker._thread.join()
-    with pytest.raises(ServerGone, match="gone"):
+    with pytest.raises(PolicyError, match="gone"):
         asker.answer()
 
 

@@ -1,17 +1,21 @@
 """The control loop on the fake arm when the arm, the server or a camera fails."""
 
 import contextlib
+import types
 
 import numpy as np
 import pytest
+from websockets.exceptions import ConcurrencyError
 
 from lorasp_jax.extras.piper import session as sessions
 from lorasp_jax.extras.piper.cameras import NoPicture, Simulated
+from lorasp_jax.extras.piper.fake import frames
 from lorasp_jax.extras.piper.log import Log
 from lorasp_jax.extras.piper.options import Server
 from lorasp_jax.extras.piper.session import PERIOD
 from lorasp_jax.extras.serving.client import PolicyClient
-from tests.extras.piper.piper_runs import Run, Turning, assert_holds, assert_safe
+from lorasp_jax.extras.serving.wire import FrameError
+from tests.extras.piper.piper_runs import Run, Turning, assert_braked, assert_holds, assert_safe
 from tests.extras.serving.stand_in import StandIn, serving
 
 
@@ -147,6 +151,63 @@ def test_a_server_that_refuses(bench):
         run = Run(bench, lambda o: ask({**o, "prompt": 3}))
         assert "prompt must be text" in run(30.0)
     assert_holds(run, "prompt must be text")
+
+
+@pytest.mark.parametrize("error", [FrameError("bad"), TypeError("bad"), ConcurrencyError("bad")])
+def test_a_policy_that_raises_anything(bench, error):
+    run = Run(bench, ask := Turning())
+
+    def change(actions):
+        raise error
+
+    run.at = {0.3: lambda: setattr(ask, "change", change)}
+    assert run(30.0) == "bad"
+    assert run.said[1:] == ["moving slowly to the rest pose"]
+    assert_holds(run, "bad")
+
+
+@pytest.mark.parametrize("where", ["cameras", "recorder", "log", "done"])
+@pytest.mark.parametrize("error", [OSError("it broke"), KeyboardInterrupt("it broke")])
+def test_every_other_error_brakes_and_is_raised(bench, where, error):
+    broken = []
+
+    def work(*_):
+        if bench.clock.now() > due and not broken:
+            broken.append(where)
+            raise error
+        return where == "cameras" and bench.world.images()
+
+    due = bench.clock.now() + 0.45  # at full speed
+    part = {
+        "cameras": Simulated(work),
+        "recorder": types.SimpleNamespace(step=work),
+        "log": types.SimpleNamespace(observation=work, line=lambda *_, **__: work()),
+    }
+    run = Run(bench, Turning(), **{name: x for name, x in part.items() if name == where})
+    with pytest.raises(type(error), match="it broke"):
+        run(30.0, work if where == "done" else lambda: False)
+    assert run.said == ["holding: it broke"]
+    assert_braked(run)
+
+
+def test_a_closed_stdout_does_not_stop_the_brake(bench):
+    def say(sentence):
+        raise BrokenPipeError(sentence)
+
+    run = Run(bench, ask := Turning(), say=say)
+    run.at = {0.3: lambda: setattr(ask, "change", lambda actions: actions[:, :3])}
+    with pytest.raises(BrokenPipeError, match="actions must be numbers"):
+        run(30.0)
+    assert_braked(run)
+
+
+@pytest.mark.parametrize("kinds", [frames.JOINTS[:1], frames.DRIVERS])
+def test_a_kind_of_frame_that_stops(bench, kinds):
+    run = Run(bench, Turning())
+    run.at = {0.5: lambda: bench.lose(kinds)}
+    problem = run(5.0)
+    assert run.said == [f"holding: {problem}"]
+    assert_braked(run)
 
 
 def test_a_server_that_hangs(bench):

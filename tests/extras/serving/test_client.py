@@ -9,8 +9,10 @@ import time
 
 import numpy as np
 import pytest
+from websockets.sync.server import serve
 
-from lorasp_jax.extras.serving.client import PolicyClient, ServerGone
+from lorasp_jax.extras.serving import wire
+from lorasp_jax.extras.serving.client import PolicyClient, PolicyError, ServerGone
 from tests import ROOT
 from tests.extras.serving.stand_in import StandIn, connect, observation, serving
 
@@ -62,6 +64,23 @@ def test_a_late_reply_is_never_taken_for_the_next_one():
         policy.gate.set()
         with pytest.raises(ServerGone, match=r"the connection to .* is closed"):
             client.infer(observation())
+
+
+@pytest.mark.parametrize(
+    ("reply", "words"), [(b"\xc1", "malformed: the frame"), (wire.pack([1]), "a map, got a list")]
+)
+def test_a_malformed_reply_is_the_policys_error(reply, words):
+    def answer(socket):
+        socket.send(wire.pack({}))
+        socket.recv()
+        socket.send(reply)
+
+    with serve(answer, "127.0.0.1", 0, compression=None) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        address = f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
+        with PolicyClient(address) as client, pytest.raises(PolicyError, match=words):
+            client.infer({})
+        server.shutdown()
 
 
 def test_a_server_that_stops():

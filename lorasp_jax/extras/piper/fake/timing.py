@@ -4,6 +4,7 @@ import threading
 import time
 
 from lorasp_jax.extras.piper.arm import PiperArm
+from lorasp_jax.extras.piper.fake import frames
 from lorasp_jax.extras.piper.fake.firmware import PERIOD, FakePiper
 
 _PATIENCE = 5.0  # s of real time for the SDK's thread to read what the fake arm sent
@@ -44,7 +45,7 @@ class Lockstep:
             return
         _discard(self._arm)
         end = time.monotonic() + _PATIENCE
-        while self._arm.sdk.GetArmStatus().time_stamp != self._fake.stamp:
+        while self._arm.heard.get(frames.STATUS) != self._fake.time:
             if time.monotonic() > end:
                 raise TimeoutError("piper_sdk does not read the virtual bus")
             time.sleep(0)
