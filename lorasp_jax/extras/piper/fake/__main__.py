@@ -23,7 +23,7 @@ from lorasp_jax.extras.piper.cameras import Simulated
 from lorasp_jax.extras.piper.fake.demonstrator import Demonstrator
 from lorasp_jax.extras.piper.fake.firmware import PERIOD, FakePiper
 from lorasp_jax.extras.piper.fake.timing import Lockstep, RealTime
-from lorasp_jax.extras.piper.fake.world import Physics, World
+from lorasp_jax.extras.piper.fake.world import PhysicsGap, World
 from lorasp_jax.extras.piper.recording import Recording
 from lorasp_jax.extras.piper.session import Session
 from lorasp_jax.extras.serving.client import ServerGone
@@ -185,7 +185,7 @@ def _recorder(options: argparse.Namespace, world: World, size: int) -> Iterator[
             prompt=options.prompt or instructions[0],
             control_dt=options.control_dt,
             image_size=size,
-            physics_dt=Physics().timestep,
+            physics_dt=PhysicsGap().timestep,
         )
 
 

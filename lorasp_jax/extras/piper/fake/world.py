@@ -1,7 +1,7 @@
 """One of the project's tasks with the PiPER, simulated by MuJoCo's C engine.
 
 Cameras are rendered by the ray caster that policies were trained with, and the tasks' own tests
-judge success. Physics differ from training: the engine, its time step, gains, friction, damping.
+judge success. PhysicsGap differ from training: the engine, its time step, gains, friction, damping.
 """
 
 import functools
@@ -24,7 +24,7 @@ _MATRICES = ("geom_xmat", "cam_xmat", "xmat", "site_xmat")
 
 
 @dataclass(frozen=True)
-class Physics:
+class PhysicsGap:
     """How the fake arm's physics differ from the simulation's; all our choices.
 
     Attributes:
@@ -51,14 +51,16 @@ class World:
         instruction: the request in words.
     """
 
-    def __init__(self, task: str, *, image_size: int = 64, physics: Physics | None = None) -> None:
+    def __init__(
+        self, task: str, *, image_size: int = 64, physics: PhysicsGap | None = None
+    ) -> None:
         """Build a task's scene; call `reset` before anything else.
 
         Raises:
             ValueError: the task is unknown.
         """
         self.env: envs.Env = envs.make(task, robot="piper", num_envs=1, image_size=image_size)
-        self._physics = physics or Physics()
+        self._physics = physics or PhysicsGap()
         self._render = jax.jit(self.env.render)
         self._check = jax.jit(functools.partial(_check, self.env))
         self._lock = threading.Lock()  # the arm may live in a thread of its own
