@@ -15,7 +15,6 @@ from envs.cli import commands
 from envs.experts.collection import Record
 from envs.names import names
 from envs.scene import distractors
-from lorasp_jax.base import alarms
 from lorasp_jax.base import compilation_cache as cache
 from lorasp_jax.base.errors import parse_arguments, run_command
 
@@ -105,5 +104,4 @@ def finite(text: str) -> float:
 
 
 if __name__ == "__main__":
-    alarms.silence()
     sys.exit(main(sys.argv[1:]))

@@ -3,18 +3,7 @@
 All exist in JAX 0.10.2, 0.11.2 and 0.12.0.1.
 """
 
-from jax._src import compilation_cache, core, lru_cache, xla_bridge
-from jaxlib import utils
-
-FileCache = lru_cache.LRUCache
-"""JAX's file cache of compiled programs. By default, one process can read an entry that another is
-still writing, and no public setting changes this."""
-
-
-def use_file_cache(kind: type[FileCache]) -> None:
-    """Make JAX use this class for its cache; no public setting does this."""
-    compilation_cache.LRUCache = kind  # pyright: ignore[reportPrivateImportUsage]
-
+from jax._src import core, xla_bridge
 
 backends_are_initialized = xla_bridge.backends_are_initialized
 """Return whether XLA has read its flags. Public functions such as `jax.devices()` would start a
@@ -24,7 +13,3 @@ is_untraced = core.trace_state_clean
 """Return whether no JAX transformation is tracing the caller. `jax.core` has had no public name for
 this since 0.4.36. Without this check, a step inside a user's `jax.jit` would be announced as a
 compilation, and would get compiler options that JAX rejects there."""
-
-set_min_log_level = utils.absl_set_min_log_level
-"""Set the log level of JAX's C++ code, to silence XLA's alarms about slow compilation. Unlike
-TF_CPP_MIN_LOG_LEVEL, it can be changed after startup."""

@@ -69,10 +69,8 @@ def run(command: str, arguments: Sequence[str], program: str) -> NoReturn:
     """Run one of `COMMANDS` and exit with its exit code."""
     from rich.console import Console
 
-    from lorasp_jax.base import alarms
     from lorasp_jax.base.errors import report_error
 
-    alarms.silence()
     try:
         module = importlib.import_module(COMMANDS[command][0])
     except ModuleNotFoundError as error:

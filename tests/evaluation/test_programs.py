@@ -16,7 +16,6 @@ from envs.state import Data, State
 from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.base import fast_cpu
-from lorasp_jax.base.alarms import COMPILATION
 from lorasp_jax.config import EvaluationConfig
 from lorasp_jax.evaluation import make_rollout, programs
 from lorasp_jax.evaluation.programs import compiled_rollout, prepared, split_rollout
@@ -44,7 +43,12 @@ def compilations():
 
     def listen(event, duration, fun_name="", **_):
         name = fun_name.removeprefix("jit(").removesuffix(")")
-        if event == COMPILATION and name in {*POLICY, *WORLD, "_hold", "correct_action"}:
+        if event == "/jax/core/compile/backend_compile_duration" and name in {
+            *POLICY,
+            *WORLD,
+            "_hold",
+            "correct_action",
+        }:
             counts[name] = counts.get(name, 0) + 1
 
     monitoring.register_event_duration_secs_listener(listen)

@@ -1,7 +1,7 @@
 """One of the project's tasks with the PiPER, simulated by MuJoCo's C engine.
 
 Cameras are rendered by the ray caster that policies were trained with, and the tasks' own tests
-judge success. PhysicsGap differ from training: the engine, its time step, gains, friction, damping.
+judge success. Physics differ from training: the engine, its time step, gains, friction, damping.
 """
 
 import functools
