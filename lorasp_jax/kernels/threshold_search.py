@@ -27,7 +27,7 @@ class Boundary(NamedTuple):
 class Ratio(NamedTuple):
     """η in [0, 1] as numerator / denominator, exact in fp32 for decimals of up to 7 digits."""
 
-    numerator: float | jax.Array  # an array if η is traced
+    numerator: float
     denominator: float
 
 

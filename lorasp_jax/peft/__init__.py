@@ -10,22 +10,21 @@ import pkgutil
 from typing import Any
 
 from lorasp_jax.peft._aux import Aux
-from lorasp_jax.peft._fields import check_names, short
+from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Method
-from lorasp_jax.peft._settings import to_settings, upgrade
+from lorasp_jax.peft._settings import to_settings, without_removed
 from lorasp_jax.peft.ada_lora import AdaLoRA
 from lorasp_jax.peft.dora import DoRA
 from lorasp_jax.peft.full import FullFineTuning
 from lorasp_jax.peft.lora import LoRA
 from lorasp_jax.peft.lora_moe import LoRAMoE
-from lorasp_jax.peft.lora_sp import EnergySchedule, LoRASP
+from lorasp_jax.peft.lora_sp import LoRASP
 from lorasp_jax.peft.lora_sp_release import LoRASPRelease
 
 __all__ = [
     "AdaLoRA",
     "Aux",
     "DoRA",
-    "EnergySchedule",
     "FullFineTuning",
     "LoRA",
     "LoRAMoE",
@@ -72,15 +71,12 @@ def create(name: str, **fields: Any) -> Method:
 
 
 def from_settings(settings: Any) -> Method:
-    """Create a method from settings written by this or an earlier version of `to_settings`.
+    """Create a method from settings written by `to_settings`.
 
     Raises:
       ValueError: `settings` does not name a method, or `create` rejects it.
     """
     if not isinstance(settings, dict) or not isinstance(settings.get("method"), str):
         raise ValueError(f"adapter settings must name a method, got {short(settings)}")
-    fields = upgrade(settings)
-    if isinstance(schedule := fields.get("schedule"), dict):
-        check_names(EnergySchedule, "schedule", (), schedule)
-        fields["schedule"] = EnergySchedule(**schedule)
+    fields = without_removed(settings)
     return create(fields.pop("method"), **fields)

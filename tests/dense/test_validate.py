@@ -14,7 +14,7 @@ import lorasp_jax
 from lorasp_jax.adapters.adaptation import count, penalties
 from lorasp_jax.adapters.compress import calibration
 from lorasp_jax.dense import LinenDense
-from lorasp_jax.peft import AdaLoRA, EnergySchedule, LoRA, LoRAMoE, LoRASP
+from lorasp_jax.peft import AdaLoRA, LoRA, LoRAMoE, LoRASP
 
 X, KERNEL, KEY = jnp.ones((3, 5)), jnp.ones((5, 4)), jax.random.key(0)
 METHOD, MOE = LoRA(rank=2), LoRAMoE(rank=2, experts=2)
@@ -66,10 +66,6 @@ def with_kernel(value):
         (
             lambda: AdaLoRA(rank=2).transform(optax.sgd(0.1), 1.5),
             "total_steps must be an integer from 1 to 2147483647, got 1.5",
-        ),
-        (
-            lambda: LoRASP(schedule=EnergySchedule()).transform(optax.sgd(0.1), 0),
-            "total_steps must be an integer from 1",
         ),
         # Linen
         (lambda: LINEN.init(0, X), "key must be a PRNG key such as jax.random.key(0), got 0"),

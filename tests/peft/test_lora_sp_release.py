@@ -158,7 +158,7 @@ def test_z_loss_is_minus_infinity_at_the_clip():
         ({"rank": 0}, "rank must be at least 1, got 0"),
         ({"hidden_width": 0}, "hidden_width must be at least 1, got 0"),
         ({"energy_target": 1.5}, r"energy_target must lie in \(0, 1\], got 1.5"),
-        ({"granularity": "layer"}, "lora_sp_release has no field 'granularity'"),
+        ({"router": "gelu"}, "lora_sp_release has no field 'router'"),
     ],
 )
 def test_invalid_fields(fields, message):

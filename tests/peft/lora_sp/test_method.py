@@ -10,7 +10,7 @@ import pytest
 
 from lorasp_jax.kernels import rowwise_kernel
 from lorasp_jax.kernels.energy_gate import energy_gate
-from lorasp_jax.peft import EnergySchedule, LoRA, LoRASP
+from lorasp_jax.peft import LoRA, LoRASP
 from lorasp_jax.peft._shared_input import apply_shared_input
 from lorasp_jax.peft.lora_sp import bank, gpu_kernel, losses
 from lorasp_jax.peft.lora_sp.gpu_kernel import FusedBottleneck
@@ -226,7 +226,6 @@ def test_layers_with_a_shared_input_share_a_kernel(x):
         (LoRASP(hidden_width=8), ["energy_gate"]),
         (LoRASP.paper(rank=64), ["energy_gate"]),
         (LoRASP(rank=64, router="gelu_relu"), ["energy_gate"]),
-        (LoRASP(rank=64, schedule=EnergySchedule()), []),
     ],
 )
 def test_kernels_on_an_nvidia_gpu(x, method, kernels):
@@ -298,8 +297,6 @@ def test_nan_parameters_propagate(x, monkeypatch, path):
         ({"rank": 0}, "at least 1"),
         ({"hidden_width": 0}, "hidden_width must be at least 1, got 0"),
         ({"router": "relu"}, "router must be one of 'gelu', .*, 'softmax', got 'relu'"),
-        ({"granularity": "batch"}, "granularity must be one of 'token', 'sample', 'layer'"),
-        ({"schedule": 0.5}, "schedule must be EnergySchedule or None, got 0.5"),
     ],
 )
 def test_invalid_fields(fields, message):
