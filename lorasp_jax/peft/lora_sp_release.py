@@ -24,10 +24,10 @@ import jax
 import jax.numpy as jnp
 
 from lorasp_jax.kernels.energy_gate import kept_energy
-from lorasp_jax.peft._aux import Aux, masked_mean
-from lorasp_jax.peft._method import Params, kaiming_uniform
+from lorasp_jax.peft.auxiliary import Aux, masked_mean
 from lorasp_jax.peft.lora_sp.bank import BankMethod, apply_masked_scores, init_bank
 from lorasp_jax.peft.lora_sp.router import cast_and_clip, init_output_layer
+from lorasp_jax.peft.method import Params, kaiming_uniform
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,7 +24,7 @@ from envs.datasets.locks import acquire
 from envs.datasets.writing import TEMPORARY_SUFFIX, write_text
 from envs.scene.ranges import Randomization
 from lorasp_jax.config import Config
-from lorasp_jax.peft._settings import without_removed
+from lorasp_jax.peft.settings import without_removed
 from lorasp_jax.storage.digest import verify_digest, with_digest
 from lorasp_jax.storage.json_values import check
 from lorasp_jax.training import records

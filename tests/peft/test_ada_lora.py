@@ -1,6 +1,5 @@
 """Test AdaLoRA against Hugging Face PEFT, and properties of its rank allocation."""
 
-import dataclasses
 import json
 
 import jax
@@ -233,12 +232,10 @@ def test_too_few_steps():
         small(warmup=0.2, final=0.6).transform(optax.sgd(1.0), 1)
 
 
-def test_initial_gradients_and_parameter_count():
+def test_initial_gradients():
     method = small()
     params, kernel = method.init(jax.random.key(0), jnp.ones((4, 5)))
-    assert sum(leaf.size for leaf in jax.tree.leaves(params)) == (4 + 5 + 1) * 6
     x = jax.random.normal(jax.random.key(1), (3, 4))
     grads = jax.grad(lambda p: method.apply(p, x, kernel)[0].sum())(params)
     assert np.all(grads["lora_a"] == 0)  # e is zero
     assert np.any(grads["lora_e"] != 0)
-    assert dataclasses.replace(method) == method

@@ -20,6 +20,7 @@ NET = nnx.Dict(inp=nnx.Linear(5, 4, rngs=nnx.Rngs(0)))
         ({"lora_alpha": 8}, "did you mean 'alpha'?"),
         ({"rank": "8"}, "rank must be int, got '8'"),
         ({"rank": True}, "rank must be int, got True"),
+        ({"rank": 0}, "rank must be at least 1, got 0"),
         ({"rank": 1.5}, "rank must be int, got 1.5"),
         ({"rank": 10**12}, "rank must be at most 1048576"),
         ({"rank": -(10**12)}, "rank must be at least -2147483647"),

@@ -20,10 +20,10 @@ from lorasp_jax.adapters.compress.compaction import (
     replace_adapters,
 )
 from lorasp_jax.peft import Method
-from lorasp_jax.peft._fields import short
-from lorasp_jax.peft._method import Params
+from lorasp_jax.peft.fields import short
 from lorasp_jax.peft.lora_sp.bank import BankMethod
 from lorasp_jax.peft.lora_sp.gpu_kernel import supported_size
+from lorasp_jax.peft.method import Params
 
 
 def prune(

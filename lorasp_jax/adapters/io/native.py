@@ -25,7 +25,7 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdapterParam, validate
 from lorasp_jax.peft import Method, to_settings
-from lorasp_jax.peft._fields import short
+from lorasp_jax.peft.fields import short
 from lorasp_jax.storage import digest
 
 TENSORS, DESCRIPTION = "adapter.safetensors", "adapter.json"

@@ -17,7 +17,7 @@ from lorasp_jax.adapters.layers.einsum import (
 )
 from lorasp_jax.dense import cast_input
 from lorasp_jax.peft import Aux, Method
-from lorasp_jax.peft._method import dropout, dropout_rate
+from lorasp_jax.peft.method import dropout, dropout_rate
 
 
 def _general(layer: Any) -> tuple[str, str]:

@@ -7,9 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from lorasp_jax.kernels.energy_gate import exact_ratio
-from lorasp_jax.peft._method import Method, Params
-from lorasp_jax.peft._validate import Shapes
 from lorasp_jax.peft.lora_sp.router import clip
+from lorasp_jax.peft.method import Method, Params, Shapes
 
 Bank = dict[str, jax.Array]
 

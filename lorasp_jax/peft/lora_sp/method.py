@@ -20,12 +20,13 @@ import jax
 import jax.numpy as jnp
 
 from lorasp_jax.kernels.energy_gate import default_implementation, energy_gate, kept_energy
-from lorasp_jax.peft._aux import Aux
-from lorasp_jax.peft._method import Params, kaiming_uniform
+from lorasp_jax.kernels.low_rank_matmul import Bottleneck
+from lorasp_jax.peft.auxiliary import Aux
 from lorasp_jax.peft.lora_sp.bank import BankMethod, apply_masked_scores, init_bank
 from lorasp_jax.peft.lora_sp.gpu_kernel import FusedBottleneck
 from lorasp_jax.peft.lora_sp.losses import Losses, loss_sums
 from lorasp_jax.peft.lora_sp.router import Router, init_output_layer, router_scores
+from lorasp_jax.peft.method import Params, kaiming_uniform
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,11 +98,11 @@ class LoRASP(BankMethod):
         aux = Aux(active_rank, energy.reshape(tokens), Losses(sums), usage=sums.kept)
         return z.reshape(*tokens, self.rank), aux
 
-    def fused_kernel(self, params: Params) -> FusedBottleneck | None:
-        """A fused NVIDIA GPU kernel for the default router and gate; None if it does not apply."""
+    def implementation(self, params: Params) -> Bottleneck:
+        """A fused kernel on an NVIDIA GPU, for the default router and sizes that it supports."""
         num_scores = params["router"]["w2"].shape[-1]
         if self.router != "gelu" or default_implementation() != "pallas":
-            return None
+            return self
         sizes = self.rank, num_scores, self.hidden_width
         kernel = FusedBottleneck(*sizes, self.energy_target, self.scale)
-        return kernel if kernel.is_supported else None
+        return kernel if kernel.is_supported else self
