@@ -31,7 +31,7 @@ from rich.console import Console
 
 from benchmarks.measuring import best, machine, print_table
 from lorasp_jax import peft
-from lorasp_jax.dense import DenseLayer, apply_layers
+from lorasp_jax.dense import DenseLayer, dense_shared_input
 from lorasp_jax.kernels.energy_gate import energy_gate
 from lorasp_jax.kernels.frozen_matmul import Kernel, frozen_matmul
 from lorasp_jax.kernels.quantized_weights import quantize_kernel
@@ -121,7 +121,7 @@ def measure_shared_input(
 
         def grouped(params: Any, x: jax.Array, kernels: Any, method: Any = method) -> Any:
             pairs = zip(params, kernels, strict=True)
-            return apply_layers([DenseLayer(k, None, p, method) for p, k in pairs], x, None)
+            return dense_shared_input(x, [DenseLayer(k, None, p, method) for p, k in pairs])
 
         seconds = []
         for layers in (separate, grouped):

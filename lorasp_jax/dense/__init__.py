@@ -19,7 +19,6 @@ always returns (y, aux) and stores nothing.
 from lorasp_jax.dense.functional import (
     DenseLayer,
     apply_layer,
-    apply_layers,
     cast_input,
     dense,
     dense_shared_input,
@@ -46,7 +45,6 @@ __all__ = [
     "DropoutKey",
     "LinenDense",
     "apply_layer",
-    "apply_layers",
     "cast_input",
     "dense",
     "dense_shared_input",

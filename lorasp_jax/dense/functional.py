@@ -64,29 +64,6 @@ def dense(
     return apply_layer(layer, x, token_mask)
 
 
-def dense_shared_input(
-    x: jax.Array, layers: Sequence[DenseLayer], *, token_mask: jax.Array | None = None
-) -> list[tuple[jax.Array, Aux]]:
-    """`dense` for several layers with a shared input. Adapters of one method share one matmul.
-
-    Args:
-      x: [...tokens, I].
-      layers: arguments of `dense` for each layer.
-      token_mask: bool [...tokens].
-
-    Returns:
-      y and aux of each layer.
-
-    Raises:
-      ValueError: see `dense`.
-    """
-    layers = [DenseLayer(*layer) for layer in layers]
-    for layer in layers:
-        validate.layer(layer)
-        x = cast_input(x.dtype, x, layer.kernel, token_mask, layer.kernel.shape[0])
-    return apply_layers(layers, x, token_mask)
-
-
 def apply_layer(
     layer: DenseLayer, x: jax.Array, token_mask: jax.Array | None
 ) -> tuple[jax.Array, Aux]:
@@ -103,10 +80,21 @@ def apply_layer(
     return _with_bias(layer, x, result)
 
 
-def apply_layers(
-    layers: Sequence[DenseLayer], x: jax.Array, token_mask: jax.Array | None
+def dense_shared_input(
+    x: jax.Array, layers: Sequence[DenseLayer], *, token_mask: jax.Array | None = None
 ) -> list[tuple[jax.Array, Aux]]:
-    """Compute `dense_shared_input` without checks."""
+    """`dense` for several layers with a shared input, without its checks.
+
+    Layers with the same method and without dropout compute their down-projections in one matmul.
+
+    Args:
+        x: [...tokens, I], in the dtype to compute in.
+        layers: arguments of `dense` for each layer.
+        token_mask: bool [...tokens].
+
+    Returns:
+        y and aux of each layer.
+    """
     groups: dict[Bottleneck, list[tuple[int, Any, LowRankLayer]]] = {}
     results: dict[int, tuple[jax.Array, Aux]] = {}
     for i, layer in enumerate(layers):

@@ -53,6 +53,7 @@ class LinenDense(nn.Module):
         params = None
         if self.method is not None and not self.method.trains_base:
             params = self.variable("adapters", "adapter", self._init_adapter, kernel).value
+            validate.params(self.method, params, shape)
         x = cast_input(self.dtype, x, kernel, token_mask)
         use_dropout = params is not None and dropout_rate(self.method) and self.has_rng("dropout")
         key = self.make_rng("dropout") if use_dropout else None

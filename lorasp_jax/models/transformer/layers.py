@@ -9,7 +9,7 @@ import numpy as np
 from flax import nnx
 
 from lorasp_jax.adapters.layers.prepared import Layer, Prepared
-from lorasp_jax.dense import Dense, apply_layers, cast_input
+from lorasp_jax.dense import Dense, cast_input, dense_shared_input
 from lorasp_jax.peft import Aux
 
 LayerAux = dict[str, Aux]
@@ -128,7 +128,8 @@ def apply_to_shared_input(
     fused = []
     if len({layer.dtype for layer in dense}) == 1:
         arrays = [layer.arrays() for layer in dense]
-        fused = apply_layers(arrays, cast_input(dense[0].dtype, x, arrays[0].kernel), token_mask)
+        x_cast = cast_input(dense[0].dtype, x, arrays[0].kernel)
+        fused = dense_shared_input(x_cast, arrays, token_mask=token_mask)
     fused_results, results = iter(fused), []
     for layer in layers.values():
         if isinstance(layer, Prepared):
