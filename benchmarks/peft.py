@@ -31,10 +31,10 @@ from rich.console import Console
 
 from benchmarks.measuring import best, machine, print_table
 from lorasp_jax import peft
+from lorasp_jax.dense import DenseLayer, dense_shared_input
 from lorasp_jax.kernels.energy_gate import energy_gate
 from lorasp_jax.kernels.frozen_matmul import Kernel, frozen_matmul
 from lorasp_jax.kernels.quantized_weights import quantize_kernel
-from lorasp_jax.peft._shared_input import apply_shared_input
 
 SHAPES = ((2048, 16384), (16384, 2048), (2048, 2048), (1152, 4304))
 # Query, key and value projections of pi0's language model and vision tower; gate and up projections
@@ -120,9 +120,8 @@ def measure_shared_input(
             return [method.apply(p, x, k) for p, k in zip(params, kernels, strict=True)]
 
         def grouped(params: Any, x: jax.Array, kernels: Any, method: Any = method) -> Any:
-            return apply_shared_input(
-                [(method, *arrays) for arrays in zip(params, kernels, strict=True)], x
-            )
+            pairs = zip(params, kernels, strict=True)
+            return dense_shared_input(x, [DenseLayer(k, None, p, method) for p, k in pairs])
 
         seconds = []
         for layers in (separate, grouped):

@@ -39,6 +39,6 @@ from .peft import LoRA as LoRA
 from .peft import LoRAMoE as LoRAMoE
 from .peft import LoRASP as LoRASP
 from .peft import LoRASPRelease as LoRASPRelease
-from .peft._aux import auxiliary_losses as auxiliary_losses
+from .peft.auxiliary import auxiliary_losses as auxiliary_losses
 
 __version__: str

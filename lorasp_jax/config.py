@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from envs.scene.ranges import Randomization
-from lorasp_jax.peft import Method, _fields
+from lorasp_jax.peft import Method, fields
 
 SCALES = ("smoke", "cpu", "accelerator")
 MAX_NAME_BYTES = 200
@@ -75,7 +75,7 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         """Validate the fields."""
-        _fields.check_fields(self)
+        fields.check_fields(self)
         _at_least(0, self, "max_tokens", "chunk")
 
 
@@ -100,7 +100,7 @@ class DataConfig:
 
     def __post_init__(self) -> None:
         """Validate the fields."""
-        _fields.check_fields(self)
+        fields.check_fields(self)
         _at_least(1, self, "episodes", "num_envs")
         _at_least(0, self, "action_noise", "fresh_every")
         if self.fresh_every and self.source:
@@ -146,7 +146,7 @@ class OptimConfig:
 
     def __post_init__(self) -> None:
         """Validate the fields."""
-        _fields.check_fields(self)
+        fields.check_fields(self)
         _at_least(1, self, "steps", "batch_size", "accumulate", "max_skipped")
         _at_least(0, self, "learning_rate", "final_learning_rate", "warmup_steps")
         _at_least(0, self, "weight_decay", "state_noise", "rtc_max_delay")
@@ -177,7 +177,7 @@ class AuxiliaryConfig:
 
     def __post_init__(self) -> None:
         """Validate the fields."""
-        _fields.check_fields(self)
+        fields.check_fields(self)
         _at_least(0, self, "spectral", "balance", "z", "orthogonality")
         if not 0 <= self.warmup <= 1:
             raise ValueError(f"warmup must lie in [0, 1], got {self.warmup}")
@@ -208,7 +208,7 @@ class EvaluationConfig:
 
     def __post_init__(self) -> None:
         """Validate the fields."""
-        _fields.check_fields(self)
+        fields.check_fields(self)
         _at_least(1, self, "episodes", "num_envs", "execute_steps", "denoise_steps")
         if self.every < 0:
             raise ValueError(f"evaluation.every must be at least 0, got {self.every}")
@@ -274,9 +274,9 @@ class Config:
 
     def __post_init__(self) -> None:
         """Validate the fields and their combinations."""
-        _fields.check_fields(self)
-        _fields.check_fields(self.peft, "peft.")
-        _fields.check_fields(self.scene, "scene.")
+        fields.check_fields(self)
+        fields.check_fields(self.peft, "peft.")
+        fields.check_fields(self.scene, "scene.")
         _check_name(self.name)
         _at_least(1, self, "fsdp", "log_every", "checkpoint_every", "image_size")
         if self.control_dt <= 0 or not 0 <= self.seed < 2**32:

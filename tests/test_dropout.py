@@ -13,8 +13,8 @@ import lorasp_jax
 from lorasp_jax.adapters.io.native import load_adapters, save_adapters
 from lorasp_jax.dense import LinenDense
 from lorasp_jax.peft import AdaLoRA, DoRA, LoRA
-from lorasp_jax.peft._method import dropout
 from lorasp_jax.peft.dora import column_factor
+from lorasp_jax.peft.method import dropout
 from tests import nets
 from tests.test_scanned import EINSUMS, IDS, Llama
 

@@ -179,8 +179,7 @@ def _adapter() -> Cases:
         "methods/lin~0/rank": ["8", None, 0, -1, 1.5, NAN, [8], 4, 10**9],
         "methods/lin~0/energy_target": ["x", NAN, 2.0, None],
         "methods/lin~0/router": ["x", None, []],
-        "methods/lin~0/score_function": ["x", None, []],
-        "methods/lin~0/schedule": ["x", 1, [], {"strat": 1}, {"start": "x"}, {"start": 2}],
+        "methods/lin~0/schedule": ["x", 1, {"start": 0.5}],
         "methods/lin~0/unknown": [1],
     }
     yield from _escaped(values)

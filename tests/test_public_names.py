@@ -21,7 +21,7 @@ PUBLIC = {
         unmerge with_dropout
     """,
     "lorasp_jax.peft": """
-        AdaLoRA Aux DoRA EnergySchedule FullFineTuning LoRA LoRAMoE LoRASP LoRASPRelease Method
+        AdaLoRA Aux DoRA FullFineTuning LoRA LoRAMoE LoRASP LoRASPRelease Method
         create find from_settings names to_settings
     """,
     "lorasp_jax.models": """

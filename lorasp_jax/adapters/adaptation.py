@@ -29,9 +29,9 @@ from lorasp_jax.adapters import paths
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdaptedLayer, AdapterAux, AdapterParam, DropoutKey, validate
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
-from lorasp_jax.peft import FullFineTuning, Method, _validate
-from lorasp_jax.peft._fields import short
-from lorasp_jax.peft._method import Params, dropout_rate
+from lorasp_jax.peft import FullFineTuning, Method
+from lorasp_jax.peft.fields import checked_key, short
+from lorasp_jax.peft.method import Params, dropout_rate
 
 Model = TypeVar("Model", bound=nnx.Module)
 
@@ -113,7 +113,7 @@ def with_dropout(model: Model, key: jax.Array) -> Model:
       model: not modified; adapters without dropout are unaffected.
       key: typed PRNG key.
     """
-    root, key = _wrapped_copy(model), _validate.key(key)
+    root, key = _wrapped_copy(model), checked_key(key)
     for location in paths.unique(paths.locate(root, AdaptedLayer)):
         layer = location.child
         if isinstance(layer.adapter, AdapterParam) and dropout_rate(layer.method):

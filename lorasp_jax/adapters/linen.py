@@ -29,8 +29,9 @@ from lorasp_jax.adapters.layers.linen_layers import layer_call, supported_class,
 from lorasp_jax.adapters.layers.nnx_layers import Einsums
 from lorasp_jax.adapters.paths import Rules, check_method_rules, find_rule, no_match_message
 from lorasp_jax.dense import AUX_NAME, validate
-from lorasp_jax.peft import Method, _validate
-from lorasp_jax.peft._method import dropout_rate
+from lorasp_jax.peft import Method
+from lorasp_jax.peft.fields import checked_key
+from lorasp_jax.peft.method import dropout_rate
 
 ADAPTER = "lorasp_adapter"  # parameter name of an adapter in its layer
 # Marks the model's own scopes. Its code may apply other modules with separate variables, as Hugging
@@ -322,7 +323,7 @@ def _rngs(key: Any) -> dict[str, jax.Array]:
     rngs = dict(key) if isinstance(key, Mapping) else {"params": key}
     if "params" not in rngs:
         raise ValueError(f'rngs must have a key for "params", got {sorted(map(str, rngs))}')
-    return {name: _validate.key(value) for name, value in rngs.items()}
+    return {name: checked_key(value) for name, value in rngs.items()}
 
 
 def _is_model_module(module: nn.Module) -> bool:

@@ -11,7 +11,7 @@ from flax import nnx
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdaptedLayer
 from lorasp_jax.peft import Method
-from lorasp_jax.peft._fields import short
+from lorasp_jax.peft.fields import short
 
 Rules = Sequence[tuple[str, Method | None]]
 

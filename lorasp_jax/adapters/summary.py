@@ -12,7 +12,7 @@ from lorasp_jax.adapters.layers.nnx_layers import kernel_of
 from lorasp_jax.adapters.paths import EINSUMS_HINT, locate, locate_layers, locate_other_matrices
 from lorasp_jax.dense import AUX_NAME, AdapterAux, AdapterParam, validate
 from lorasp_jax.peft import Aux
-from lorasp_jax.peft._fields import short
+from lorasp_jax.peft.fields import short
 
 Row = tuple[str, ...]
 

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Literal
 
-from lorasp_jax.peft import _fields
+from lorasp_jax.peft import fields
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Keys:
     image_size: int = 0
 
     def __post_init__(self) -> None:
-        _fields.check_fields(self)
+        fields.check_fields(self)
         if not isinstance(self.cameras, Mapping):
             raise ValueError(f"cameras must be a mapping, name -> feature, got {self.cameras!r}")
         for name, feature in self.cameras.items():

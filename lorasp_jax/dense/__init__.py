@@ -16,7 +16,13 @@ A model that a jitted function captures in its closure stores no aux. `layer(x, 
 always returns (y, aux) and stores nothing.
 """
 
-from lorasp_jax.dense.functional import DenseLayer, cast_input, dense, dense_shared_input
+from lorasp_jax.dense.functional import (
+    DenseLayer,
+    apply_layer,
+    cast_input,
+    dense,
+    dense_shared_input,
+)
 from lorasp_jax.dense.layers import (
     AUX_NAME,
     AdaptedLayer,
@@ -38,6 +44,7 @@ __all__ = [
     "DenseLayer",
     "DropoutKey",
     "LinenDense",
+    "apply_layer",
     "cast_input",
     "dense",
     "dense_shared_input",

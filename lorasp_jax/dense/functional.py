@@ -1,19 +1,22 @@
 """An adapted dense layer on arrays, or several with a shared input."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax.typing import Dtype
 
 from lorasp_jax.dense import validate
 from lorasp_jax.kernels.frozen_matmul import frozen_matmul
+from lorasp_jax.kernels.low_rank_matmul import Bottleneck, LowRankLayer, low_rank_matmul
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
-from lorasp_jax.peft import Aux, Method, _validate
-from lorasp_jax.peft._method import Params
-from lorasp_jax.peft._shared_input import AdaptedKernel, apply_shared_input
+from lorasp_jax.peft import Aux, Method
+from lorasp_jax.peft.fields import short
+from lorasp_jax.peft.method import Params
 
 
 class DenseLayer(NamedTuple):
@@ -56,50 +59,64 @@ def dense(
         go together.
     """
     layer = DenseLayer(kernel, bias, params, method, dropout_key)
-    matrix = _checked_matrix(layer, x, token_mask)
-    if method is None or params is None:
+    validate.layer(layer)
+    x = cast_input(getattr(x, "dtype", None), x, kernel, token_mask, kernel.shape[0])
+    return apply_layer(layer, x, token_mask)
+
+
+def apply_layer(
+    layer: DenseLayer, x: jax.Array, token_mask: jax.Array | None
+) -> tuple[jax.Array, Aux]:
+    """Compute `dense` without checks."""
+    matrix, method = _matrix(layer), layer.method
+    if method is None or layer.params is None:
         result = _base(x, matrix), Aux()
-    elif dropout_key is not None:
-        result = method.apply_with_dropout(params, x, matrix, dropout_key, token_mask=token_mask)
+    elif layer.dropout_key is not None:
+        result = method.apply_with_dropout(
+            layer.params, x, matrix, layer.dropout_key, token_mask=token_mask
+        )
     else:
-        result = method.apply(params, x, matrix, token_mask=token_mask)
+        result = method.apply(layer.params, x, matrix, token_mask=token_mask)
     return _with_bias(layer, x, result)
 
 
 def dense_shared_input(
     x: jax.Array, layers: Sequence[DenseLayer], *, token_mask: jax.Array | None = None
 ) -> list[tuple[jax.Array, Aux]]:
-    """`dense` for several layers with a shared input. Adapters without dropout share one matmul.
+    """`dense` for several layers with a shared input, without its checks.
+
+    Layers with the same method and without dropout compute their down-projections in one matmul.
 
     Args:
-      x: [...tokens, I].
-      layers: arguments of `dense` for each layer.
-      token_mask: bool [...tokens].
+        x: [...tokens, I], in the dtype to compute in.
+        layers: arguments of `dense` for each layer.
+        token_mask: bool [...tokens].
 
     Returns:
-      y and aux of each layer.
-
-    Raises:
-      ValueError: see `dense`.
+        y and aux of each layer.
     """
-    layers = [DenseLayer(*layer) for layer in layers]
+    groups: dict[Bottleneck, list[tuple[int, Any, LowRankLayer]]] = {}
     results: dict[int, tuple[jax.Array, Aux]] = {}
-    adapted: dict[int, AdaptedKernel] = {}
     for i, layer in enumerate(layers):
-        if layer.method is None or layer.params is None or layer.dropout_key is not None:
-            results[i] = dense(x, *layer, token_mask=token_mask)
-        else:
-            adapted[i] = layer.method, layer.params, _checked_matrix(layer, x, token_mask)
-    adapted_results = apply_shared_input([*adapted.values()], x, token_mask=token_mask)
-    for i, result in zip(adapted, adapted_results, strict=True):
-        results[i] = _with_bias(layers[i], x, result)
+        has_sum = layer.params is not None and layer.dropout_key is None
+        method = layer.method if has_sum else None
+        if method is None or not method.is_low_rank_sum:
+            results[i] = apply_layer(layer, x, token_mask)
+            continue
+        arrays = method.low_rank_layer(layer.params, _matrix(layer))
+        member = i, method.rows_dtype(x.dtype), arrays
+        groups.setdefault(method.implementation(layer.params), []).append(member)
+    for f, members in groups.items():
+        indices, rows_dtypes, arrays = zip(*members, strict=True)
+        outputs = low_rank_matmul(f, rows_dtypes[0], list(arrays), x, token_mask)
+        for i, (y, aux) in zip(indices, outputs, strict=True):
+            aux = dataclasses.replace(aux, token_mask=token_mask)
+            results[i] = _with_bias(layers[i], x, (y, aux))
     return [results[i] for i in range(len(layers))]
 
 
-def _checked_matrix(layer: DenseLayer, x: jax.Array, token_mask: jax.Array | None) -> jax.Array:
-    """Validate layer, input and mask; return the kernel as a matrix [I, O]."""
-    _validate.tokens(x, token_mask)
-    validate.layer(layer, x.shape[-1])
+def _matrix(layer: DenseLayer) -> jax.Array:
+    """The kernel as a matrix [I, O]."""
     return layer.kernel.reshape(layer.kernel.shape[0], math.prod(layer.kernel.shape[1:]))
 
 
@@ -117,17 +134,46 @@ def _with_bias(
     return (y if layer.bias is None else y + layer.bias.astype(y.dtype)), aux
 
 
-def cast_input(dtype: Dtype | None, x: Any, kernel: Any) -> jax.Array:
-    """Cast x to the compute dtype; None promotes the dtypes of x and kernel.
+def cast_input(
+    dtype: Dtype | None,
+    x: Any,
+    kernel: Any,
+    token_mask: Any = None,
+    width: int | None = None,
+) -> jax.Array:
+    """Check a layer's input and mask, and cast x to the compute dtype.
+
+    Args:
+        dtype: compute dtype; None promotes the dtypes of x and kernel.
+        x: [...tokens, I].
+        kernel: the layer's kernel.
+        token_mask: bool [...tokens], or None.
+        width: I; None to not check it.
 
     Raises:
-      ValueError: x is not an array, or the dtypes cannot be promoted, as with 8-bit floating-point
-        kernels.
+        ValueError: x is not an array that can be cast to a floating-point dtype, or x or the mask
+            has the wrong shape.
     """
+    is_array = isinstance(x, jax.Array | np.ndarray) and x.ndim
+    if not is_array or not (x.dtype == bool or jnp.issubdtype(x.dtype, jnp.number)):
+        raise ValueError(f"x must be an array [...tokens, I], got {short(x)}")
     try:
-        return validate.array(x).astype(dtype or jnp.promote_types(x.dtype, kernel.dtype))
+        x = x.astype(dtype or jnp.promote_types(x.dtype, kernel.dtype))
     except jax.dtypes.TypePromotionError as error:
         raise ValueError(
             f"cannot promote {x.dtype} input and {kernel.dtype} kernel: pass a compute dtype, such "
             "as dtype=jnp.bfloat16"
         ) from error
+    if not jnp.issubdtype(x.dtype, jnp.floating):
+        raise ValueError(f"x must be a floating-point array [...tokens, I], got {short(x)}")
+    if width is not None and x.shape[-1] != width:
+        raise ValueError(
+            f"input width {x.shape[-1]} does not match kernel shape {list(kernel.shape)}"
+        )
+    if token_mask is not None:
+        actual = getattr(token_mask, "dtype", type(token_mask).__name__), np.shape(token_mask)
+        if actual != (bool, x.shape[:-1]):
+            raise ValueError(
+                f"token_mask must be bool {list(x.shape[:-1])}, got {actual[0]} {list(actual[1])}"
+            )
+    return x

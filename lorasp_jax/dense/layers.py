@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NoReturn
 
 import flax.errors
 import jax
@@ -11,11 +11,11 @@ from flax import nnx
 from flax.typing import Dtype, Initializer
 
 from lorasp_jax.dense import validate
-from lorasp_jax.dense.functional import DenseLayer, cast_input, dense
+from lorasp_jax.dense.functional import DenseLayer, apply_layer, cast_input
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import Aux, Method
-from lorasp_jax.peft._fields import short
-from lorasp_jax.peft._method import Params
+from lorasp_jax.peft.fields import short
+from lorasp_jax.peft.method import Params
 
 AUX_NAME = "stored_aux"
 KERNEL_INIT = jax.nn.initializers.lecun_normal()  # same as nnx.Linear and nn.Dense
@@ -29,12 +29,11 @@ class AdapterAux(nnx.Intermediate[Any]):
     """Aux of a drop-in layer's last call."""
 
 
-def reject_out_sharding(out_sharding: Any) -> None:
-    """Raise ValueError unless out_sharding is None. Some models pass it to every layer."""
-    if out_sharding is not None:
-        raise ValueError(
-            "adapted layers do not support out_sharding: constrain the output's sharding instead"
-        )
+def reject_out_sharding() -> NoReturn:
+    """Raise ValueError. Some models pass out_sharding to every layer."""
+    raise ValueError(
+        "adapted layers do not support out_sharding: constrain the output's sharding instead"
+    )
 
 
 class DropoutKey(nnx.Variable[Any]):
@@ -187,17 +186,16 @@ class Dense(AdaptedLayer):
         out_sharding: None = None,
     ) -> Any:
         """y [...tokens, O], or (y, aux) if `return_aux`; see `dense`. out_sharding must be None."""
-        reject_out_sharding(out_sharding)
-        y, aux = dense(self.cast_input(x), *self.arrays(), token_mask=token_mask)
+        if out_sharding is not None:
+            reject_out_sharding()
+        layer = self.arrays()
+        x = cast_input(self.dtype, x, layer.kernel, token_mask, layer.kernel.shape[0])
+        y, aux = apply_layer(layer, x, token_mask)
         if return_aux:
             return y, aux
         if self.adapter is not None:
             self.store_aux(aux)
         return y
-
-    def cast_input(self, x: jax.Array) -> jax.Array:
-        """Cast x to the compute dtype."""
-        return cast_input(self.dtype, x, self.kernel.get_value())
 
     def arrays(self) -> DenseLayer:
         """The layer's arguments for `dense` and `dense_shared_input`."""

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from flax.typing import Dtype, Initializer
 
 from lorasp_jax.dense import validate
-from lorasp_jax.dense.functional import cast_input, dense
+from lorasp_jax.dense.functional import DenseLayer, apply_layer, cast_input
 from lorasp_jax.dense.layers import AUX_NAME, KERNEL_INIT
 from lorasp_jax.peft import Method
-from lorasp_jax.peft._method import Params, dropout_rate
+from lorasp_jax.peft.method import Params, dropout_rate
 
 
 class LinenDense(nn.Module):
@@ -53,10 +53,11 @@ class LinenDense(nn.Module):
         params = None
         if self.method is not None and not self.method.trains_base:
             params = self.variable("adapters", "adapter", self._init_adapter, kernel).value
-        x = cast_input(self.dtype, x, kernel)
+            validate.params(self.method, params, shape)
+        x = cast_input(self.dtype, x, kernel, token_mask)
         use_dropout = params is not None and dropout_rate(self.method) and self.has_rng("dropout")
         key = self.make_rng("dropout") if use_dropout else None
-        y, aux = dense(x, kernel, bias, params, self.method, key, token_mask=token_mask)
+        y, aux = apply_layer(DenseLayer(kernel, bias, params, self.method, key), x, token_mask)
         if return_aux:
             return y, aux
         if params is not None:

@@ -1,5 +1,7 @@
 """Validate arguments before any computation."""
 
+import functools
+import math
 import os
 import pathlib
 from collections.abc import Mapping
@@ -10,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import linen, nnx
 
-from lorasp_jax.peft import Method, _fields, _validate
-from lorasp_jax.peft._fields import short
-from lorasp_jax.peft._method import MAX_SIZE
+from lorasp_jax.peft import Method
+from lorasp_jax.peft.fields import checked_key, positive_int, short
+from lorasp_jax.peft.method import MAX_SIZE, Shapes
 
 MAX_NAME_BYTES = 255
 """Maximum length of a file or folder name [bytes]."""
@@ -20,7 +22,7 @@ MAX_NAME_BYTES = 255
 
 def size(name: str, value: Any) -> int:
     """Return a width; raise ValueError unless it is an integer from 1 to `MAX_SIZE`."""
-    return _fields.positive_int(name, value, MAX_SIZE)
+    return positive_int(name, value, MAX_SIZE)
 
 
 def method(value: Any) -> Method | None:
@@ -63,13 +65,11 @@ def floating_dtype(name: str, dtype: Any) -> None:
         raise ValueError(f"{name} must be a floating-point dtype, got {short(dtype)}")
 
 
-def layer(arrays: Any, width: int) -> None:
-    """Raise ValueError unless a `DenseLayer` is consistent and accepts x [...tokens, width]."""
+def layer(arrays: Any) -> None:
+    """Raise ValueError unless the arrays, method and key of a `DenseLayer` fit together."""
     shape = getattr(arrays.kernel, "shape", ())
     if len(shape) < 2:
         raise ValueError(f"kernel must be an array [I, *O], got {short(arrays.kernel)}")
-    if width != shape[0]:
-        raise ValueError(f"input width {width} does not match kernel shape {list(shape)}")
     bias = tuple(getattr(arrays.bias, "shape", (0,) * len(shape)))
     trailing = zip(bias[::-1], shape[::-1], strict=False)
     if arrays.bias is not None and not (
@@ -79,8 +79,37 @@ def layer(arrays: Any, width: int) -> None:
     adapter_method = method(arrays.method)
     if (arrays.params is None) != (adapter_method is None or adapter_method.trains_base):
         raise ValueError("params and method must be given together")
+    if arrays.params is not None:
+        params(adapter_method, arrays.params, (shape[0], math.prod(shape[1:])))
     if arrays.dropout_key is not None:
-        _validate.key(arrays.dropout_key)
+        checked_key(arrays.dropout_key)
+
+
+def params(method: Any, values: Any, shape: tuple[int, ...]) -> None:
+    """Raise ValueError if the parameters do not fit the method and a kernel [I, O].
+
+    Without this check, parameters of a different rank could silently get the wrong scale.
+    """
+    actual = _shapes(values)
+    for name, expected in method.shapes(_initial_shapes(method, shape), actual).items():
+        if actual.get(name) != expected:
+            raise ValueError(
+                f"{method.name} for a kernel {list(shape)} needs {name} {list(expected)}, got "
+                f"{list(actual[name]) if name in actual else 'none'}"
+            )
+
+
+@functools.lru_cache(maxsize=1024)  # a model's layers share shapes and are traced repeatedly
+def _initial_shapes(method: Any, shape: tuple[int, ...]) -> Shapes:
+    return _shapes(jax.eval_shape(lambda: method.init_params(jax.random.key(0), *shape)))
+
+
+def _shapes(params: Any) -> Shapes:
+    leaves = jax.tree_util.tree_leaves_with_path(params)
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="/"): jnp.shape(leaf)
+        for path, leaf in leaves
+    }
 
 
 def module(model: Any) -> Any:

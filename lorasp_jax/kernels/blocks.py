@@ -1,7 +1,7 @@
-"""Operations on blocks of arrays inside Pallas kernels for Triton, for attention."""
+"""Launch parameters of Pallas kernels for Triton, and what attention kernels do with blocks."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,23 @@ import jax.numpy as jnp
 MASKED = -1e38
 """Logit of a masked key. Finite, so that a fully masked row gets a uniform softmax, not NaN."""
 LOG2_E = math.log2(math.e)
+
+
+class Launch(NamedTuple):
+    """Launch parameters of a kernel."""
+
+    rows: int
+    """Rows per block, a power of two: 1, or at least 16, the minimum dimension of a matmul in
+    Triton. In attention, a row is one query of one head."""
+    warps: int
+    """Warps per program."""
+    programs: int = 1
+    """Maximum number of programs that share the blocks: those of rows in a row-wise kernel, those
+    of keys in cached attention."""
+    keys: int = 0
+    """Keys per matmul in attention, a power of two, at least 16."""
+    stages: int = 1
+    """Stages of the software pipeline over blocks."""
 
 
 def load(ref: Any, at: tuple[Any, ...], exist: jax.Array | None) -> jax.Array:

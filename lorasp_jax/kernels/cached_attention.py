@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax.experimental import pallas as pl
 
-from lorasp_jax.kernels.blocks import LOG2_E, MASKED, load, matmul, store
+from lorasp_jax.kernels.blocks import LOG2_E, MASKED, Launch, load, matmul, store
 from lorasp_jax.kernels.row_sharding import by_rows
 
 KeysValues = tuple[jax.Array, jax.Array]
@@ -24,22 +24,8 @@ HEAD_DIMS = (16, 32, 64, 128, 256)
 """Supported head sizes."""
 
 
-class Launch(NamedTuple):
-    """Launch parameters."""
-
-    rows: int
-    """Rows per program, a power of two, at least 16. A row is one query of one head."""
-    keys: int
-    """Keys per matmul, a power of two, at least 16."""
-    splits: int
-    """Number of programs that share the keys of a block of rows, at most one per matmul."""
-    warps: int
-    """Warps per program."""
-    stages: int = 1
-    """Stages of the software pipeline over keys."""
-
-
-NARROW, WIDE, MAX_NARROW = Launch(32, 64, 4, 4), Launch(32, 128, 8, 8), 128
+NARROW = Launch(rows=32, keys=64, programs=4, warps=4)
+WIDE, MAX_NARROW = Launch(rows=32, keys=128, programs=8, warps=8), 128
 """Launch parameters for heads of up to MAX_NARROW dimensions, and for wider ones: the fastest of
 about ten each on an H200, for SmolVLA and pi0. They take 43 and 148 KiB of shared memory."""
 
@@ -97,7 +83,7 @@ def cached_attention(
     num_own = 0 if own is None else tokens
     cached_blocks, own_blocks = (pl.cdiv(count, launch.keys) for count in (cached, num_own))
     blocks = cached_blocks + own_blocks
-    per_program = pl.cdiv(blocks, launch.splits)
+    per_program = pl.cdiv(blocks, launch.programs)
     size = _Size(heads, kv_heads, cached, num_own, cached_blocks, blocks, per_program)
     # XLA computes all that belongs to these tokens, with RoPE, in one kernel.
     tokens_array = q if own is None else jnp.concatenate([q, *own], axis=2)
@@ -161,6 +147,7 @@ class _Keys(NamedTuple):
         is_own = jnp.asarray(block >= size.cached_blocks)
         own = is_own.astype(jnp.int32)
         index = (block - own * size.cached_blocks) * width + jnp.arange(width)
+        # The number of own or of cached keys, without a branch on the traced `is_own`.
         exist = index < size.cached + own * (size.own - size.cached)
         return cls(is_own, own * size.cached, index, exist)
 
@@ -176,6 +163,7 @@ class _Keys(NamedTuple):
         def cached() -> list[jax.Array]:
             return [load(ref, (batch, index, head, column), exist) for ref in cache_refs]
 
+        # A branch, not a select: only one of the two is read from memory.
         return jax.lax.cond(self.is_own, own, cached) if size.own else cached()
 
 
@@ -193,6 +181,7 @@ def _kernel(
     """Attend from one block of rows to some blocks of keys (online softmax)."""
     batch, group, dim = pl.program_id(2), size.heads // size.kv_heads, y_ref.shape[-1]
     kv_head, split = pl.program_id(1) // size.splits, pl.program_id(1) % size.splits
+    # The query heads of one key head are rows of one block, so that they share its keys.
     row = pl.program_id(0) * launch.rows + jnp.arange(launch.rows)
     token, head = row // group, kv_head * group + row % group
     exists = token < tokens_ref.shape[1]
@@ -207,15 +196,18 @@ def _kernel(
         is_attended = load(mask_ref, mask_at, exists[:, None] & keys.exist[None]) != 0
         logits = jnp.where(is_attended, matmul(q, k, (1, 1)) * LOG2_E, MASKED)
         logits = jnp.where(keys.exist[None], logits, -jnp.inf)
+        # Online softmax: scale what has been summed so far down to the new maximum.
         new_top = jnp.maximum(top, logits.max(1))
         weights, rescale = jnp.exp2(logits - new_top[:, None]), jnp.exp2(top - new_top)
         y = rescale[:, None] * y + matmul(weights.astype(v.dtype), v, (1, 0))
         return new_top, rescale * total + weights.sum(1), y
 
     zeros = jnp.zeros(launch.rows, jnp.float32)
+    # Below every logit, but finite: -inf minus -inf would be NaN.
     state = (zeros + 2 * MASKED, zeros, jnp.zeros((launch.rows, dim), jnp.float32))
     count = jnp.minimum(size.blocks - split * size.per_program, size.per_program)
     top, total, y = jax.lax.fori_loop(0, count, block, state)
+    # Unnormalized: `_combine` needs the maximum and the total of every split.
     at = (batch, split, token, head)
     store(top_ref, at, top, exists)
     store(total_ref, at, total, exists)

@@ -3,8 +3,6 @@
 For scores s >= 0, let E_k be the fraction of the energy Σ s² in the k largest scores (paper eq.
 12). The gate keeps the smallest k with E_k >= η; ties go to the lowest index. Implementations:
 
-- "pairwise": for each direction, sum the energy of all directions that rank before it. O(R²),
-  vectorized over rows and R; fastest on a CPU for small R.
 - "sort": sort the scores, accumulate energy, threshold. The reference; in rare cases, rounding of
   its cumulative sum changes whether η is reached.
 - "bisection": binary search for the threshold, one bit per step, without a sort.
@@ -32,7 +30,6 @@ from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.experimental import pallas as pl
 
 from lorasp_jax.kernels.platform import platform
@@ -46,15 +43,11 @@ from lorasp_jax.kernels.threshold_search import (
     float_bits,
 )
 
-Implementation = Literal["pairwise", "sort", "bisection", "block", "pallas"]
+Implementation = Literal["sort", "bisection", "block", "pallas"]
 
 MIN_TARGET = 2.0**-64
 """A smaller η could underflow in fp32 and is raised to this value. Both keep one direction, because
 no bank has 2^64."""
-
-PAIRWISE_RANK = 32
-"""Largest R at which "pairwise" is the default on CPU. Above it, "bisection" is faster (on two
-cores)."""
 
 
 def exact_ratio(energy_target: float) -> Ratio:
@@ -89,7 +82,7 @@ def energy_gate(
     Args:
       scores: [..., R], non-negative, cast to fp32. For negative scores the magnitude is used.
       energy_target: η in (0, 1], a Python number, interpreted as an exact decimal.
-      implementation: see the module docstring; None for `default_implementation(R)`.
+      implementation: see the module docstring; None for `default_implementation()`.
       interpret: run "pallas" without a GPU, slowly.
 
     Returns:
@@ -99,7 +92,7 @@ def energy_gate(
       ValueError: η outside (0, 1] or an unknown implementation.
     """
     ratio = exact_ratio(energy_target)
-    name = implementation or default_implementation(scores.shape[-1])
+    name = implementation or default_implementation()
     compute_mask = _mask_function(name, interpret)
     scores = scores.astype(jnp.float32)
     constant = jnp.abs(jax.lax.stop_gradient(scores))  # also clears the sign bit of -0
@@ -108,12 +101,9 @@ def energy_gate(
     return mask, mask.sum(-1).astype(jnp.float32), kept_energy(scores, mask)
 
 
-def default_implementation(rank: int) -> Implementation:
-    """Choose "pallas" on GPU, "pairwise" for small banks on CPU, else "bisection"."""
-    backend = platform()
-    if backend == "cpu" and rank <= PAIRWISE_RANK:
-        return "pairwise"
-    return "pallas" if backend == "gpu" else "bisection"
+def default_implementation() -> Implementation:
+    """Choose "pallas" on GPU, else "bisection"."""
+    return "pallas" if platform() == "gpu" else "bisection"
 
 
 def kept_flags(scores: jax.Array, energy_target: float) -> jax.Array:
@@ -146,7 +136,6 @@ def _positive_flags(scores: jax.Array) -> jax.Array:
 def _mask_function(implementation: str, interpret: bool) -> Callable[[jax.Array, Ratio], jax.Array]:
     """Return the function that maps scores [..., R] and η to the mask."""
     masks = {
-        "pairwise": _pairwise_mask,
         "bisection": bisected_mask,
         "block": lambda scores, ratio: _block_flags(scores, ratio) != 0,
     }
@@ -173,21 +162,6 @@ def _mask_function(implementation: str, interpret: bool) -> Callable[[jax.Array,
 def positive(scores: jax.Array) -> jax.Array:
     """Return the mask at η = 1, bool [..., R]: positive scores, except in rows with NaN."""
     return (scores > 0) & (scores.sum(-1, keepdims=True) > 0)
-
-
-def _pairwise_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
-    """Keep each positive score if those that rank before it fall short of the energy target."""
-    energy = energies(scores)
-    position = np.arange(scores.shape[-1])
-
-    def add(j: jax.Array, before: jax.Array) -> jax.Array:
-        score_j, energy_j = (jax.lax.dynamic_index_in_dim(a, j, -1) for a in (scores, energy))
-        ranks_first = (score_j > scores) | ((score_j == scores) & (j < position))
-        return before + jnp.where(ranks_first, energy_j, 0)
-
-    before = jax.lax.fori_loop(0, scores.shape[-1], add, jnp.zeros_like(scores))
-    target = ratio.numerator * energy.sum(-1, keepdims=True)
-    return (ratio.denominator * before < target) & (scores > 0)
 
 
 def kept_mask(scores: jax.Array, last: Boundary) -> jax.Array:

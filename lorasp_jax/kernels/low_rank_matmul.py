@@ -22,7 +22,7 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,20 +33,16 @@ from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.kernels.rematerialization import save_for_backward
 
 
-class Bottleneck(Protocol):
-    """f of one layer; must be hashable."""
+class Bottleneck:
+    """f of layers with a shared input. Hashable; objects that compare equal compute the same f."""
 
     def bottleneck(
         self, params: Any, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Any]:
         """Return z [..., R] and a pytree of auxiliary outputs, from projected rows [..., Q]."""
-        ...
+        raise NotImplementedError
 
-
-class BottleneckEach(Protocol):
-    """f of several layers in one call; must be hashable."""
-
-    def bottleneck_each(
+    def bottlenecks(
         self,
         params: Sequence[Any],
         projected: jax.Array,
@@ -56,15 +52,41 @@ class BottleneckEach(Protocol):
         """Return z and the auxiliary outputs of each layer.
 
         Args:
-          params: parameters of each layer.
-          projected: projected rows of all layers, concatenated, possibly with trailing padding.
-          widths: Q of each layer.
-          token_mask: bool [...tokens] or None.
+            params: parameters of each layer.
+            projected: projected rows of all layers, concatenated, possibly with trailing padding.
+            widths: Q of each layer.
+            token_mask: bool [...tokens] or None.
         """
-        ...
+        each = jnp.split(projected, _ends(widths), axis=-1)[:-1]
+        calls = zip(params, each, strict=True)
+        return [_traced_once(self)(p, rows, token_mask) for p, rows in calls]
 
+    def pack(self, params: Any) -> Any:
+        """Convert a layer's parameters to the form that `stacked_bottlenecks` expects."""
+        return params
 
-Methods = tuple[Bottleneck, ...] | BottleneckEach
+    def stacked_bottlenecks(
+        self, params: Any, projected: jax.Array, columns: range, token_mask: jax.Array | None
+    ) -> tuple[jax.Array, Any]:
+        """`bottlenecks` of n layers whose parameters are stacked, here with `jax.vmap`.
+
+        Args:
+            params: from `pack`, stacked [n, ...].
+            projected: [...tokens, C], contains the projected rows of all layers.
+            columns: start column of each layer in `projected`. The step is Q.
+            token_mask: bool [...tokens] or None.
+
+        Returns:
+            z of all layers, concatenated to [...tokens, n R], and auxiliary outputs [n, ...].
+        """
+        tokens, (n, width) = projected.shape[:-1], (len(columns), columns.step)
+        rows = projected[..., columns.start : columns.stop].reshape(*tokens, n, width)
+
+        def single_layer(params: Any, rows: jax.Array) -> tuple[jax.Array, Any]:
+            return self.bottleneck(params, rows, token_mask)
+
+        z, aux = jax.vmap(single_layer, in_axes=(0, -2), out_axes=(-2, 0))(params, rows)
+        return z.reshape(*tokens, n * z.shape[-1]), aux
 
 
 class LowRankLayer(NamedTuple):
@@ -84,7 +106,7 @@ class LowRankLayer(NamedTuple):
 @functools.partial(jax.jit, static_argnums=(0, 1))
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def low_rank_matmul(
-    methods: Methods,
+    f: Bottleneck,
     rows_dtype: Any,
     layers: Sequence[LowRankLayer],
     x: jax.Array,
@@ -93,56 +115,46 @@ def low_rank_matmul(
     """Return (x W + z U, aux) of each layer, where z, aux = f(params, x P, token_mask).
 
     Args:
-      methods: a tuple with the f of each layer, or one object for all layers; objects that compare
-        equal must compute the same f.
+      f: computes z of all layers.
       rows_dtype: dtype of x P, which is accumulated in fp32.
       layers: the arrays of each layer.
       x: [..., I]; the outputs have its dtype.
-      token_mask: bool [...tokens] or None, passed to each f.
+      token_mask: bool [...tokens] or None, passed to f.
     """
-    projected = jnp.matmul(x, _concat_downs(layers, x), preferred_element_type=rows_dtype)
-    params, widths = [layer.params for layer in layers], _widths(layers)
-    if isinstance(methods, tuple):
-        calls = zip(methods, params, _split(widths, projected), strict=True)
-        z_aux = [_traced_once(method)(p, rows, token_mask) for method, p, rows in calls]
-    else:
-        z_aux = methods.bottleneck_each(params, projected, widths, token_mask)
+    projected = jnp.matmul(x, _concat_downs(layers, x.dtype), preferred_element_type=rows_dtype)
+    params = [layer.params for layer in layers]
+    return _outputs(layers, x, f.bottlenecks(params, projected, _widths(layers), token_mask))
+
+
+@functools.cache
+def _traced_once(f: Bottleneck) -> Callable[..., tuple[jax.Array, Any]]:
+    """Return f, traced once for all layers for which it has equal shapes."""
+    return jax.jit(f.bottleneck, inline=True)
+
+
+def _outputs(
+    layers: Sequence[LowRankLayer], x: jax.Array, z_aux: Sequence[tuple[jax.Array, Any]]
+) -> list[tuple[jax.Array, Any]]:
     return [
         (base_plus_low_rank(x, z, layer.kernel, layer.up), aux)
         for layer, (z, aux) in zip(layers, z_aux, strict=True)
     ]
 
 
-@functools.cache
-def _traced_once(method: Bottleneck) -> Callable[..., tuple[jax.Array, Any]]:
-    """Return f, traced once for all layers for which it has equal shapes."""
-    return jax.jit(method.bottleneck, inline=True)
-
-
 def _forward(
-    methods: Methods,
+    f: Bottleneck,
     rows_dtype: Any,
     layers: Sequence[LowRankLayer],
     x: jax.Array,
     token_mask: jax.Array | None,
 ) -> tuple:
-    widths = _widths(layers)
-    projected = jnp.matmul(x, _concat_downs(layers, x), preferred_element_type=rows_dtype)
-
     def inner(params: list[Any], projected: jax.Array) -> list[tuple[jax.Array, Any]]:
-        if isinstance(methods, tuple):
-            calls = zip(methods, params, _split(widths, projected), strict=True)
-            z_aux = [_traced_once(method)(p, rows, token_mask) for method, p, rows in calls]
-        else:
-            z_aux = methods.bottleneck_each(params, projected, widths, token_mask)
+        z_aux = f.bottlenecks(params, projected, _widths(layers), token_mask)
         return [(z.astype(x.dtype), aux) for z, aux in z_aux]
 
+    projected = jnp.matmul(x, _concat_downs(layers, x.dtype), preferred_element_type=rows_dtype)
     z_aux, vjp = jax.vjp(inner, [layer.params for layer in layers], projected)
-    outputs = [
-        (base_plus_low_rank(x, z, layer.kernel, layer.up), aux)
-        for layer, (z, aux) in zip(layers, z_aux, strict=True)
-    ]
-    return outputs, (layers, x, vjp, [z for z, _ in z_aux])
+    return _outputs(layers, x, z_aux), (layers, x, vjp, [z for z, _ in z_aux])
 
 
 def base_plus_low_rank(
@@ -157,9 +169,9 @@ def base_plus_low_rank(
 
 
 def _backward(
-    methods: Methods, rows_dtype: Any, residuals: tuple, cotangents: Sequence[tuple]
+    f: Bottleneck, rows_dtype: Any, residuals: tuple, cotangents: Sequence[tuple]
 ) -> tuple:
-    del methods, rows_dtype
+    del f, rows_dtype
     layers, x, vjp, z_of_layers = residuals
     gradients = [g for g, _ in cotangents]
     base_input_grads, dz_aux = [], []
@@ -174,7 +186,7 @@ def _backward(
     d_params, d_projected = vjp(dz_aux)
     q = d_projected.astype(x.dtype)
     dx = _input_gradient(layers, x, gradients, base_input_grads, q)
-    d_downs = _split(_widths(layers), _outer(x, q, layers[0].down.dtype))
+    d_downs = jnp.split(_outer(x, q, layers[0].down.dtype), _ends(_widths(layers)), axis=-1)[:-1]
     d_layers = [
         LowRankLayer(d_param, None, d_down, _outer(z, g, layer.up.dtype))
         for layer, d_param, d_down, z, g in zip(
@@ -192,7 +204,11 @@ def _input_gradient(
     q: jax.Array,
 ) -> jax.Array:
     """Compute Σ g Wᵀ + q Pᵀ, [..., I]; `base_input_grads` holds each g Wᵀ if already computed."""
-    p, kernels, d_in = _concat_downs(layers, x), [layer.kernel for layer in layers], x.shape[-1]
+    p, kernels, d_in = (
+        _concat_downs(layers, x.dtype),
+        [layer.kernel for layer in layers],
+        x.shape[-1],
+    )
     is_narrow = sum(g.shape[-1] for g in gradients) <= d_in
     pairs = list(zip(gradients, kernels, strict=True))
     if is_narrow and all(_should_concat(kernel, g, d_in) for g, kernel in pairs):
@@ -214,9 +230,9 @@ def _should_concat(kernel: jax.Array | QuantizedKernel, x: jax.Array, width: int
     return has_many_rows and platform() != "cpu" and not uses_float8(kernel, rows, width)
 
 
-def _concat_downs(layers: Sequence[LowRankLayer], x: jax.Array) -> jax.Array:
+def _concat_downs(layers: Sequence[LowRankLayer], dtype: Any) -> jax.Array:
     """Concatenate the P of all layers, [I, ΣQ], padded, in the dtype of x."""
-    return pad_columns(jnp.concatenate([layer.down.astype(x.dtype) for layer in layers], axis=1))
+    return pad_columns(jnp.concatenate([layer.down.astype(dtype) for layer in layers], axis=1))
 
 
 def _widths(layers: Sequence[LowRankLayer]) -> list[int]:
@@ -224,9 +240,9 @@ def _widths(layers: Sequence[LowRankLayer]) -> list[int]:
     return [layer.down.shape[1] for layer in layers]
 
 
-def _split(widths: Sequence[int], columns: jax.Array) -> list[jax.Array]:
-    """Split [..., at least ΣQ] into the columns [..., Q] of each layer, without the padding."""
-    return jnp.split(columns, list(itertools.accumulate(widths)), axis=-1)[:-1]
+def _ends(widths: Sequence[int]) -> list[int]:
+    """Return the column after the last one of each layer; only padding follows the last layer's."""
+    return list(itertools.accumulate(widths))
 
 
 def pad_columns(matrix: jax.Array) -> jax.Array:

@@ -20,21 +20,10 @@ import jax
 import jax.numpy as jnp
 from jax.experimental import pallas as pl
 
+from lorasp_jax.kernels.blocks import Launch
 from lorasp_jax.kernels.packing import PackedTree, spans
 from lorasp_jax.kernels.rematerialization import save_for_backward
 from lorasp_jax.kernels.row_sharding import by_rows
-
-
-class Launch(NamedTuple):
-    """Launch parameters of a kernel."""
-
-    rows: int
-    """Rows per block: 1, or at least 16, the minimum dimension of a matmul in Triton."""
-    warps: int
-    """Warps per program."""
-    programs: int
-    """Number of programs per function, if there are as many blocks. Each writes partial sums."""
-
 
 FORWARD = Launch(16, 2, 1056)
 BACKWARD = Launch(16, 4, 264)
@@ -108,7 +97,7 @@ def rowwise_kernel(
     """
     launches = (FEW, FEW) if len(rows) <= FEW_ROWS else (FORWARD, BACKWARD)
     packed, valid = PackedTree.of(shared), valid.astype(jnp.int8)
-    single = packed.values.ndim == 1
+    single = packed.values.ndim == 1  # one function: treat it as a stack of one
     packed = dataclasses.replace(packed, values=jnp.atleast_2d(packed.values))
     results: Any = _rowwise((function, widths, start, launches, interpret), packed, rows, valid)
     output, sums, statistics = results
@@ -157,6 +146,7 @@ def _backward(static: tuple, residuals: tuple, cotangents: tuple) -> tuple:
         def differentiable(shared: Any, columns: Columns) -> tuple:
             return function(shared, columns, valid != 0, _unpack_bits(mask))[:2]
 
+        # Recompute the block instead of storing its residuals; the stored mask saves the search.
         _, vjp = jax.vjp(differentiable, shared, columns)
         d_shared, d_columns = vjp((d_output, d_sums))
         return [d_columns], d_shared
@@ -164,8 +154,10 @@ def _backward(static: tuple, residuals: tuple, cotangents: tuple) -> tuple:
     sizes = [array.shape[1] // len(packed.values) for array in (mask, d_output)]
     inputs = [Operand(rows, widths, start, sum(widths)), Operand(valid, (1,))]
     inputs += [Operand(a, (w,), stride=w) for a, w in zip((mask, d_output), sizes, strict=True)]
+    # The gradients of the sums are the same for all rows, as the shared arrays are.
     constants = PackedTree.of((packed.tree(), d_sums), axes=1)
     (d_rows,), d_packed = _map_blocks(block, constants, inputs, launch, interpret)
+    # Columns outside the functions' own get no gradient.
     unused = rows.shape[1] - start - d_rows.shape[1]
     return d_packed, jnp.pad(d_rows, ((0, 0), (start, unused))), None
 
@@ -190,6 +182,7 @@ def _map_blocks(
     body: Body, shared: PackedTree, inputs: list[Operand], launch: Launch, interpret: bool
 ) -> tuple[Sequence[jax.Array], PackedTree]:
     """Run body(shared, *input columns) -> (output columns, sums) on all blocks, in one kernel."""
+    # The body's results on one block give the layout of all outputs.
     columns, sums = jax.eval_shape(
         lambda values, *columns: body(dataclasses.replace(shared, values=values).tree(), *columns),
         shared.values[0],
@@ -218,6 +211,7 @@ def _call(
     from jax.experimental.pallas import triton  # absent from builds without NVIDIA support
 
     (values,), launch, num_rows = shared, blocks.launch, len(arrays[0])
+    # Whole blocks only; padded rows are not valid, so they add nothing to the sums.
     arrays = [jnp.pad(array, ((0, -num_rows % launch.rows), (0, 0))) for array in arrays]
     num_blocks, num_functions = len(arrays[0]) // launch.rows, len(values)
     programs = min(launch.programs, num_blocks)
@@ -238,6 +232,7 @@ def _call(
 def _pack_bits(mask: jax.Array) -> jax.Array:
     """Pack 0 and 1, int32 [n, K], into bits, uint8 [n, K / 8]."""
     rows, width = mask.shape
+    # Bit b of byte j is entry b K/8 + j, so that a sum over an axis packs the bits.
     bits = mask.reshape(rows, 8, width // 8)
     return jax.lax.shift_left(bits, _bit_numbers(bits)).sum(1, dtype=jnp.int32).astype(jnp.uint8)
 
@@ -268,10 +263,12 @@ def _kernel(
 ) -> None:
     """Run one program: every `programs`-th block of one function."""
     program, function = pl.program_id(0), pl.program_id(1)
+    # Loaded once, before the loop over the program's blocks.
     shared = blocks.shared_tree(lambda *span: shared_ref[function, pl.ds(*span)])
     num_rows = blocks.launch.rows
 
     def block(i: jax.Array, sums: Any) -> Any:
+        # Programs take blocks in turn, so that their numbers of blocks differ by one at most.
         at = pl.ds((program + i * programs) * num_rows, num_rows)
         loaded = [
             [ref[at, pl.ds(*span)] for span in operand.spans(function)]
@@ -284,6 +281,7 @@ def _kernel(
         return jax.tree.map(jnp.add, sums, block_sums)
 
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), blocks.sums)
+    # Sums stay in registers until the last block: no atomics, and the order is fixed.
     count = pl.cdiv(num_blocks - program, programs)
     leaves = jax.tree.leaves(jax.lax.fori_loop(0, count, block, zeros))
     for span, leaf in zip(spans(tuple(leaf.size for leaf in leaves)), leaves, strict=True):

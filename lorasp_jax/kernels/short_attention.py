@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jax.experimental import pallas as pl
 
-from lorasp_jax.kernels.blocks import LOG2_E, MASKED, load, matmul, store
+from lorasp_jax.kernels.blocks import LOG2_E, MASKED, Launch, load, matmul, store
 from lorasp_jax.kernels.rematerialization import save_for_backward
 from lorasp_jax.kernels.row_sharding import by_rows
 
@@ -33,19 +33,6 @@ MAX_KEY_ELEMENTS = 8192
 """Maximum number of keys times head size in general use. Up to here, the backward pass needs at
 most 88 KiB of shared memory on GPUs with 99 KiB, compiled with Triton 3.9; twice as many need 120.
 """
-
-
-class Launch(NamedTuple):
-    """Launch parameters of a kernel."""
-
-    rows: int
-    """Rows per block, a power of two, at least 16. A row is one query of one head."""
-    keys: int
-    """Maximum number of keys per matmul, a power of two, at least 16."""
-    warps: int
-    """Warps per program."""
-    stages: int = 1
-    """Stages of the software pipeline over blocks."""
 
 
 FORWARD = Launch(rows=64, keys=128, warps=4)
@@ -228,16 +215,20 @@ def _forward_kernel(launch: Launch, q_ref: Any, k_ref: Any, v_ref: Any, *others:
     q = rows.load(q_ref)
     logits = []
     for keys in chunks:
+        # In base 2, since the GPU has an instruction for 2^x and not for e^x.
         x = matmul(q, keys.load(k_ref), (1, 1)) * LOG2_E
         for ref in mask_ref:
             x = jnp.where(_load_mask(ref, rows, keys), x, MASKED)
+        # -inf for keys that do not exist: even a fully masked row gives them no weight.
         logits.append(x if keys.exist is None else jnp.where(keys.exist[None], x, -jnp.inf))
+    # All keys are at hand, so one maximum per row suffices; there is no online softmax.
     top = functools.reduce(jnp.maximum, [x.max(1) for x in logits])
     total, y = jnp.zeros_like(top), jnp.zeros(q.shape, jnp.float32)
     for keys, x in zip(chunks, logits, strict=True):
         weights = jnp.exp2(x - top[:, None])
         total += weights.sum(1)
         y += matmul(weights.astype(v_ref.dtype), keys.load(v_ref), (1, 0))
+    # Dividing y instead of the weights costs H operations per row instead of S.
     rows.store(y_ref, y / total[:, None])
     rows.store(log_sum_ref, top + jnp.log2(total))
 
@@ -248,6 +239,7 @@ def _backward_kernel(launch: Launch, q_ref: Any, k_ref: Any, v_ref: Any, *others
     num_keys, size = k_ref.shape[1], k_ref.shape[3]
     program = _Program(launch, pl.program_id(2), pl.program_id(1))
     chunks = program.keys(num_keys)
+    # Loaded once, before the loop over the blocks of queries.
     loaded = [(keys.load(k_ref), keys.load(v_ref)) for keys in chunks]
 
     def block(i: Any, sums: list[tuple]) -> list[tuple]:
@@ -259,6 +251,7 @@ def _backward_kernel(launch: Launch, q_ref: Any, k_ref: Any, v_ref: Any, *others
         masked = jnp.where(some, -jnp.inf, -math.log2(num_keys))[:, None]
         if mask_ref:
             q = jnp.where(some[:, None], q, jnp.zeros_like(q))
+        # Σ_j w_j dw_j of the softmax's gradient equals dy · y, without another pass over keys.
         mean = (dy.astype(jnp.float32) * rows.load(y_ref).astype(jnp.float32)).sum(1)
         dq, results = jnp.zeros(q.shape, jnp.float32), []
         for keys, (k, v), (dk, dv) in zip(chunks, loaded, sums, strict=True):
@@ -267,7 +260,7 @@ def _backward_kernel(launch: Launch, q_ref: Any, k_ref: Any, v_ref: Any, *others
                 log_weights = jnp.where(_load_mask(ref, rows, keys), log_weights, masked)
             if keys.exist is not None:
                 log_weights = jnp.where(keys.exist[None], log_weights, -jnp.inf)
-            weights = jnp.exp2(log_weights)
+            weights = jnp.exp2(log_weights)  # normalized: log_sum holds the denominator
             dx = (weights * (matmul(dy, v, (1, 1)) - mean[:, None])).astype(q.dtype)
             dq += matmul(dx, k, (1, 0))
             dv += matmul(weights.astype(dy.dtype), dy, (0, 0))
@@ -275,6 +268,7 @@ def _backward_kernel(launch: Launch, q_ref: Any, k_ref: Any, v_ref: Any, *others
         rows.store(dq_ref, jnp.where(some[:, None], dq, 0) if mask_ref else dq)
         return results
 
+    # One program per key head adds up dk and dv in a fixed order.
     zeros = [(jnp.zeros((len(keys.at[1]), size), jnp.float32),) * 2 for keys in chunks]
     num_blocks = pl.cdiv(q_ref.shape[1] * q_ref.shape[3], launch.rows)
     for keys, (dk, dv) in zip(chunks, jax.lax.fori_loop(0, num_blocks, block, zeros), strict=True):

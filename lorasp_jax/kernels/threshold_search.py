@@ -27,7 +27,7 @@ class Boundary(NamedTuple):
 class Ratio(NamedTuple):
     """η in [0, 1] as numerator / denominator, exact in fp32 for decimals of up to 7 digits."""
 
-    numerator: float | jax.Array  # an array if η is traced
+    numerator: float
     denominator: float
 
 
@@ -93,19 +93,24 @@ def bisected_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
 
     def step(i: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         threshold, decision = carry
+        # Bit 31 is the sign, which is 0.
         candidate = threshold | jax.lax.shift_left(jnp.int32(1), 30 - i)
         above = scores >= _float(candidate)
         reached = ratio.denominator * jnp.where(above, energy, 0).sum(-1, keepdims=True) >= target
+        # Reached: whatever lies below is dropped. Not reached: whatever lies above is kept.
         update = jnp.where(reached, jnp.int8(-1), jnp.int8(1))
         threshold = jnp.where(reached, candidate, threshold)
+        # The other side stays as it was decided before.
         return threshold, jnp.where(above == reached, decision, update)
 
     start = jnp.zeros_like(target, jnp.int32), jnp.zeros_like(scores, jnp.int8)
     _, decision = jax.lax.fori_loop(0, 31, step, start)
     kept, tied = decision > 0, decision == 0
+    # The product with a triangular matrix counts the ties before each one.
     earlier = np.triu(np.ones((scores.shape[-1],) * 2, np.float32), 1)
     ties_before = tied.astype(jnp.float32) @ earlier
     before = jnp.where(kept, energy, 0).sum(-1, keepdims=True) + ties_before * energy
+    # A target of 0 belongs to a row of zeros; one of NaN compares as False, too.
     return (kept | (tied & (ratio.denominator * before < target))) & (target > 0)
 
 
@@ -118,7 +123,7 @@ def block_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
     second search finds the last tie with s that is needed. A single row gives scalars, whose
     comparisons cost nothing in a kernel.
     """
-    if scores.size == scores.shape[-1]:
+    if scores.size == scores.shape[-1]:  # a single row
         scores = scores.reshape(-1)
     energy = energies(scores)
     target = ratio.numerator * _by_row(jnp.sum, energy)
@@ -141,17 +146,20 @@ def block_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
         lower_half = bracket._replace(high=middle, num_high=count)
         return jax.tree.map(functools.partial(jnp.where, is_low), upper_half, lower_half)
 
+    # All scores reach the target, and none does, so the bracket is the row's own range.
     lowest, highest = (float_bits(_by_row(f, scores)) for f in (jnp.min, jnp.max))
     zero = jnp.zeros_like(lowest)
     ends = jax.lax.fori_loop(0, UNCOUNTED_STEPS, halve, (lowest, highest + 1))
+    # Undecided: more than one score lies in the bracket, which can still be halved.
     bracket = jax.lax.while_loop(
         lambda b: _any((b.high - b.low > 1) & (b.num_low - b.num_high > 1)),
         halve_and_count,
         _Bracket(*ends, *(_count(scores >= _float(end)) for end in ends)),
     )
-    # The bracket now holds a single score or ties.
+    # The bracket now holds a single score or ties: take the largest score below its upper end.
     score = _by_row(jnp.max, jnp.where(scores <= _float(bracket.high - 1), scores, -1))
     last_tie = functools.partial(_last_tie, scores, energy, score, target, ratio)
+    # Ties are rare, so the second search runs only if a row of the block has some.
     has_ties = _any(bracket.num_low - bracket.num_high > 1)
     boundary_score = jnp.where(target > 0, score, jnp.nan)
     return Boundary(
@@ -170,11 +178,12 @@ def _last_tie(
     tied = scores == score
     tie_energy = _by_row(jnp.max, jnp.where(tied, energy, 0))
     position = jax.lax.broadcasted_iota(jnp.int32, scores.shape, scores.ndim - 1)
-    num_bits = (scores.shape[-1] - 1).bit_length()
+    num_bits = (scores.shape[-1] - 1).bit_length()  # of an index
 
     def step(i: jax.Array, index: jax.Array) -> jax.Array:
         candidate = index | jax.lax.shift_left(jnp.int32(1), num_bits - 1 - i)
         before = _by_row(jnp.sum, (tied & (position < candidate)).astype(jnp.float32))
+        # The largest index whose ties before it fall short is that of the last kept tie.
         falls_short = ratio.denominator * (above + before * tie_energy) < target
         return jnp.where(falls_short, candidate, index)
 

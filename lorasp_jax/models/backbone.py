@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax.adapters.layers.prepared import Layer, fuse_layer
+from lorasp_jax.adapters.layers.prepared import Layer
 from lorasp_jax.dense import Dense
 from lorasp_jax.models import flow_matching
 from lorasp_jax.models.config import BackboneConfig
@@ -71,14 +71,6 @@ class Backbone(nnx.Module):
         self.action_time_mlp_in: Layer = Dense(2 * width, width, **options)
         self.action_time_mlp_out: Layer = Dense(width, width, **options)
         self.action_out_proj: Layer = Dense(width, dim, **options)
-
-    def fuse_projections(self, *, copy_kernels: bool = True) -> None:
-        """See `prepared.FusableModule`. No two of these layers share an input."""
-        self.state_proj = fuse_layer(self.state_proj, copy_kernels=copy_kernels)
-        self.action_in_proj = fuse_layer(self.action_in_proj, copy_kernels=copy_kernels)
-        self.action_time_mlp_in = fuse_layer(self.action_time_mlp_in, copy_kernels=copy_kernels)
-        self.action_time_mlp_out = fuse_layer(self.action_time_mlp_out, copy_kernels=copy_kernels)
-        self.action_out_proj = fuse_layer(self.action_out_proj, copy_kernels=copy_kernels)
 
     def embed_actions(
         self, x_t: jax.Array, flow_time: jax.Array, action_valid: jax.Array | None

@@ -9,7 +9,6 @@ from typing import Any, Literal, Self
 import jax.numpy as jnp
 
 from lorasp_jax.models.inputs import OURS, InputConfig
-from lorasp_jax.peft import _fields
 
 VOCABULARY_SIZE = 320
 """Rows of the embedding table in this project's base models, including reserved tokens."""
@@ -205,8 +204,8 @@ class BackboneConfig:
             "inputs": InputConfig(**{**inputs, "delta": tuple(inputs.get("delta", ()))}),
         }
         config = cls(**{**fields, **nested})
-        _fields.check_fields(config)
-        _fields.check_fields(config.inputs, "inputs.")
+        fields.check_fields(config)
+        fields.check_fields(config.inputs, "inputs.")
         for name in (config.dtype, config.param_dtype):
             jnp.dtype(name)  # raises TypeError for an unknown dtype
         return config

@@ -28,7 +28,7 @@ class Prefix(Protocol):
         ...
 
 
-class FlowModel(prepared.FusableModule, Protocol):
+class FlowModel(Protocol):
     """Backbone interface that a sampler requires; see `backbone.Backbone`."""
 
     config: BackboneConfig
@@ -163,7 +163,7 @@ def _prefix_model(model: FlowModel, once: bool) -> FlowModel:
         tower.blocks = unstack(tower.blocks)
         quantization.dequantize(tower, keep_float8=True)
         for block in tower.blocks:
-            block.fuse_projections()
+            prepared.fuse_projections(block)
     return model
 
 
@@ -174,6 +174,5 @@ def _suffix_model(model: FlowModel) -> FlowModel:
     model.action.blocks = unstack(model.action.blocks)
     quantization.dequantize(cast(nnx.Module, model))
     for module in (model, *(module for _, module in nnx.iter_modules(model.action))):
-        if isinstance(module, prepared.FusableModule):
-            module.fuse_projections()
+        prepared.fuse_projections(cast(nnx.Module, module))
     return model

@@ -1,7 +1,7 @@
 """Framework-agnostic adapter methods, one frozen dataclass per file or folder.
 
-`create("lora_sp", rank=64)` finds a method by its module name, so a new method is one new file.
-Modules that begin with `_` are shared by the methods.
+`create("lora_sp", rank=64)` finds a method by the name of the module that defines it, so a new
+method is one new file.
 """
 
 import difflib
@@ -9,23 +9,22 @@ import importlib
 import pkgutil
 from typing import Any
 
-from lorasp_jax.peft._aux import Aux
-from lorasp_jax.peft._fields import check_names, short
-from lorasp_jax.peft._method import Method
-from lorasp_jax.peft._settings import to_settings, upgrade
 from lorasp_jax.peft.ada_lora import AdaLoRA
+from lorasp_jax.peft.auxiliary import Aux
 from lorasp_jax.peft.dora import DoRA
+from lorasp_jax.peft.fields import short
 from lorasp_jax.peft.full import FullFineTuning
 from lorasp_jax.peft.lora import LoRA
 from lorasp_jax.peft.lora_moe import LoRAMoE
-from lorasp_jax.peft.lora_sp import EnergySchedule, LoRASP
+from lorasp_jax.peft.lora_sp import LoRASP
 from lorasp_jax.peft.lora_sp_release import LoRASPRelease
+from lorasp_jax.peft.method import Method
+from lorasp_jax.peft.settings import to_settings, without_removed
 
 __all__ = [
     "AdaLoRA",
     "Aux",
     "DoRA",
-    "EnergySchedule",
     "FullFineTuning",
     "LoRA",
     "LoRAMoE",
@@ -40,9 +39,22 @@ __all__ = [
 ]
 
 
+def _classes() -> dict[str, type[Method]]:
+    """The method class that each module defines, by the module's name."""
+    found: dict[str, type[Method]] = {}
+    for name in sorted(module.name for module in pkgutil.iter_modules(__path__)):
+        module = importlib.import_module(f"{__name__}.{name}")
+        for value in vars(module).values():
+            is_method = isinstance(value, type) and issubclass(value, Method)
+            if is_method and f"{value.__module__}.".startswith(f"{module.__name__}."):
+                found[name] = value
+    del found["method"]  # the base class
+    return found
+
+
 def names() -> list[str]:
     """Names of all methods."""
-    return sorted(m.name for m in pkgutil.iter_modules(__path__) if not m.name.startswith("_"))
+    return list(_classes())
 
 
 def find(name: str) -> type[Method]:
@@ -51,15 +63,13 @@ def find(name: str) -> type[Method]:
     Raises:
       ValueError: unknown method; the message lists the valid names.
     """
-    if name not in names():
-        close = difflib.get_close_matches(str(name), names(), n=1)
+    classes = _classes()
+    if name not in classes:
+        close = difflib.get_close_matches(str(name), classes, n=1)
         hint = f" (did you mean {close[0]!r}?)" if close else ""
-        valid = ", ".join(names())
+        valid = ", ".join(classes)
         raise ValueError(f"unknown method {short(name)}{hint}; valid methods are {valid}")
-    module = importlib.import_module(f"{__name__}.{name}")
-    classes = [c for c in vars(module).values() if isinstance(c, type) and issubclass(c, Method)]
-    (cls,) = [c for c in classes if f"{c.__module__}.".startswith(f"{module.__name__}.")]
-    return cls
+    return classes[name]
 
 
 def create(name: str, **fields: Any) -> Method:
@@ -72,15 +82,12 @@ def create(name: str, **fields: Any) -> Method:
 
 
 def from_settings(settings: Any) -> Method:
-    """Create a method from settings written by this or an earlier version of `to_settings`.
+    """Create a method from settings written by `to_settings`.
 
     Raises:
       ValueError: `settings` does not name a method, or `create` rejects it.
     """
     if not isinstance(settings, dict) or not isinstance(settings.get("method"), str):
         raise ValueError(f"adapter settings must name a method, got {short(settings)}")
-    fields = upgrade(settings)
-    if isinstance(schedule := fields.get("schedule"), dict):
-        check_names(EnergySchedule, "schedule", (), schedule)
-        fields["schedule"] = EnergySchedule(**schedule)
+    fields = without_removed(settings)
     return create(fields.pop("method"), **fields)

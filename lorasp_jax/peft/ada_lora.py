@@ -21,9 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from lorasp_jax.peft import _fields
-from lorasp_jax.peft._aux import Aux
-from lorasp_jax.peft._method import Method, Params
+from lorasp_jax.peft.auxiliary import Aux
+from lorasp_jax.peft.fields import positive_int
+from lorasp_jax.peft.method import Method, Params
 
 _INIT_STD = 0.02  # PEFT's value for A and B
 _NAMES = {"lora_a", "lora_e", "lora_b"}
@@ -143,7 +143,7 @@ class AdaLoRA(Method):
           ValueError: no steps remain between warm-up and final phase. The wrapped optimizer's
             `init` also raises it, for a tree without AdaLoRA parameters.
         """
-        _fields.positive_int("total_steps", total_steps)
+        positive_int("total_steps", total_steps)
         begin, end = round(self.warmup * total_steps), total_steps - round(self.final * total_steps)
         if begin >= end:
             raise ValueError(

@@ -15,9 +15,9 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from lorasp_jax.peft._aux import Aux
-from lorasp_jax.peft._method import Kernel, Params
+from lorasp_jax.peft.auxiliary import Aux
 from lorasp_jax.peft.lora import LoRA
+from lorasp_jax.peft.method import Kernel, Params
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +31,7 @@ class DoRA(LoRA):
     """
 
     additive: ClassVar[bool] = False
+    is_low_rank_sum: ClassVar[bool] = False
 
     def init(
         self, key: jax.Array, kernel: Kernel, *, statistics: Any = None

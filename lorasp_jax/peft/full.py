@@ -6,8 +6,8 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from lorasp_jax.peft._aux import Aux
-from lorasp_jax.peft._method import Kernel, Method, Params
+from lorasp_jax.peft.auxiliary import Aux
+from lorasp_jax.peft.method import Kernel, Method, Params
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,6 +20,7 @@ class FullFineTuning(Method):
 
     trains_base: ClassVar[bool] = True
     additive: ClassVar[bool] = False
+    is_low_rank_sum: ClassVar[bool] = False
 
     def init(
         self, key: jax.Array, kernel: Kernel, *, statistics: Any = None

@@ -10,9 +10,9 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
-from lorasp_jax.peft import _validate
-from lorasp_jax.peft._aux import Aux
-from lorasp_jax.peft._method import Kernel, Method, Params, kaiming_uniform
+from lorasp_jax.peft.auxiliary import Aux
+from lorasp_jax.peft.fields import check_kernel
+from lorasp_jax.peft.method import Kernel, Method, Params, kaiming_uniform
 
 _SPLIT_INITIALIZATIONS = ("pissa", "olora")
 
@@ -81,12 +81,12 @@ class LoRA(Method):
             R > I.
         """
         if self.needs_statistics:
-            _validate.matrix(kernel)
+            check_kernel(kernel)
             a = principal_inputs(statistics, kernel.shape[0], self.rank)
             return {"lora_a": a, "lora_b": jnp.zeros((self.rank, kernel.shape[1]))}, kernel
         if not self.splits_kernel:
             return super().init(key, kernel, statistics=statistics)
-        _validate.matrix(kernel)
+        check_kernel(kernel)
         if isinstance(kernel, jax.ShapeDtypeStruct) or self.rank > min(kernel.shape):
             given = "a shape" if isinstance(kernel, jax.ShapeDtypeStruct) else "a kernel"
             raise ValueError(

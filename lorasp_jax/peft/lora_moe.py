@@ -16,9 +16,9 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
-from lorasp_jax.peft._aux import Aux, masked_mean
-from lorasp_jax.peft._method import Method, Params, kaiming_uniform
+from lorasp_jax.peft.auxiliary import Aux, masked_mean
 from lorasp_jax.peft.lora_sp.router import cast_and_clip
+from lorasp_jax.peft.method import Method, Params, kaiming_uniform
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,18 +24,17 @@ import jax
 import jax.numpy as jnp
 
 from lorasp_jax.kernels.energy_gate import kept_energy
-from lorasp_jax.peft._aux import Aux, masked_mean
-from lorasp_jax.peft._method import Params, kaiming_uniform
+from lorasp_jax.peft.auxiliary import Aux, masked_mean
 from lorasp_jax.peft.lora_sp.bank import BankMethod, apply_masked_scores, init_bank
 from lorasp_jax.peft.lora_sp.router import cast_and_clip, init_output_layer
+from lorasp_jax.peft.method import Params, kaiming_uniform
 
 
 @dataclasses.dataclass(frozen=True)
 class LoRASPRelease(BankMethod):
     """Adapter with an input-dependent active rank, for comparison with the public code only.
 
-    Parameters: bank.u [R, O], bank.v [I, R]; router.w1 [I, R], or w1 [I, H] and w2 [H, R]. A
-    normalized bank adds a scalar (bank.gain).
+    Parameters: bank.u [R, O], bank.v [I, R]; router.w1 [I, R], or w1 [I, H] and w2 [H, R].
 
     Raises:
       ValueError: a rank or width below 1, or η outside (0, 1].
@@ -50,8 +49,6 @@ class LoRASPRelease(BankMethod):
     hidden_width: int | None = None
     """None: the scores are x W1, the default of the public code. H: they are softmax(x W1) W2 with
     width H and W2 initially 0/1, as with that code's option `router_projection` (H = 4)."""
-    normalized_bank: bool = False
-    """Keep the bank's directions orthonormal; see `LoRASP.normalized_bank`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -64,16 +61,14 @@ class LoRASPRelease(BankMethod):
         return ("w1",) if self.hidden_width is None else ("w2",)
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
-        """Initialize V and W1 randomly and U (or the gain) to zero; the delta is zero."""
+        """Initialize V and W1 randomly and U to zero; the delta is zero."""
         input_key, score_key = jax.random.split(key)
         inputs = kaiming_uniform(input_key, (d_in, self.rank + (self.hidden_width or self.rank)))
         v, w1 = jnp.split(inputs, [self.rank], axis=1)
-        bank_key = jax.random.fold_in(key, 1)
-        bank = init_bank(bank_key, v, d_out, normalized=self.normalized_bank)
         output_layer = {}
         if self.hidden_width is not None:
             output_layer = init_output_layer(score_key, "softmax", self.hidden_width, self.rank)
-        return {"bank": bank, "router": {"w1": w1, **output_layer}}
+        return {"bank": init_bank(v, d_out), "router": {"w1": w1, **output_layer}}
 
     def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None

@@ -6,7 +6,6 @@ import dataclasses
 import difflib
 import io
 import itertools
-import typing
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
@@ -168,7 +167,6 @@ def load(path: Path, scale: str) -> Config:
 def override(config: Config, arguments: Sequence[str], program: str = "") -> Config:
     """Apply dotted overrides such as `--peft.rank 64 --optim.steps 100`."""
     wants_help = bool(HELP & set(arguments))
-    config, arguments = _with_subconfigs(config, arguments, create_all=wants_help)
     _check_names(arguments, config)
     printed = io.StringIO()
     quiet = contextlib.nullcontext() if wants_help else contextlib.redirect_stderr(printed)
@@ -188,30 +186,6 @@ def override(config: Config, arguments: Sequence[str], program: str = "") -> Con
         raise ValueError(_sentence(printed.getvalue())) from error
     names = (field.name for field in dataclasses.fields(Config))
     return Config(**{name: getattr(parsed, name) for name in names})
-
-
-def _with_subconfigs(
-    config: Config, arguments: Sequence[str], *, create_all: bool
-) -> tuple[Config, list[str]]:
-    """Create the optional sub-configs of the method; return config and remaining arguments.
-
-    `--peft.schedule.start 0.5` creates a schedule; `--peft.schedule None` removes it. With
-    `create_all` every sub-config is created, so that the help text lists its options.
-    """
-    method: Any = config.peft
-    rest = [part for a in arguments for part in (a.split("=") if a.endswith("=None") else [a])]
-    changes: dict[str, Any] = {}
-    for name, hint in typing.get_type_hints(type(method)).items():
-        subconfig: Any
-        for subconfig in filter(dataclasses.is_dataclass, typing.get_args(hint)):
-            option, current = f"--peft.{name}", getattr(method, name)
-            if [option, "None"] in map(list, itertools.pairwise(rest)):
-                index = rest.index(option)
-                del rest[index : index + 2]
-                changes[name] = None
-            elif current is None and (create_all or any(a.startswith(f"{option}.") for a in rest)):
-                changes[name] = subconfig()
-    return dataclasses.replace(config, peft=dataclasses.replace(method, **changes)), rest
 
 
 def _check_names(arguments: Sequence[str], config: Config) -> None:

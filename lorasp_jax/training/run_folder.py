@@ -26,7 +26,7 @@ from lorasp_jax.base.json_values import check
 from lorasp_jax.base.locks import acquire
 from lorasp_jax.base.writing import TEMPORARY_SUFFIX, write_text
 from lorasp_jax.config import Config
-from lorasp_jax.peft._settings import upgrade
+from lorasp_jax.peft.settings import without_removed
 from lorasp_jax.training import records
 from lorasp_jax.training.distributed import processes
 
@@ -194,7 +194,7 @@ def changed_settings(recorded: Mapping[str, Any], current: Mapping[str, Any]) ->
     The recorded one may have been written by an earlier version.
     """
     earlier = {
-        "peft": upgrade(recorded["peft"]),
+        "peft": without_removed(recorded["peft"]),
         "evaluation": {"before": True, **recorded.get("evaluation", {})},  # every run did
     }
     return _differences({**recorded, **earlier}, current)

@@ -12,7 +12,7 @@ from flax import nnx
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.data.batches import Batch
 from lorasp_jax.models import flow_matching
-from lorasp_jax.peft._aux import Aux, auxiliary_losses, masked_mean
+from lorasp_jax.peft.auxiliary import Aux, auxiliary_losses, masked_mean
 from lorasp_jax.training import guard as guards
 from lorasp_jax.training.guard import Guard
 

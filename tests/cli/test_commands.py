@@ -93,8 +93,8 @@ def bash_script(tmp_path_factory):
     ("words", "expected"),
     [
         (["tra"], {"train"}),
-        (["train", "--peft.gran"], {"--peft.granularity"}),
-        (["train", "--peft.granularity", "sa"], {"sample"}),
+        (["train", "--peft.rou"], {"--peft.router"}),
+        (["train", "--peft.router", "so"], {"softmax"}),
         (["envs", "col"], {"collect"}),
         (["envs", "collect", "--num-"], {"--num-envs", "--num-episodes"}),
         (["data", "convert", "--to", ""], {"cache", "rlds"}),
@@ -118,7 +118,7 @@ def test_bash_completion(words, expected, bash_script, tmp_path):
 @pytest.mark.parametrize("shell", ["zsh", "fish"])
 def test_other_shells(shell, capsys):
     assert completion.main([shell], "lorasp-jax completion") == 0
-    assert "peft.granularity" in capsys.readouterr().out
+    assert "peft.router" in capsys.readouterr().out
 
 
 def test_a_command_without_its_dependencies_says_how_to_install_them():

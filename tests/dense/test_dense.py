@@ -12,7 +12,6 @@ from flax import nnx
 import lorasp_jax
 from lorasp_jax.dense import AdapterParam, Dense, LinenDense, dense, dense_shared_input
 from lorasp_jax.peft import DoRA, FullFineTuning, LoRA, LoRASP
-from lorasp_jax.peft.lora_sp.router import router_scores
 
 METHOD = LoRASP(rank=8, hidden_width=4)
 
@@ -68,8 +67,6 @@ def test_layers_with_a_shared_input(x):
         assert jax.tree.structure(aux) == jax.tree.structure(expected)
         for a, b in zip(jax.tree.leaves(aux), jax.tree.leaves(expected), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
-    with pytest.raises(ValueError, match="input width 4 does not match kernel shape"):
-        dense_shared_input(x[:, :4], [layers[0].arrays()])
 
 
 def test_linen_equals_nnx(x):
@@ -205,7 +202,7 @@ def test_program_size_per_layer(method, limit):
     [
         (jnp.ones((2, 4), int), None, r"floating-point array .* got int32 \[2, 4\]"),
         (jnp.ones(()), None, r"got float32 \[\]"),
-        ([[1.0] * 4], None, "got list"),
+        ([[1.0] * 4], None, r"must be an array .* got \[\["),
         (jnp.ones((2, 4)), jnp.ones((3, 3), bool), r"bool \[2\], got bool \[3, 3\]"),
         (jnp.ones((2, 4)), jnp.ones(2), r"bool \[2\], got float32 \[2\]"),
     ],
@@ -217,21 +214,28 @@ def test_invalid_inputs(method, x, mask, message):
         dense(x, kernel, None, params, method, token_mask=mask)
 
 
-def test_call_depth_from_a_layer_to_the_router():
-    """A reader who follows the calls from a layer reaches eq. (10) after five functions."""
+def test_the_calls_from_a_layer_to_the_router():
+    """Who follows x from a layer reaches eq. (10) in eight calls, and only one of them checks."""
     layer = Dense(3, 5, method=LoRASP(rank=7, hidden_width=3), rngs=nnx.Rngs(0))
-    callers = []
+    all_calls, calls = [], []
 
     def profile(frame, event, _):
-        if event == "call" and frame.f_code is router_scores.__code__ and not callers:
-            while frame := frame.f_back:
-                own = frame.f_globals.get("__name__", "").startswith("lorasp_jax.")
-                if own and not frame.f_code.co_name.startswith("<"):
-                    callers.append(frame.f_code.co_name)
+        name, own = frame.f_code.co_name, frame.f_globals.get("__name__", "")
+        if event != "call" or not own.startswith("lorasp_jax.") or name.startswith("<"):
+            return
+        if "router_scores" in calls:
+            return
+        all_calls.append(name)
+        arguments = frame.f_locals.values()
+        is_x = any(getattr(a, "shape", ())[:1] == (11,) for a in arguments)
+        if is_x:
+            calls.append(name)  # it gets x, or what was computed from x for the same 11 tokens
 
     sys.setprofile(profile)
     try:
-        layer(jnp.ones((2, 3)))
+        layer(jnp.ones((11, 3)), token_mask=jnp.ones(11, bool))
     finally:
         sys.setprofile(None)
-    assert callers == ["bottleneck", "low_rank_matmul", "apply", "dense", "__call__"]
+    path = "__call__ cast_input apply_layer apply low_rank_matmul bottlenecks bottleneck"
+    assert calls == [*path.split(), "router_scores"]
+    assert len(all_calls) <= 28  # with those that get parameters only, such as `up`

@@ -5,16 +5,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lorasp_jax.kernels.cached_attention import Launch, cached_attention
+from lorasp_jax.kernels.blocks import Launch
+from lorasp_jax.kernels.cached_attention import cached_attention
 from lorasp_jax.models.transformer import attention
 from lorasp_jax.training.cost import flops
 
 BATCH, TOKENS, KV_HEADS, GROUP, DIM = 2, 5, 2, 3, 16
 LAUNCHES = {
-    "one_program": Launch(rows=16, keys=16, splits=1, warps=1),
-    "splits": Launch(rows=16, keys=16, splits=2, warps=1),
-    "more_splits_than_blocks": Launch(rows=16, keys=16, splits=9, warps=1),
-    "one_block": Launch(rows=32, keys=64, splits=1, warps=1),
+    "one_program": Launch(rows=16, keys=16, programs=1, warps=1),
+    "splits": Launch(rows=16, keys=16, programs=2, warps=1),
+    "more_splits_than_blocks": Launch(rows=16, keys=16, programs=9, warps=1),
+    "one_block": Launch(rows=32, keys=64, programs=1, warps=1),
 }
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul
+from lorasp_jax.kernels.low_rank_matmul import Bottleneck, LowRankLayer, low_rank_matmul
 
 # (I, O), every code path for 10 tokens: output wider, more than twice as wide, square, input wider;
 # then I above the number of tokens.
@@ -34,8 +34,8 @@ def inner(params, rows, token_mask):
 
 
 @dataclasses.dataclass(frozen=True)
-class Method:
-    """Implements the protocol `Bottleneck`."""
+class Method(Bottleneck):
+    """An f."""
 
     bottleneck: Callable = inner
 
@@ -52,7 +52,7 @@ MASK = jnp.arange(10).reshape(2, 5) != 3
 
 def ours(params, x, kernel, down, up, mask=MASK):
     layers = [LowRankLayer(params, kernel, down, up)]
-    return low_rank_matmul((Method(),), x.dtype, layers, x, mask)[0]
+    return low_rank_matmul(Method(), x.dtype, layers, x, mask)[0]
 
 
 def reference(params, x, kernel, down, up, mask=MASK):
@@ -89,7 +89,7 @@ def test_several_layers_with_one_input(d_outs):
 
     def grouped(params, x, layers):
         layers = [layer._replace(params=p) for p, layer in zip(params, layers, strict=True)]
-        return low_rank_matmul((Method(),) * len(layers), x.dtype, layers, x, MASK)
+        return low_rank_matmul(Method(), x.dtype, layers, x, MASK)
 
     def separate(params, x, layers):
         return [reference(p, x, *layer[1:]) for p, layer in zip(params, layers, strict=True)]
@@ -116,9 +116,7 @@ def test_several_layers_with_one_input(d_outs):
 def test_several_layers_share_the_down_projection():
     params, x, *_ = inputs(9, 1)
     layers = [LowRankLayer(params, *inputs(9, d_out)[2:]) for d_out in (4, 3, 2)]
-    program = jax.make_jaxpr(lambda x: low_rank_matmul((Method(),) * 3, x.dtype, layers, x, MASK))(
-        x
-    )
+    program = jax.make_jaxpr(lambda x: low_rank_matmul(Method(), x.dtype, layers, x, MASK))(x)
     matmuls = [line for line in str(program).splitlines() if "dot_general" in line]
     assert len(matmuls) == 1 + 3 * 2  # x P; x W and z U of each
 
@@ -152,7 +150,7 @@ def test_dtypes():
     assert (dx.dtype, d_down.dtype, d_up.dtype) == (jnp.bfloat16, jnp.float32, jnp.float32)
     params, x, *matrices = arguments
     layers = [LowRankLayer(params, *matrices)]
-    exact = jax.jit(lambda x: low_rank_matmul((Method(),), jnp.float32, layers, x, MASK)[0])
+    exact = jax.jit(lambda x: low_rank_matmul(Method(), jnp.float32, layers, x, MASK)[0])
     expected = x.astype(jnp.float32) @ matrices[1].astype(jnp.bfloat16).astype(jnp.float32)
     statistic = exact(x)[1]["statistic"]
     assert statistic.dtype == jnp.float32
@@ -194,12 +192,12 @@ def test_equal_layers_are_traced_once():
         calls.append(rows.shape)
         return inner(params, rows, token_mask)
 
-    methods = (Method(counting),)
+    f = Method(counting)
     params, x, *rest = inputs(9, 9)
 
     def loss(params, x, depth):
         for _ in range(depth):
-            ((x, aux),) = low_rank_matmul(methods, x.dtype, [LowRankLayer(params, *rest)], x, MASK)
+            ((x, aux),) = low_rank_matmul(f, x.dtype, [LowRankLayer(params, *rest)], x, MASK)
         return x.sum() + aux["loss"]
 
     num_traces = []
@@ -218,13 +216,13 @@ def test_layers_of_other_shapes_share_the_traced_bottleneck():
         calls.append(rows.shape)
         return inner(params, rows, token_mask)
 
-    methods = (Method(counting),)
+    f = Method(counting)
 
     def loss(params, shapes):
         total = 0.0
         for shape in shapes:
             _, x, *rest = inputs(*shape)
-            ((y, aux),) = low_rank_matmul(methods, x.dtype, [LowRankLayer(params, *rest)], x, MASK)
+            ((y, aux),) = low_rank_matmul(f, x.dtype, [LowRankLayer(params, *rest)], x, MASK)
             total += y.sum() + aux["loss"]
         return total
 

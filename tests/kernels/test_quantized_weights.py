@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.scipy.special import ndtri
 
-from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul
+from lorasp_jax.kernels.low_rank_matmul import Bottleneck, LowRankLayer, low_rank_matmul
 from lorasp_jax.kernels.quantized_weights import KINDS, NF4, quantize_kernel
 from tests import GOLDEN
 
@@ -103,7 +103,7 @@ def test_stack_equals_its_layers(kind):
     np.testing.assert_array_equal(scanned, flat.astype(jnp.bfloat16))
 
 
-class Identity:
+class Identity(Bottleneck):
     def bottleneck(self, params, rows, token_mask):
         del params, token_mask
         return rows, ()
@@ -112,7 +112,7 @@ class Identity:
 def low_rank(x, kernel, p, u):
     """Compute x W + (x P) U."""
     layers = [LowRankLayer((), kernel, p, u)]
-    return low_rank_matmul((Identity(),), x.dtype, layers, x, None)[0][0]
+    return low_rank_matmul(Identity(), x.dtype, layers, x, None)[0][0]
 
 
 @pytest.mark.parametrize("kind", KINDS)

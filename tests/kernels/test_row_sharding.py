@@ -9,10 +9,10 @@ import pytest
 from jax.sharding import NamedSharding, PartitionSpec
 
 from lorasp_jax.kernels import rowwise_kernel as kernels
-from lorasp_jax.kernels.cached_attention import Launch as CachedLaunch
+from lorasp_jax.kernels.blocks import Launch
 from lorasp_jax.kernels.cached_attention import cached_attention
 from lorasp_jax.kernels.row_sharding import by_rows
-from lorasp_jax.kernels.short_attention import Launch, short_attention
+from lorasp_jax.kernels.short_attention import short_attention
 from lorasp_jax.training.distributed import mesh as meshes
 from tests.kernels.test_rowwise_kernel import WIDTHS, close, gated
 
@@ -99,7 +99,7 @@ def test_short_attention(batch):
 
     @jax.jit
     def gradients(q, mask):
-        launches = (Launch(16, 16, 4),) * 2
+        launches = (Launch(rows=16, keys=16, warps=4),) * 2
 
         def loss(q):
             k, v = jnp.sin(q[:, :, :1]), jnp.cos(q[:, :, :1])
@@ -123,7 +123,7 @@ def test_cached_attention():
     @jax.jit
     def attend(q, mask):
         own, cached = jnp.sin(q[:, :, :1]), jnp.cos(jnp.tile(q[:, :, :1], (1, 3, 1, 1))[:, :11])
-        launch = CachedLaunch(16, 16, 2, 1)
+        launch = Launch(rows=16, keys=16, programs=2, warps=1)
         arrays = q, (own, own + 1), (cached, cached - 1), mask
         return cached_attention(*arrays, launch=launch, interpret=True)
 

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lorasp_jax.kernels.short_attention import MAX_KEYS, Launch, short_attention
+from lorasp_jax.kernels.blocks import Launch
+from lorasp_jax.kernels.short_attention import MAX_KEYS, short_attention
 from lorasp_jax.models.transformer.attention import attention
 
 LAUNCHES = Launch(rows=16, keys=32, warps=4), Launch(rows=32, keys=16, warps=4)

@@ -1,6 +1,5 @@
 """Test AdaLoRA against Hugging Face PEFT, and properties of its rank allocation."""
 
-import dataclasses
 import json
 
 import jax
@@ -201,22 +200,6 @@ def test_match_budget():
     assert AdaLoRA(rank=128).match_budget(75.6) == AdaLoRA(rank=128, target_rank=76)
 
 
-@pytest.mark.parametrize(
-    "fields",
-    [
-        {"target_rank": 7},
-        {"target_rank": 0},
-        {"interval": 0},
-        {"warmup": 0.6, "final": 0.4},
-        {"final": -0.1},
-    ],
-    ids=str,
-)
-def test_invalid_fields(fields):
-    with pytest.raises(ValueError, match="got"):
-        small(**fields)
-
-
 def test_orthogonal_parameters_have_zero_gradient():
     params = {"lora_a": jnp.eye(4, 2), "lora_b": jnp.eye(2, 3), "lora_e": jnp.ones(2)}
     gradient = jax.grad(lambda p: small(rank=2).penalty(p)["orthogonality"])(params)
@@ -233,12 +216,10 @@ def test_too_few_steps():
         small(warmup=0.2, final=0.6).transform(optax.sgd(1.0), 1)
 
 
-def test_initial_gradients_and_parameter_count():
+def test_initial_gradients():
     method = small()
     params, kernel = method.init(jax.random.key(0), jnp.ones((4, 5)))
-    assert sum(leaf.size for leaf in jax.tree.leaves(params)) == (4 + 5 + 1) * 6
     x = jax.random.normal(jax.random.key(1), (3, 4))
     grads = jax.grad(lambda p: method.apply(p, x, kernel)[0].sum())(params)
     assert np.all(grads["lora_a"] == 0)  # e is zero
     assert np.any(grads["lora_e"] != 0)
-    assert dataclasses.replace(method) == method

@@ -8,7 +8,7 @@ from flax import nnx
 
 import lorasp_jax
 from lorasp_jax import peft
-from lorasp_jax.peft import AdaLoRA, LoRA, LoRAMoE, LoRASP
+from lorasp_jax.peft import AdaLoRA, LoRA, LoRAMoE, LoRASP, LoRASPRelease
 
 NET = nnx.Dict(inp=nnx.Linear(5, 4, rngs=nnx.Rngs(0)))
 
@@ -20,6 +20,7 @@ NET = nnx.Dict(inp=nnx.Linear(5, 4, rngs=nnx.Rngs(0)))
         ({"lora_alpha": 8}, "did you mean 'alpha'?"),
         ({"rank": "8"}, "rank must be int, got '8'"),
         ({"rank": True}, "rank must be int, got True"),
+        ({"rank": 0}, "rank must be at least 1, got 0"),
         ({"rank": 1.5}, "rank must be int, got 1.5"),
         ({"rank": 10**12}, "rank must be at most 1048576"),
         ({"rank": -(10**12)}, "rank must be at least -2147483647"),
@@ -47,6 +48,33 @@ def test_too_many_values():
         ValueError, match=r"lora takes at most 5 values \(rank, .* dropout\), got 6"
     ):
         LoRA(1, 2.0, False, "kaiming", 0.1, 3)  # pyright: ignore[reportCallIssue]
+
+
+@pytest.mark.parametrize(
+    ("method", "fields", "message"),
+    [
+        (LoRASP, {"energy_target": 0.0}, r"energy_target must lie in \(0, 1\], got 0.0"),
+        (LoRASP, {"energy_target": 1.5}, r"energy_target must lie in \(0, 1\], got 1.5"),
+        (LoRASP, {"rank": 0}, "rank must be at least 1, got 0"),
+        (LoRASP, {"hidden_width": 0}, "hidden_width must be at least 1, got 0"),
+        (LoRASP, {"router": "relu"}, "router must be one of 'gelu', .*, 'softmax', got 'relu'"),
+        (LoRASPRelease, {"hidden_width": 0}, "hidden_width must be at least 1, got 0"),
+        (LoRASPRelease, {"router": "gelu"}, "lora_sp_release has no field 'router'"),
+        (LoRAMoE, {"experts": 0}, "experts and rank must be at least 1, got 0, 32"),
+        (LoRAMoE, {"rank": 0}, "experts and rank must be at least 1, got 4, 0"),
+        (LoRAMoE, {"routing": "top2"}, "routing must be one of 'weighted', 'top1', got 'top2'"),
+        (LoRAMoE, {"gate_gradient": "soft"}, "must be one of 'hard', 'switch', got 'soft'"),
+        (LoRAMoE, {"gate_gradient": "switch"}, "'switch' needs routing 'top1', got 'weighted'"),
+        (AdaLoRA, {"rank": 6, "target_rank": 7}, "target_rank from 1 to rank, got"),
+        (AdaLoRA, {"target_rank": 0}, "target_rank from 1 to rank, got"),
+        (AdaLoRA, {"interval": 0}, "interval=0"),
+        (AdaLoRA, {"warmup": 0.6, "final": 0.4}, "sum to less than 1, got 0.6 and 0.4"),
+        (AdaLoRA, {"final": -0.1}, "non-negative .* got 0.1 and -0.1"),
+    ],
+)
+def test_values_out_of_range(method, fields, message):
+    with pytest.raises(ValueError, match=message):
+        method(**fields)
 
 
 BAD = ["x", None, True, -1, 10**30, 1e308, float("nan"), float("inf"), [], {}, (), object]

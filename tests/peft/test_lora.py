@@ -77,16 +77,10 @@ def test_equals_hugging_face(case, methods):
         assert_close(delta, golden[f"delta_weight/{i}"].T, 1e-5)
 
 
-def test_initialization_and_parameter_count():
-    """A is uniform in ±1/√I and B zero, with (I + O) R parameters."""
+def test_initialization():
+    """A is uniform in ±1/√I and B zero."""
     params, _ = LoRA(rank=4).init(jax.random.key(0), jax.ShapeDtypeStruct((900, 50), jnp.float32))
-    assert sum(leaf.size for leaf in jax.tree.leaves(params)) == (900 + 50) * 4
     bound = 1 / 30
     assert np.abs(params["lora_a"]).max() == pytest.approx(bound, rel=0.01)
     assert np.std(params["lora_a"]) == pytest.approx(bound / 3**0.5, rel=0.03)
     assert not params["lora_b"].any()
-
-
-def test_invalid_rank():
-    with pytest.raises(ValueError, match="rank must be at least 1, got 0"):
-        LoRA(rank=0)

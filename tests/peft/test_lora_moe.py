@@ -141,33 +141,14 @@ def test_initial_paper_lora_sp_equals_weighted_moe(seed, x):
     np.testing.assert_allclose(moe.delta(params, x)[0], theirs, rtol=1e-5, atol=1e-6)
 
 
-def test_initialization_and_parameter_count():
-    """(I + O) E R + I E parameters; A and the router uniform in ±1/√I, B zero."""
+def test_initialization():
+    """A and the router uniform in ±1/√I, B zero."""
     kernel = jax.ShapeDtypeStruct((400, 30), jnp.float32)
     params, _ = LoRAMoE(EXPERTS, 8).init(jax.random.key(0), kernel)
-    count = sum(leaf.size for leaf in jax.tree.leaves(params))
-    assert count == (400 + 30) * EXPERTS * 8 + 400 * EXPERTS
     for name in ("lora_a", "router"):
         assert np.abs(params[name]).max() == pytest.approx(1 / 20, rel=0.01)
         assert np.std(params[name]) == pytest.approx(1 / 20 / 3**0.5, rel=0.05)
     assert not params["lora_b"].any()
-
-
-@pytest.mark.parametrize("method", ALL, ids=lambda m: f"{m.routing}-{m.gate_gradient}")
-def test_padding_is_ignored(method, x):
-    """Losses and their gradients equal those of the valid tokens alone."""
-    mask = jnp.arange(7)[None] < jnp.array([[3], [7], [0]])
-
-    def losses(params, x, mask):
-        aux = method.delta(params, x, token_mask=mask)[1]
-        return sum(aux.losses.values()), aux.losses
-
-    losses_and_grads = jax.value_and_grad(losses, has_aux=True)
-    alone = losses_and_grads(arrays(), x[mask], None)
-    for garbage in (1e3, -1e3, 1e8):
-        padded = losses_and_grads(arrays(), jnp.where(mask[..., None], x, garbage), mask)
-        for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(padded), strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
 
 
 def test_padding_only(x):
@@ -197,26 +178,6 @@ def test_logits_are_fp32_for_bfloat16_inputs(x):
     param_grads, x_grad = task(arrays(), low)
     assert {leaf.dtype for leaf in jax.tree.leaves(param_grads)} == {jnp.dtype("float32")}
     assert x_grad.dtype == jnp.bfloat16
-
-
-def test_merge_suggests_an_alternative():
-    with pytest.raises(ValueError, match=r"depends on the input .* keep the adapter"):
-        ALL[0].merge(arrays(), jnp.zeros((D_IN, D_OUT)))
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"experts": 0}, "experts and rank must be at least 1, got 0, 32"),
-        ({"rank": 0}, "experts and rank must be at least 1, got 4, 0"),
-        ({"routing": "top2"}, "routing must be one of 'weighted', 'top1', got 'top2'"),
-        ({"gate_gradient": "soft"}, "gate_gradient must be one of 'hard', 'switch', got 'soft'"),
-        ({"gate_gradient": "switch"}, "'switch' needs routing 'top1', got 'weighted'"),
-    ],
-)
-def test_invalid_fields(fields, message):
-    with pytest.raises(ValueError, match=message):
-        LoRAMoE(**fields)
 
 
 @pytest.mark.parametrize("experts", [1, 4, 7])

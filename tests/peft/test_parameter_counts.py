@@ -8,7 +8,6 @@ from lorasp_jax import peft
 from lorasp_jax.peft import (
     AdaLoRA,
     DoRA,
-    EnergySchedule,
     FullFineTuning,
     LoRA,
     LoRAMoE,
@@ -38,8 +37,6 @@ TABLE = [
         (LoRASP(rank=8, hidden_width=4, router=name), 8 * (I + O) + 4 * (I + 8) + 4 + 8)
         for name in ("gelu", "gelu_relu", "gelu_softmax")
     ),
-    (LoRASP(rank=8, hidden_width=4, schedule=EnergySchedule()), 8 * (I + O) + 4 * (I + 8) + 13),
-    (LoRASP(rank=8, hidden_width=4, normalized_bank=True), 8 * (I + O) + 4 * (I + 8) + 4 + 8 + 1),
     (LoRASP.paper(), 128 * (I + O) + 4 * (I + 128)),
     (LoRASPRelease(), 128 * (I + O) + 128 * I),
     (LoRASPRelease(hidden_width=4), 128 * (I + O) + 4 * (I + 128)),

@@ -1,6 +1,5 @@
 """The command line: one sentence per mistake, typos suggest the right name."""
 
-import dataclasses
 import re
 
 import pytest
@@ -8,7 +7,7 @@ import pytest
 from envs.scene.ranges import Randomization
 from lorasp_jax.config import Config
 from lorasp_jax.models.presets import PRESETS
-from lorasp_jax.peft import EnergySchedule, LoRA, LoRASP, LoRASPRelease
+from lorasp_jax.peft import LoRA, LoRASP, LoRASPRelease
 from lorasp_jax.training.overrides import load, override, parse
 
 CONFIG = Config(name="a", scale="cpu", peft=LoRASP(rank=8))
@@ -39,24 +38,6 @@ def test_a_bool_is_negated():
 def test_scale_is_chosen_by_backend_and_can_be_forced():
     assert parse(MULTITASK).config.scale == "cpu"
     assert parse([*MULTITASK, "--scale", "accelerator"]).config.model.size == "small"
-
-
-def test_every_variant_of_lora_sp_is_an_option():
-    options = ["--peft.router=gelu_relu", "--peft.granularity=sample", "--peft.normalized-bank"]
-    options += ["--peft.schedule.start=0.5", "--peft.schedule.curve", "cosine"]
-    method = override(CONFIG, [*options, "--peft.schedule.share=0.25"]).peft
-    schedule = EnergySchedule(0.5, "cosine", 0.25)
-    fields = {"router": "gelu_relu", "granularity": "sample", "normalized_bank": True}
-    assert method == LoRASP(rank=8, schedule=schedule, **fields)
-
-
-@pytest.mark.parametrize("off", [["--peft.schedule", "None"], ["--peft.schedule=None"]])
-def test_a_schedule_is_changed_and_removed(off):
-    scheduled = dataclasses.replace(CONFIG, peft=LoRASP(rank=8, schedule=EnergySchedule(0.5)))
-    assert override(scheduled, ["--peft.rank", "4"]).peft.schedule == EnergySchedule(0.5)
-    changed = override(scheduled, ["--peft.schedule.share", "0.1"]).peft.schedule
-    assert changed == EnergySchedule(0.5, share=0.1)
-    assert override(scheduled, off).peft == LoRASP(rank=8) == override(CONFIG, off).peft
 
 
 def test_the_rule_of_the_released_code_is_a_method():
@@ -93,8 +74,6 @@ def test_method_by_name_keeps_the_rank():
         ([*MULTITASK, "--optim.steps", "many"], "--optim.steps.*'many'"),
         ([*MULTITASK, "--peft.energy-target", "1.5"], "^peft: .*1.5"),
         ([*MULTITASK, "--peft.energy-target", "0"], "0"),
-        ([*MULTITASK, "--peft.schedule.start", "2"], r"schedule.start must be in \(0, 1\], got 2"),
-        ([*MULTITASK, "--peft.schedule.strat", "1"], "did you mean --peft.schedule.start?"),
     ],
 )
 def test_mistakes_are_one_sentence(arguments, message, capsys):
@@ -113,7 +92,6 @@ def test_help_lists_every_field_and_option(config, capsys):
     printed = capsys.readouterr().out
     for name in (
         "--peft.energy-target",
-        "--peft.schedule.curve",
         "--optim.learning-rate",
         "--evaluation.episodes",
     ):

@@ -12,7 +12,7 @@ adapter that is not a LoRA. Adapters with weight 0 are computed too.
 
 import dataclasses
 import itertools
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from flax import nnx
 
 from lorasp_jax.kernels.frozen_matmul import frozen_matmul
 from lorasp_jax.peft import Aux, LoRA, Method
-from lorasp_jax.peft._method import Params
+from lorasp_jax.peft.method import Params
 
 
 class AdapterChoice(nnx.Variable[Any]):
@@ -67,6 +67,8 @@ class AdapterSet(Method):
     methods: tuple[Method | None, ...]
     """Method of each adapter; None if it is in the bank."""
 
+    is_low_rank_sum: ClassVar[bool] = False
+
     @property
     def bank_names(self) -> list[str]:
         """Names of the K adapters in the bank."""
@@ -105,8 +107,8 @@ class AdapterSet(Method):
         rank = jnp.sum((bank_weights != 0) * bank["rank"], axis=-1).astype(jnp.float32)
         for (name, method), part in zip(self._additive_others(), parts, strict=True):
             own_params = params["others"][name]
-            kernel = method.fused_kernel(own_params) or method
-            own_z, aux = kernel.bottleneck(method.bottleneck_params(own_params), part, token_mask)
+            f = method.implementation(own_params)
+            own_z, aux = f.bottleneck(method.bottleneck_params(own_params), part, token_mask)
             z.append(weights[name][..., None] * own_z)
             rank += _active_rank(weights[name], aux)
         return jnp.concatenate(z, axis=-1), Aux(jnp.broadcast_to(rank, rows.shape[:-1]))

@@ -14,8 +14,8 @@ from lorasp_jax.adapters.combine import named
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdaptedLayer, AdapterParam, validate
 from lorasp_jax.peft import FullFineTuning, LoRA
-from lorasp_jax.peft._fields import short
-from lorasp_jax.peft._method import Params
+from lorasp_jax.peft.fields import short
+from lorasp_jax.peft.method import Params
 
 
 class FusedAdapters(NamedTuple):

@@ -36,8 +36,8 @@ from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.adapters.paths import Location
 from lorasp_jax.dense import AdaptedLayer, AdapterParam, validate
 from lorasp_jax.peft import LoRA, Method
-from lorasp_jax.peft._fields import short
-from lorasp_jax.peft._method import MAX_SIZE, Params
+from lorasp_jax.peft.fields import short
+from lorasp_jax.peft.method import MAX_SIZE, Params
 
 Selection: TypeAlias = str | Mapping[str, float] | None
 AdaptedLayers: TypeAlias = dict[str, AdaptedLayer]

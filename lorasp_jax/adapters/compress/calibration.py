@@ -12,7 +12,7 @@ import functools
 import re
 from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -23,8 +23,8 @@ from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdapterAux, AdapterParam, validate
 from lorasp_jax.kernels.frozen_matmul import frozen_matmul
-from lorasp_jax.peft._fields import short
-from lorasp_jax.peft._method import Aux, Method, Params
+from lorasp_jax.peft.fields import short
+from lorasp_jax.peft.method import Aux, Method, Params
 
 Forward = Callable[[Any, Any], Any]
 """(model, batch) -> output pytree, which must include any aux that the model returns. All other
@@ -74,6 +74,8 @@ class Observed(Method):
 
     Parameters: those of `inner`, or the pair of these and those of `reference`.
     """
+
+    is_low_rank_sum: ClassVar[bool] = False
 
     path: str
     inner: Method | None

@@ -16,8 +16,8 @@ from lorasp_jax.adapters.compress import calibration
 from lorasp_jax.adapters.compress.calibration import Forward, Layer, Sums
 from lorasp_jax.dense import AdaptedLayer, AdapterParam, validate
 from lorasp_jax.peft import Method
-from lorasp_jax.peft._method import Params
 from lorasp_jax.peft.lora_sp.bank import BankMethod
+from lorasp_jax.peft.method import Params
 
 Replacements = dict[str, tuple[Method, Params]]
 """New adapters by path."""

@@ -18,8 +18,8 @@ from lorasp_jax.adapters.compress.compaction import (
     replace_adapters,
 )
 from lorasp_jax.peft import LoRA
-from lorasp_jax.peft._fields import short
-from lorasp_jax.peft._method import Params
+from lorasp_jax.peft.fields import short
+from lorasp_jax.peft.method import Params
 
 
 def distill(

@@ -20,10 +20,10 @@ from lorasp_jax.adapters.compress.compaction import (
     replace_adapters,
 )
 from lorasp_jax.peft import Method
-from lorasp_jax.peft._fields import short
-from lorasp_jax.peft._method import Params
-from lorasp_jax.peft.lora_sp.bank import BankMethod, normalized_bank
+from lorasp_jax.peft.fields import short
+from lorasp_jax.peft.lora_sp.bank import BankMethod
 from lorasp_jax.peft.lora_sp.gpu_kernel import supported_size
+from lorasp_jax.peft.method import Params
 
 
 def prune(
@@ -101,9 +101,6 @@ def _pruned(layer: Any, usage: np.ndarray, rank: int) -> tuple[Method, Params]:
 def _reordered(params: Params, order: jax.Array, *, method: BankMethod, rank: int) -> Params:
     """Reorder one layer's directions; keep the first `rank` in the bank, and all scores."""
     bank, router = dict(params["bank"]), dict(params["router"])
-    if method.normalized_bank:  # a subset of orthonormal directions is orthonormal
-        gain = jnp.asarray(bank["u"].shape[1] ** -0.5)
-        bank |= normalized_bank(bank | {"gain": gain})
     bank["u"], bank["v"] = bank["u"][order[:rank]], bank["v"][:, order[:rank]]
     router |= {name: router[name][..., order] for name in method.score_arrays if name in router}
     return {**params, "bank": bank, "router": router}

@@ -27,7 +27,7 @@ from lorasp_jax.dense import AdaptedLayer, AdapterParam, Dense, validate
 from lorasp_jax.kernels.frozen_matmul import uses_float8
 from lorasp_jax.kernels.platform import multiplies_float8
 from lorasp_jax.kernels.quantized_weights import KINDS, Kind, QuantizedKernel, quantize_kernel
-from lorasp_jax.peft._fields import short
+from lorasp_jax.peft.fields import short
 
 # (id of a variable, equation, kind) -> (quantized variable, original variable, error). Storing the
 # original keeps its id valid.

@@ -31,8 +31,8 @@ from lorasp_jax.adapters.io.peft_full import (
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdaptedLayer, AdapterParam, validate
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA
-from lorasp_jax.peft._fields import short
-from lorasp_jax.peft._method import dropout_rate
+from lorasp_jax.peft.fields import short
+from lorasp_jax.peft.method import dropout_rate
 
 
 def dotted(path: str, index: tuple[int, ...]) -> str:

@@ -26,7 +26,7 @@ from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.base import digest
 from lorasp_jax.dense import AdapterParam, validate
 from lorasp_jax.peft import Method, to_settings
-from lorasp_jax.peft._fields import short
+from lorasp_jax.peft.fields import short
 
 TENSORS, DESCRIPTION = "adapter.safetensors", "adapter.json"
 FORMAT, VERSION = "lorasp_jax adapter", 2

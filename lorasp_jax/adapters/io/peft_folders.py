@@ -19,8 +19,8 @@ import numpy as np
 
 from lorasp_jax.adapters.io.name_patterns import values_of
 from lorasp_jax.adapters.io.native import read_bytes, read_tensors
-from lorasp_jax.peft._fields import short
-from lorasp_jax.peft._method import MAX_ALPHA, MAX_SIZE
+from lorasp_jax.peft.fields import short
+from lorasp_jax.peft.method import MAX_ALPHA, MAX_SIZE
 
 CONFIG, TENSORS = "adapter_config.json", "adapter_model.safetensors"
 PREFIX = "base_model.model."

@@ -17,7 +17,7 @@ from lorasp_jax.adapters import paths
 from lorasp_jax.adapters.io.peft_folders import PREFIX, Adapter, FullTensors
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdapterParam, Dense
-from lorasp_jax.peft._fields import short
+from lorasp_jax.peft.fields import short
 
 Names = Callable[[str, tuple[int, ...]], str]
 _TORCH_NAMES = {"kernel": "weight", "embedding": "weight", "scale": "weight", "bias": "bias"}

@@ -23,11 +23,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from lorasp_jax.dense import dense
+from lorasp_jax.dense import DenseLayer, apply_layer
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import Aux, Method
-from lorasp_jax.peft._fields import short
-from lorasp_jax.peft._method import Params
+from lorasp_jax.peft.fields import short
+from lorasp_jax.peft.method import Params
 
 LINEAR = "...i,io->...o"
 _EQUATION = re.compile(r"{0},([a-zA-Z]+)->{0}".format(r"([a-zA-Z]*(?:\.\.\.)?[a-zA-Z]*)"))
@@ -168,7 +168,7 @@ def einsum(
     def apply_dense(
         x: jax.Array, matrix: jax.Array, params: Any, key: Any
     ) -> tuple[jax.Array, Aux]:
-        return dense(x, matrix, None, params, method, key)
+        return apply_layer(DenseLayer(matrix, None, params, method, key), x, None)
 
     for _ in axes.batch:
         apply_dense = jax.vmap(apply_dense)

@@ -18,8 +18,8 @@ from lorasp_jax.adapters.layers import einsum
 from lorasp_jax.dense import AdaptedLayer, Dense, cast_input, reject_out_sharding, with_value
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import LoRA, Method
-from lorasp_jax.peft._fields import short
-from lorasp_jax.peft._method import dropout, dropout_rate
+from lorasp_jax.peft.fields import short
+from lorasp_jax.peft.method import dropout, dropout_rate
 
 Einsums = Mapping[type, Callable[[Any], tuple[str, str | None]]]
 """Functions layer -> (kernel name, equation), by NNX or Linen layer class. The equation is None for
@@ -58,7 +58,8 @@ class EinsumLayer(AdaptedLayer):
         Raises:
           ValueError: out_sharding is not None.
         """
-        reject_out_sharding(out_sharding)
+        if out_sharding is not None:
+            reject_out_sharding()
         kernel = self.kernel_variable().get_value()
         bias = None if getattr(self, "bias", None) is None else self.bias.get_value()
         params = None if self.adapter is None else self.adapter.get_value()

@@ -21,28 +21,18 @@ import functools
 import itertools
 import math
 from collections.abc import Sequence
-from typing import (
-    Any,
-    Literal,
-    NamedTuple,
-    Protocol,
-    TypeAlias,
-    TypeGuard,
-    TypeVar,
-    runtime_checkable,
-)
+from typing import Any, Literal, NamedTuple, TypeAlias, TypeGuard, TypeVar
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
 
 from lorasp_jax.dense import Dense
-from lorasp_jax.kernels.low_rank_matmul import base_plus_low_rank, pad_columns
+from lorasp_jax.kernels.low_rank_matmul import Bottleneck, base_plus_low_rank, pad_columns
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import Aux
-from lorasp_jax.peft._batched_bottleneck import BatchedBottleneck, VmapBottleneck
 
-Block = TypeVar("Block", bound="FusableModule")
+Block = TypeVar("Block", bound=nnx.Module)
 
 TILE, MIN_TILES = 64, 256
 """Output tile size of a matmul, and the number of tiles that saturate a GPU."""
@@ -56,7 +46,7 @@ take about 190 us as `SharedProjection` instead of 225 (816 tokens, LoRA-SP with
 class BottleneckSpec(NamedTuple):
     """The function f of n layers."""
 
-    kernel: BatchedBottleneck
+    f: Bottleneck
     width: int
     """Q, the number of columns of one layer's P."""
     out_sizes: tuple[int, ...]
@@ -153,13 +143,18 @@ Layer: TypeAlias = Dense | Prepared
 """A `Dense` or its prepared replacement."""
 
 
-@runtime_checkable
-class FusableModule(Protocol):
-    """Module that can fuse its layers with shared inputs."""
+def fuse_projections(module: nnx.Module, *, copy_kernels: bool = True) -> None:
+    """Fuse a module's own `Dense` layers in place, not its children's; see `fuse_layers`.
 
-    def fuse_projections(self, *, copy_kernels: bool = True) -> None:
-        """Fuse this module's own layers in place, not its children's; see `fuse_layers`."""
-        ...
+    Its class lists the names of layers with a shared input in `shared_inputs`, in call order.
+    """
+    groups = [*getattr(module, "shared_inputs", ())]
+    shared = {name for group in groups for name in group}
+    layers = [name for name, value in vars(module).items() if type(value) is Dense]
+    for names in (*groups, *((name,) for name in layers if name not in shared)):
+        own = [getattr(module, name) for name in names]
+        for name, layer in zip(names, fuse_layers(own, copy_kernels=copy_kernels), strict=True):
+            setattr(module, name, layer)
 
 
 def fuse_layers(layers: Sequence[Layer], *, copy_kernels: bool = True) -> list[Layer]:
@@ -176,11 +171,14 @@ def fuse_layers(layers: Sequence[Layer], *, copy_kernels: bool = True) -> list[L
       copy_kernels: whether to copy W, unless one is quantized; best unless the fused layers are
         called once.
     """
+    # A concatenated W would have to be dequantized, which is what quantization saves.
     copy_kernels = copy_kernels and not any(map(_is_quantized, layers))
     plain = [layer for layer in layers if _is_plain(layer)]
+    # Without adapters, one matmul of all W. A single such layer would gain nothing.
     same = len(plain) == len(layers) and len({layer.dtype for layer in plain}) == 1
     if copy_kernels and len(layers) > 1 and same:
         return [Prepared(_fused_kernels(plain)), *(Prepared() for _ in plain[1:])]
+    # One f for all layers needs one method, and one matmul needs one dtype.
     fusable = [layer for layer in layers if _is_fusable(layer)]
     fuse = _with_copied_kernels if copy_kernels else _shared_projection
     if len(fusable) == len(layers) and len({(layer.method, layer.dtype) for layer in fusable}) == 1:
@@ -188,16 +186,11 @@ def fuse_layers(layers: Sequence[Layer], *, copy_kernels: bool = True) -> list[L
     return [Prepared(fuse([layer])) if _is_fusable(layer) else layer for layer in layers]
 
 
-def fuse_layer(layer: Layer, *, copy_kernels: bool = True) -> Layer:
-    """`fuse_layers` for a single layer."""
-    return fuse_layers([layer], copy_kernels=copy_kernels)[0]
-
-
 def fuse_stack(blocks: Block) -> Block:
     """Prepare stacked modules [L, ...] without copying their kernels."""
 
     def fuse(block: Block) -> Block:
-        block.fuse_projections(copy_kernels=False)
+        fuse_projections(block, copy_kernels=False)
         return block
 
     return jax.vmap(fuse)(blocks)
@@ -209,6 +202,7 @@ def _call_fused(
     """Output y of each layer, and aux with leading axis n."""
     ends = list(itertools.accumulate(fused.bottleneck.out_sizes))
     projected = matmul(x, fused.input_matrix)
+    # x P follows x W in the same array, where f reads it.
     z, aux = _bottleneck(fused, projected, ends[-1], token_mask)
     y = projected[..., : ends[-1]] + z @ fused.output_matrix
     y = y if fused.bias is None else y + fused.bias
@@ -233,7 +227,7 @@ def _call_shared(
     for layer_z, kernel, up, bias in zip(
         zs, shared.kernels, shared.ups, shared.biases, strict=True
     ):
-        if up is None:
+        if up is None:  # [W; U] was joined
             y = pad_columns(jnp.concatenate([x, layer_z], axis=-1)) @ kernel.astype(x.dtype)
         else:
             y = base_plus_low_rank(x, layer_z, kernel, up)
@@ -251,9 +245,9 @@ def _bottleneck(
 
     The columns of x P begin at `start` in `projected`.
     """
-    kernel, width, out_sizes = arrays.bottleneck
+    f, width, out_sizes = arrays.bottleneck
     columns = range(start, start + len(out_sizes) * width, width)
-    z, aux = kernel.bottleneck_all(arrays.params, projected, columns, token_mask)
+    z, aux = f.stacked_bottlenecks(arrays.params, projected, columns, token_mask)
     return z.astype(projected.dtype), aux
 
 
@@ -269,6 +263,7 @@ def matmul(x: jax.Array, matrix: jax.Array) -> jax.Array:
         return x @ matrix
     x = x.reshape(*x.shape[:-1], splits, d_in // splits)
     matrix = matrix.reshape(splits, d_in // splits, d_out)
+    # fp32, so that the splits' sums are rounded once, as in one product.
     partial_sums = jnp.einsum("...pi,pio->p...o", x, matrix, preferred_element_type=jnp.float32)
     return partial_sums.sum(0).astype(x.dtype)
 
@@ -323,16 +318,18 @@ def _bottleneck_spec(
 ) -> tuple[BottleneckSpec, Any]:
     """The `BottleneckSpec`, and the parameters of f as in `FusedLayers`."""
     adapters = [layer.method_and_params() for layer in layers]
-    kernels = {method.fused_kernel(params) or VmapBottleneck(method) for method, params in adapters}
-    kernel = kernels.pop() if len(kernels) == 1 else VmapBottleneck(adapters[0][0])
+    # One kernel must fit all layers. After pruning, they may score different numbers of directions.
+    implementations = {method.implementation(params) for method, params in adapters}
+    f = implementations.pop() if len(implementations) == 1 else adapters[0][0]
 
+    # f does not read leaves whose shapes differ, such as LoRA's B, which is U.
     def stack(*leaves: jax.Array) -> jax.Array | None:
         return jnp.stack(leaves) if len({leaf.shape for leaf in leaves}) == 1 else None
 
-    packed = (kernel.pack(method.bottleneck_params(params)) for method, params in adapters)
+    packed = (f.pack(method.bottleneck_params(params)) for method, params in adapters)
     params = jax.tree.map(stack, *packed)
     out_sizes = tuple(layer.kernel_matrices().shape[1] for layer in layers)
-    return BottleneckSpec(kernel, downs[0].shape[1], out_sizes), params
+    return BottleneckSpec(f, downs[0].shape[1], out_sizes), params
 
 
 def _with_copied_kernels(layers: Sequence[Dense]) -> FusedLayers | SharedProjection:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax.adapters.layers.prepared import Layer, fuse_layer
+from lorasp_jax.adapters.layers.prepared import Layer
 from lorasp_jax.dense import Dense
 from lorasp_jax.models.backbone import Backbone, suffix_mask_and_positions
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig, VisionConfig
@@ -218,13 +218,6 @@ class Pi05(Pi0):
         self.time_mlp_in: Layer = Dense(width, width, **options)
         self.time_mlp_out: Layer = Dense(width, width, **options)
         self.action_out_proj: Layer = Dense(width, dim, **options)
-
-    def fuse_projections(self, *, copy_kernels: bool = True) -> None:
-        """See `prepared.FusableModule`. No two of these layers share an input."""
-        self.action_in_proj = fuse_layer(self.action_in_proj, copy_kernels=copy_kernels)
-        self.time_mlp_in = fuse_layer(self.time_mlp_in, copy_kernels=copy_kernels)
-        self.time_mlp_out = fuse_layer(self.time_mlp_out, copy_kernels=copy_kernels)
-        self.action_out_proj = fuse_layer(self.action_out_proj, copy_kernels=copy_kernels)
 
     def embed_suffix(
         self,

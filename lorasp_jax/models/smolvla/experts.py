@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax.adapters.layers.prepared import fuse_layer
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig
 from lorasp_jax.models.transformer.attention import attention
 from lorasp_jax.models.transformer.depth import ByLayer, scan_depth, stack
@@ -36,15 +35,10 @@ class SelfBlock(ExpertBlock):
 class CrossBlock(SelfBlock):
     """Cross-attention layer of the action expert."""
 
+    shared_inputs = (("gate_proj", "up_proj"),)  # q_proj has another input than k_proj and v_proj
+
     def __init__(self, size: ExpertConfig, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
         super().__init__(size, config, context=size.kv_heads * size.head_dim, rngs=rngs)
-
-    def fuse_projections(self, *, copy_kernels: bool = True) -> None:
-        """See `prepared.FusableModule`; q_proj, k_proj and v_proj have different inputs here."""
-        self.q_proj = fuse_layer(self.q_proj, copy_kernels=copy_kernels)
-        self.k_proj = fuse_layer(self.k_proj, copy_kernels=copy_kernels)
-        self.v_proj = fuse_layer(self.v_proj, copy_kernels=copy_kernels)
-        self.fuse_output_and_mlp(copy_kernels=copy_kernels)
 
     def project_cache(self, cache: KeysValues, valid: jax.Array) -> tuple[KeysValues, LayerAux]:
         """Compute this layer's keys and values `[B, P, K, H]` from the language model's.

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 from flax import nnx
 
-from lorasp_jax.adapters.layers.prepared import Layer, fuse_layer, fuse_layers
+from lorasp_jax.adapters.layers.prepared import Layer
 from lorasp_jax.dense import Dense
 from lorasp_jax.kernels.cached_attention import KeysValues
 from lorasp_jax.kernels.rematerialization import save_for_backward
@@ -37,6 +37,10 @@ class ExpertBlock(nnx.Module):
     The layer has no biases. Subclasses may override the norm and the activation.
     """
 
+    shared_inputs: tuple[tuple[str, ...], ...] = (
+        ("q_proj", "k_proj", "v_proj"),
+        ("gate_proj", "up_proj"),
+    )
     make_norm = staticmethod(RMSNorm)
     activation = staticmethod(functools.partial(jax.nn.gelu, approximate=True))
 
@@ -66,19 +70,6 @@ class ExpertBlock(nnx.Module):
         self.gate_proj: Layer = Dense(width, size.mlp, **options)
         self.up_proj: Layer = Dense(width, size.mlp, **options)
         self.down_proj: Layer = Dense(size.mlp, width, **options)
-
-    def fuse_projections(self, *, copy_kernels: bool = True) -> None:
-        """See `prepared.FusableModule`."""
-        qkv = self.q_proj, self.k_proj, self.v_proj
-        self.q_proj, self.k_proj, self.v_proj = fuse_layers(qkv, copy_kernels=copy_kernels)
-        self.fuse_output_and_mlp(copy_kernels=copy_kernels)
-
-    def fuse_output_and_mlp(self, *, copy_kernels: bool) -> None:
-        """Fuse the layers that `output_and_mlp` calls."""
-        self.o_proj = fuse_layer(self.o_proj, copy_kernels=copy_kernels)
-        gate_up = self.gate_proj, self.up_proj
-        self.gate_proj, self.up_proj = fuse_layers(gate_up, copy_kernels=copy_kernels)
-        self.down_proj = fuse_layer(self.down_proj, copy_kernels=copy_kernels)
 
     def __call__(
         self,

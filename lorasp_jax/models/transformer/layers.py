@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax.adapters.layers.prepared import Layer, Prepared, fuse_layer
-from lorasp_jax.dense import Dense, dense_shared_input
+from lorasp_jax.adapters.layers.prepared import Layer, Prepared
+from lorasp_jax.dense import Dense, cast_input, dense_shared_input
 from lorasp_jax.peft import Aux
 
 LayerAux = dict[str, Aux]
@@ -70,10 +70,6 @@ class AdaptiveRMSNorm(nnx.Module):
         self.dense: Layer = Dense(width, 3 * width, kernel_init=nnx.initializers.zeros, **options)
         self.eps = 1e-6
 
-    def fuse_projections(self, *, copy_kernels: bool = True) -> None:
-        """See `prepared.FusableModule`."""
-        self.dense = fuse_layer(self.dense, copy_kernels=copy_kernels)
-
     def normalize(
         self, x: jax.Array, condition: jax.Array | None
     ) -> tuple[jax.Array, jax.Array, LayerAux]:
@@ -129,11 +125,11 @@ def apply_to_shared_input(
         y `[B, T, O]` of each layer, and the adapters' aux by layer name.
     """
     dense = [layer for layer in layers.values() if type(layer) is Dense]
-    inputs = [layer.cast_input(x) for layer in dense]
     fused = []
-    if len({x.dtype for x in inputs}) == 1:
+    if len({layer.dtype for layer in dense}) == 1:
         arrays = [layer.arrays() for layer in dense]
-        fused = dense_shared_input(inputs[0], arrays, token_mask=token_mask)
+        x_cast = cast_input(dense[0].dtype, x, arrays[0].kernel)
+        fused = dense_shared_input(x_cast, arrays, token_mask=token_mask)
     fused_results, results = iter(fused), []
     for layer in layers.values():
         if isinstance(layer, Prepared):

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax.adapters.layers.prepared import Layer, fuse_layer, fuse_layers
+from lorasp_jax.adapters.layers.prepared import Layer
 from lorasp_jax.dense import Dense
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.transformer.attention import attention
@@ -14,6 +14,8 @@ from lorasp_jax.models.transformer.layers import LayerAux, LayerNorm, apply_to_s
 
 class VisionBlock(nnx.Module):
     """Pre-norm transformer layer with biases: attention, then an MLP with tanh-GELU."""
+
+    shared_inputs = (("q_proj", "k_proj", "v_proj"),)
 
     def __init__(self, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
         width, mlp = config.vision.width, config.vision.mlp
@@ -27,14 +29,6 @@ class VisionBlock(nnx.Module):
         self.layer_norm2: LayerNorm = LayerNorm(width, param_dtype=config.param_dtype)
         self.fc1: Layer = Dense(width, mlp, **options)
         self.fc2: Layer = Dense(mlp, width, **options)
-
-    def fuse_projections(self, *, copy_kernels: bool = True) -> None:
-        """See `prepared.FusableModule`."""
-        qkv = self.q_proj, self.k_proj, self.v_proj
-        self.q_proj, self.k_proj, self.v_proj = fuse_layers(qkv, copy_kernels=copy_kernels)
-        self.out_proj = fuse_layer(self.out_proj, copy_kernels=copy_kernels)
-        self.fc1 = fuse_layer(self.fc1, copy_kernels=copy_kernels)
-        self.fc2 = fuse_layer(self.fc2, copy_kernels=copy_kernels)
 
     def __call__(self, x: jax.Array, token_mask: jax.Array) -> tuple[jax.Array, LayerAux]:
         """Apply the layer to x `[B, T, D]`; also return the adapters' aux."""

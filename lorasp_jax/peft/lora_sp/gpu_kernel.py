@@ -5,17 +5,17 @@ Layers with a shared input run in one launch.
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from lorasp_jax.kernels.energy_gate import kept_energy, kept_flags
+from lorasp_jax.kernels.low_rank_matmul import Bottleneck
 from lorasp_jax.kernels.packing import PackedTree
 from lorasp_jax.kernels.rowwise_kernel import rowwise_kernel
-from lorasp_jax.peft._aux import Aux
-from lorasp_jax.peft._batched_bottleneck import BatchedBottleneck
+from lorasp_jax.peft.auxiliary import Aux
 from lorasp_jax.peft.lora_sp.bank import apply_masked_scores
 from lorasp_jax.peft.lora_sp.losses import Losses, LossSums, loss_sums
 from lorasp_jax.peft.lora_sp.router import router_scores
@@ -27,7 +27,7 @@ def supported_size(size: int) -> int:
 
 
 @dataclasses.dataclass(frozen=True)
-class FusedBottleneck(BatchedBottleneck):
+class FusedBottleneck(Bottleneck):
     """`LoRASP.bottleneck` with router "gelu", one mask per token and a constant η."""
 
     rank: int
@@ -49,10 +49,30 @@ class FusedBottleneck(BatchedBottleneck):
         """Pack the router into one flat array."""
         return PackedTree.of(params["router"])
 
-    def bottleneck_all(
+    def bottleneck(
+        self, params: Any, rows: jax.Array, token_mask: jax.Array | None
+    ) -> tuple[jax.Array, Aux]:
+        """Compute z and aux of a single layer."""
+        return self.bottlenecks([params], rows, [rows.shape[-1]], token_mask)[0]
+
+    def bottlenecks(
+        self,
+        params: Sequence[Any],
+        projected: jax.Array,
+        widths: Sequence[int],
+        token_mask: jax.Array | None,
+    ) -> list[tuple[jax.Array, Aux]]:
+        """Compute z and aux of each layer in one launch. All widths must be equal."""
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(self.pack, params))
+        columns = range(0, sum(widths), widths[0])
+        z, aux = self.stacked_bottlenecks(stacked, projected, columns, token_mask)
+        layer_aux = [jax.tree.map(lambda a, i=i: a[i], aux) for i in range(len(params))]
+        return list(zip(jnp.split(z, len(params), axis=-1), layer_aux, strict=True))
+
+    def stacked_bottlenecks(
         self, params: Any, projected: jax.Array, columns: range, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
-        """See `BatchedBottleneck.bottleneck_all`."""
+        """Compute z and aux of all layers; columns beyond theirs may hold anything."""
         tokens, n = projected.shape[:-1], len(columns)
         valid = jnp.ones(tokens, bool) if token_mask is None else token_mask
         z, sums, statistics = rowwise_kernel(

@@ -18,22 +18,15 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import optax
 
 from lorasp_jax.kernels.energy_gate import default_implementation, energy_gate, kept_energy
-from lorasp_jax.peft._aux import Aux
-from lorasp_jax.peft._method import Params, kaiming_uniform
+from lorasp_jax.kernels.low_rank_matmul import Bottleneck
+from lorasp_jax.peft.auxiliary import Aux
 from lorasp_jax.peft.lora_sp.bank import BankMethod, apply_masked_scores, init_bank
 from lorasp_jax.peft.lora_sp.gpu_kernel import FusedBottleneck
 from lorasp_jax.peft.lora_sp.losses import Losses, loss_sums
-from lorasp_jax.peft.lora_sp.router import (
-    Granularity,
-    Router,
-    init_output_layer,
-    pooled_scores,
-    router_scores,
-)
-from lorasp_jax.peft.lora_sp.schedule import PROGRESS, EnergySchedule, scheduled_gate, with_schedule
+from lorasp_jax.peft.lora_sp.router import Router, init_output_layer, router_scores
+from lorasp_jax.peft.method import Params, kaiming_uniform
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,8 +34,7 @@ class LoRASP(BankMethod):
     """Adapter with an input-dependent active rank.
 
     Parameters: bank.u [R, O], bank.v [I, R]; router.w1 [I, H], w2 [H, R] and, unless the router is
-    "softmax", b1 [H], b2 [R]. In total R (I + O) + H (I + R), plus H + R for the biases. A
-    normalized bank adds a scalar (bank.gain), and so does a schedule of η (progress).
+    "softmax", b1 [H], b2 [R]. In total R (I + O) + H (I + R), plus H + R for the biases.
 
     Raises:
       ValueError: a rank or width below 1, or η outside (0, 1].
@@ -60,14 +52,6 @@ class LoRASP(BankMethod):
     """"gelu": GELU hidden layer with biases, softplus scores that are initially 1. "gelu_relu": the
     same with ReLU scores. "gelu_softmax": the same with R times the softmax over directions.
     "softmax": softmax hidden layer, no biases, 0/1 matrix as initial second layer (Table I)."""
-    granularity: Granularity = "token"
-    """Scope of a mask: one per "token", per "sample" (shared over the last token axis), or per
-    "layer" (shared over the whole batch). Shared masks use `pooled_scores`."""
-    schedule: EnergySchedule | None = None
-    """Training schedule of η, ending at `energy_target`; None keeps η constant."""
-    normalized_bank: bool = False
-    """Keep the bank's directions orthonormal, so that eq. (4), ‖ΔW - ΔW_k‖ = √(1 - E_k) ‖ΔW‖, holds
-    and score energy is proportional to ΔW energy (see `bank`). Requires R <= max(I, O)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -88,16 +72,13 @@ class LoRASP(BankMethod):
         return "w2", "b2"
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
-        """Initialize V and the router randomly and U (or the gain) to zero; the delta is zero."""
+        """Initialize V and the router randomly and U to zero; the delta is zero."""
         input_key, score_key = jax.random.split(key)
         # V and W1 share a distribution: draw them together to compile once.
         inputs = kaiming_uniform(input_key, (d_in, self.rank + self.hidden_width))
         v, w1 = jnp.split(inputs, [self.rank], axis=1)
-        bank_key = jax.random.fold_in(key, 1)
-        bank = init_bank(bank_key, v, d_out, normalized=self.normalized_bank)
         output_layer = init_output_layer(score_key, self.router, self.hidden_width, self.rank)
-        params = {"bank": bank, "router": {"w1": w1, **output_layer}}
-        return params | ({PROGRESS: jnp.zeros(())} if self.schedule else {})
+        return {"bank": init_bank(v, d_out), "router": {"w1": w1, **output_layer}}
 
     def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
@@ -107,7 +88,9 @@ class LoRASP(BankMethod):
         valid = jnp.ones(tokens, bool) if token_mask is None else token_mask
         v_x, hidden = jnp.split(rows.reshape(-1, rows.shape[-1]), [self.rank], axis=1)
         scores, logits = router_scores(params["router"], hidden, self.router)
-        mask = self._mask(params, scores, valid)
+        mask, _, _ = energy_gate(scores, self.energy_target)
+        if scores.shape[-1] > self.rank:  # the others' directions were removed by pruning
+            mask &= jnp.arange(scores.shape[-1]) < self.rank
         energy = kept_energy(scores, mask)[:, None]
         z = apply_masked_scores(v_x, self.scale * scores, mask, energy)
         sums = loss_sums(scores, logits, mask, energy, valid.reshape(-1, 1))
@@ -115,32 +98,11 @@ class LoRASP(BankMethod):
         aux = Aux(active_rank, energy.reshape(tokens), Losses(sums), usage=sums.kept)
         return z.reshape(*tokens, self.rank), aux
 
-    def _mask(self, params: Params, scores: jax.Array, valid: jax.Array) -> jax.Array:
-        """The gate's mask for scores [T, n], n >= R: bool [T, n], False for pruned directions."""
-        by_token = scores.reshape(*valid.shape, scores.shape[-1])
-        pooled = pooled_scores(by_token, valid, self.granularity)
-        if self.schedule is None:
-            mask, _, _ = energy_gate(pooled, self.energy_target)
-        else:
-            mask = scheduled_gate(
-                pooled, self.schedule.target(params[PROGRESS], self.energy_target)
-            )
-        if scores.shape[-1] > self.rank:
-            mask &= jnp.arange(scores.shape[-1]) < self.rank
-        return jnp.broadcast_to(mask, by_token.shape).reshape(scores.shape)
-
-    def fused_kernel(self, params: Params) -> FusedBottleneck | None:
-        """A fused NVIDIA GPU kernel for the default router and gate; None if it does not apply."""
+    def implementation(self, params: Params) -> Bottleneck:
+        """A fused kernel on an NVIDIA GPU, for the default router and sizes that it supports."""
         num_scores = params["router"]["w2"].shape[-1]
-        default = (self.router, self.granularity, self.schedule) == ("gelu", "token", None)
-        if not default or default_implementation(num_scores) != "pallas":
-            return None
+        if self.router != "gelu" or default_implementation() != "pallas":
+            return self
         sizes = self.rank, num_scores, self.hidden_width
         kernel = FusedBottleneck(*sizes, self.energy_target, self.scale)
-        return kernel if kernel.is_supported else None
-
-    def transform(
-        self, optimizer: optax.GradientTransformation, total_steps: int
-    ) -> optax.GradientTransformation:
-        """Wrap the optimizer to advance a scheduled η over `total_steps` steps."""
-        return optimizer if self.schedule is None else with_schedule(optimizer, total_steps)
+        return kernel if kernel.is_supported else self

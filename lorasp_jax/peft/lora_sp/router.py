@@ -1,7 +1,4 @@
-"""LoRA-SP's router: eq. (10) of the paper (arXiv 2603.07404), and score pooling.
-
-Everything is in fp32.
-"""
+"""LoRA-SP's router: eq. (10) of the paper (arXiv 2603.07404), in fp32."""
 
 import functools
 import math
@@ -13,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 
 Router = Literal["gelu", "gelu_relu", "gelu_softmax", "softmax"]
-Granularity = Literal["token", "sample", "layer"]
 
 SCORE_INIT_STD = 0.01
 INVERSE_SOFTPLUS_OF_ONE = math.log(math.e - 1)
@@ -111,29 +107,3 @@ def _(primals: tuple[jax.Array], tangents: tuple[jax.Array]) -> tuple[jax.Array,
     (x,), (tangent,) = primals, tangents
     e = jnp.exp(-jnp.abs(x))
     return softplus(x), tangent * jnp.where(x < 0, e, 1) / (1 + e)
-
-
-def pooled_scores(scores: jax.Array, valid: jax.Array, granularity: Granularity) -> jax.Array:
-    """Root mean square of the scores over the valid tokens that share a mask.
-
-    Directions that hold a fraction η of the pooled energy hold η of these tokens' total energy,
-    though not necessarily η of each token's.
-
-    Args:
-      scores: f32 [...tokens, R].
-      valid: bool [...tokens], False for padding.
-      granularity: "token": no pooling. "sample": over the last token axis. "layer": over all token
-        axes, the whole batch.
-
-    Returns:
-      f32 [...tokens, R], pooled axes reduced to size 1. Scores without token axes are returned
-      unchanged.
-    """
-    if granularity == "token" or scores.ndim == 1:
-        return scores
-    # The mask needs no gradient, and the gradient of the square root is infinite at 0.
-    scores = jax.lax.stop_gradient(scores)
-    axes = (scores.ndim - 2,) if granularity == "sample" else tuple(range(scores.ndim - 1))
-    valid = valid[..., None]
-    total = jnp.where(valid, jnp.square(scores), 0).sum(axes, keepdims=True)
-    return jnp.sqrt(total / jnp.maximum(valid.sum(axes, keepdims=True), 1))

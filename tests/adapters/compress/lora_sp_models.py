@@ -5,19 +5,17 @@ from flax import nnx
 
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.dense import AdapterParam, Dense
-from lorasp_jax.peft import EnergySchedule, LoRASP, LoRASPRelease
+from lorasp_jax.peft import LoRASP, LoRASPRelease
 from tests.adapters.test_adaptation import Net
 
 RANK = 12
 TOKENS = 40
 VARIANTS = [
     LoRASP(rank=RANK, hidden_width=4, energy_target=0.6),
-    LoRASP(RANK, 0.6, hidden_width=4, granularity="sample", schedule=EnergySchedule(0.7)),
     LoRASP(rank=4, hidden_width=2, energy_target=0.6, router="softmax"),
-    LoRASP(rank=4, hidden_width=4, energy_target=0.6, normalized_bank=True),
     LoRASPRelease(rank=RANK, energy_target=0.5),
 ]
-IDS = ["default", "sample", "softmax", "normalized", "release"]
+IDS = ["default", "softmax", "release"]
 
 
 def perturbed(model, seed=0, size=1.0):
@@ -31,8 +29,6 @@ def perturbed(model, seed=0, size=1.0):
             noisy = [p if p.ndim < 1 else p + jax.random.normal(k, p.shape) for k, p in pairs]
             params = jax.tree.unflatten(structure, noisy)
             params["bank"]["u"] *= size
-            if "gain" in params["bank"]:
-                params["bank"]["gain"] += 0.3
             location.child.adapter = AdapterParam(params)
     return model
 

@@ -184,3 +184,24 @@ def test_files_larger_than_memory(saved, name):
     os.truncate(saved / name, 2**43)
     with pytest.raises(ValueError, match=f"{name} has 8796093022208 bytes, more than"):
         load_adapters(saved, Net(nnx.Rngs(0)))
+
+
+def test_settings_that_name_removed_options():
+    """Options that LoRA-SP no longer has load at their former defaults, else are refused."""
+    method = peft.LoRASP(rank=8)
+    removed = {"granularity": "token", "schedule": None, "normalized_bank": False}
+    assert peft.from_settings(peft.to_settings(method) | removed) == method
+    for other in (
+        {"granularity": "sample"},
+        {"schedule": {"start": 0.5}},
+        {"normalized_bank": True},
+    ):
+        (name,) = other
+        with pytest.raises(ValueError, match=name):
+            peft.from_settings(peft.to_settings(method) | removed | other)
+
+
+@pytest.mark.parametrize("name", peft.names())
+def test_settings_round_trip(name):
+    method = peft.create(name)
+    assert peft.from_settings(json.loads(json.dumps(peft.to_settings(method)))) == method

@@ -26,16 +26,13 @@ FUSABLE = [name for name in METHODS if name not in ("full", "dora", "lora_moe")]
 class Net(nnx.Module):
     """Two layers with a shared input, one of them with a bias, and a third one."""
 
+    shared_inputs = (("first", "second"),)
+
     def __init__(self, dtype="bfloat16"):
         options = {"dtype": dtype, "rngs": nnx.Rngs(0)}
         self.first = Dense(8, 8, **options, use_bias=False)
         self.second = Dense(8, 12, **options)
         self.third = Dense(8, 8, **options)
-
-    def fuse_projections(self, *, copy_kernels=True):
-        pair = self.first, self.second
-        self.first, self.second = prepared.fuse_layers(pair, copy_kernels=copy_kernels)
-        self.third = prepared.fuse_layer(self.third, copy_kernels=copy_kernels)
 
     def __call__(self, x, token_mask=None):
         (first, second), aux = apply_to_shared_input(
@@ -53,7 +50,7 @@ def adapted(method, dtype="bfloat16"):
 
 def prepare(model):
     model = nnx.merge(*nnx.split(model))
-    model.fuse_projections()
+    prepared.fuse_projections(model)
     return model
 
 
@@ -148,7 +145,7 @@ def test_fused_quantized_layers_match_the_original_ones():
 def test_kernels_stay_quantized_if_they_are_not_copied():
     model = quantize(adapted(METHODS["lora"], "float32"), [(".*", "int8")]).model
     expected, x = model(jnp.ones((6, 8)))[0], jnp.ones((6, 8))
-    model.fuse_projections(copy_kernels=False)
+    prepared.fuse_projections(model, copy_kernels=False)
     codes = [leaf for leaf in jax.tree.leaves(nnx.state(model)) if leaf.dtype == jnp.int8]
     assert len(codes) == 3
     np.testing.assert_allclose(model(x)[0], expected, rtol=1e-4, atol=1e-4)
@@ -217,7 +214,7 @@ def test_quantized_layers_are_fused_after_they_are_dequantized(kind):
 
 def test_layers_without_adapters_are_not_fused_if_that_would_copy():
     model = Net("float32")
-    model.fuse_projections(copy_kernels=False)
+    prepared.fuse_projections(model, copy_kernels=False)
     assert type(model.first) is Dense
     mixed = Net("float32")
     mixed.second.dtype = "bfloat16"

@@ -8,11 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lorasp_jax.dense import DenseLayer, dense, dense_shared_input
 from lorasp_jax.kernels import rowwise_kernel
-from lorasp_jax.kernels.energy_gate import energy_gate
-from lorasp_jax.peft import EnergySchedule, LoRA, LoRASP
-from lorasp_jax.peft._shared_input import apply_shared_input
-from lorasp_jax.peft.lora_sp import bank, gpu_kernel, losses
+from lorasp_jax.peft import LoRA, LoRASP
+from lorasp_jax.peft.lora_sp import gpu_kernel, losses
 from lorasp_jax.peft.lora_sp.gpu_kernel import FusedBottleneck
 from lorasp_jax.peft.lora_sp.router import router_scores
 from tests.jaxprs import primitives
@@ -40,20 +39,6 @@ def losses_of(scores, kept_energy=1.0, valid=None):
     energy = jnp.broadcast_to(jnp.asarray(kept_energy).reshape(-1, 1), (len(scores), 1))
     sums = losses.loss_sums(scores, scores, scores > 0, energy, valid)
     return losses.spectral_loss(sums), losses.balance_loss(sums), losses.z_loss(sums)
-
-
-@pytest.mark.parametrize(
-    ("method", "router"),
-    [
-        (LoRASP(), 32 * (D_IN + 128) + 32 + 128),
-        (LoRASP(rank=64, hidden_width=8), 8 * (D_IN + 64) + 8 + 64),
-        (LoRASP.paper(), 4 * (D_IN + 128)),
-    ],
-)
-def test_parameter_count(method, router):
-    shapes = jax.eval_shape(lambda key: method.init(key, KERNEL)[0], jax.random.key(0))
-    count = sum(leaf.size for leaf in jax.tree.leaves(shapes))
-    assert count == method.rank * (D_IN + D_OUT) + router
 
 
 def test_initial_scores_are_one(x):
@@ -86,38 +71,6 @@ def test_unit_scores_and_full_target_equal_lora(x):
     np.testing.assert_array_equal(aux.active_rank, 16)
 
 
-def test_update_equals_u_sigma_v(x):
-    """Eqs. (9) and (11) for a single token."""
-    method = LoRASP(rank=16, energy_target=0.7, alpha=4.0)
-    params = initial(method)
-    params["bank"]["u"] = jax.random.normal(jax.random.key(2), (16, D_OUT))
-    params["router"]["w2"] = jax.random.normal(jax.random.key(3), (32, 16))
-    delta, aux = jax.jit(method.delta)(params, x)
-    scores, _ = scores_of(params["router"], x)
-    mask = np.asarray(jax.jit(lambda s: energy_gate(s, 0.7)[0])(scores))
-    u, v = np.asarray(params["bank"]["u"]), np.asarray(params["bank"]["v"])
-    token = np.asarray(x)[1, 4]
-    expected = 4 / 16 * token @ v @ np.diag(np.where(mask, scores, 0)[1, 4]) @ u
-    np.testing.assert_allclose(delta[1, 4], expected, rtol=1e-4, atol=1e-5)
-    assert 0 < aux.active_rank.mean() < 16
-    assert (aux.kept_energy >= 0.7 - 1e-6).all()
-
-
-def test_pruned_directions_get_no_task_gradient(x):
-    method = LoRASP(rank=16, energy_target=0.5)
-    params = initial(method)
-    params["bank"]["u"] = jnp.ones((16, D_OUT))
-
-    def task(shift):
-        scores = scores_of(params["router"], x)[0] + shift
-        mask, _, energy = energy_gate(scores, 0.5)
-        z = bank.apply_masked_scores(x @ params["bank"]["v"], scores, mask, energy[..., None])
-        return z.sum(), mask
-
-    gradient, mask = jax.jit(jax.grad(task, has_aux=True))(jnp.zeros((3, 7, 16)))
-    np.testing.assert_array_equal(gradient != 0, mask)
-
-
 def test_losses_of_uniform_and_concentrated_scores():
     """Balance is 1 for uniform use and R for a single direction; z is 0 for zero logits."""
     uniform, single = jnp.ones((5, 8)), jnp.eye(8)[jnp.zeros(5, int)]
@@ -134,7 +87,7 @@ def test_losses_of_uniform_and_concentrated_scores():
 class WithFusedKernel(LoRASP):
     """Always use the fused kernel: Triton's on a GPU, interpreted elsewhere."""
 
-    def fused_kernel(self, params):
+    def implementation(self, params):
         interpret = jax.default_backend() != "gpu"
         sizes = self.rank, params["router"]["w2"].shape[-1], self.hidden_width
         return FusedBottleneck(*sizes, self.energy_target, self.scale, interpret=interpret)
@@ -195,8 +148,9 @@ def test_layers_with_a_shared_input_share_a_kernel(x):
     mask = jax.random.bernoulli(jax.random.key(4), 0.6, x.shape[:2])
 
     def shared(params, x):
-        layers = [(method, p, w) for p, w in zip(params, weights, strict=True)]
-        return apply_shared_input(layers, x, token_mask=mask)
+        pairs = zip(params, weights, strict=True)
+        arrays = [DenseLayer(w, None, p, method) for p, w in pairs]
+        return dense_shared_input(x, arrays, token_mask=mask)
 
     def separate(params, x):
         pairs = zip(params, weights, strict=True)
@@ -226,7 +180,6 @@ def test_layers_with_a_shared_input_share_a_kernel(x):
         (LoRASP(hidden_width=8), ["energy_gate"]),
         (LoRASP.paper(rank=64), ["energy_gate"]),
         (LoRASP(rank=64, router="gelu_relu"), ["energy_gate"]),
-        (LoRASP(rank=64, schedule=EnergySchedule()), []),
     ],
 )
 def test_kernels_on_an_nvidia_gpu(x, method, kernels):
@@ -251,7 +204,7 @@ def test_pruned_directions_are_scored_but_inactive(x):
     np.testing.assert_allclose(aux.kept_energy, 8 / 12, atol=0.05)
     router = params["router"] | {"b2": params["router"]["b2"][:10]}
     with pytest.raises(ValueError, match=r"needs router/b2 \[12\], got \[10\]"):
-        method.apply({"bank": bank, "router": router}, x, jnp.ones((D_IN, D_OUT)))
+        dense(x, jnp.ones((D_IN, D_OUT)), None, {"bank": bank, "router": router}, method)
 
 
 def test_softmax_router_covers_any_rank():
@@ -288,23 +241,6 @@ def test_nan_parameters_propagate(x, monkeypatch, path):
     assert jnp.isnan(y).all()
     if part == "router":
         assert all(jnp.isnan(value) for value in aux.losses.values())
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"energy_target": 0.0}, r"energy_target must lie in \(0, 1\], got 0.0"),
-        ({"energy_target": 1.5}, r"energy_target must lie in \(0, 1\], got 1.5"),
-        ({"rank": 0}, "at least 1"),
-        ({"hidden_width": 0}, "hidden_width must be at least 1, got 0"),
-        ({"router": "relu"}, "router must be one of 'gelu', .*, 'softmax', got 'relu'"),
-        ({"granularity": "batch"}, "granularity must be one of 'token', 'sample', 'layer'"),
-        ({"schedule": 0.5}, "schedule must be EnergySchedule or None, got 0.5"),
-    ],
-)
-def test_invalid_fields(fields, message):
-    with pytest.raises(ValueError, match=message):
-        LoRASP(**fields)
 
 
 def test_scale_follows_alpha():

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from lorasp_jax.peft._fields import short
+from lorasp_jax.peft.fields import short
 
 
 @jax.tree_util.register_dataclass

@@ -1,4 +1,4 @@
-"""Check the fields of a dataclass against their annotations."""
+"""Check what a user passes: fields of a dataclass, numbers, keys and kernels."""
 
 import dataclasses
 import difflib
@@ -6,6 +6,9 @@ import types
 import typing
 from collections.abc import Iterable, Sequence
 from typing import Any
+
+import jax
+import jax.numpy as jnp
 
 MAX_FLOAT32 = (2 - 2**-23) * 2.0**127
 MAX_QUOTED = 300
@@ -61,6 +64,24 @@ def positive_int(name: str, value: Any, maximum: int = MAX_INT) -> int:
     if type(value) is not int or not 1 <= value <= maximum:
         raise ValueError(f"{name} must be an integer from 1 to {maximum}, got {short(value)}")
     return value
+
+
+def checked_key(value: Any) -> jax.Array:
+    """Return a single `jax.random` key; raise ValueError for anything else."""
+    dtype, shape = (value.dtype, value.shape) if is_array(value) else (None, None)
+    typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
+    # Raw keys: threefry has 2 words, rbg 4.
+    if not typed and (dtype != jnp.uint32 or shape not in ((2,), (4,))):
+        raise ValueError(f"key must be a PRNG key such as jax.random.key(0), got {short(value)}")
+    return value
+
+
+def check_kernel(kernel: Any) -> None:
+    """Raise ValueError unless the kernel is a floating-point matrix, or the shape of one."""
+    shape, dtype = getattr(kernel, "shape", ()), getattr(kernel, "dtype", int)
+    if len(shape) != 2 or 0 in shape or not jnp.issubdtype(dtype, jnp.floating):
+        actual = f"{dtype} {list(shape)}" if hasattr(kernel, "dtype") else type(kernel).__name__
+        raise ValueError(f"an adapter needs a floating-point kernel [I, O], got {actual}")
 
 
 def short(value: Any) -> str:

@@ -13,10 +13,9 @@ import jax.numpy as jnp
 import optax
 
 from lorasp_jax.kernels.frozen_matmul import frozen_matmul
-from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul
-from lorasp_jax.peft import _fields, _validate
-from lorasp_jax.peft._aux import Aux
-from lorasp_jax.peft._batched_bottleneck import BatchedBottleneck
+from lorasp_jax.kernels.low_rank_matmul import Bottleneck, LowRankLayer, low_rank_matmul
+from lorasp_jax.peft import fields
+from lorasp_jax.peft.auxiliary import Aux
 
 Params: TypeAlias = Any
 
@@ -30,13 +29,16 @@ class ShapeLike(Protocol):
 
 Kernel: TypeAlias = jax.Array | ShapeLike
 
+Shapes: TypeAlias = dict[str, tuple[int, ...]]
+"""Shapes of parameters by path, such as "router/w2"."""
+
 MAX_SIZE = 2**20
 """Upper bound for ranks and widths. Larger values are likely mistakes."""
 MAX_ALPHA = 1e30
 """Upper bound for |α| and 1/|α|, so that α/R neither overflows nor underflows in fp32."""
 
 
-class Method:
+class Method(Bottleneck):
     """Base class.
 
     An additive method implements `init_params`, `down`, `bottleneck`, `up` and `merge`:
@@ -48,9 +50,9 @@ class Method:
     adapter are fp32.
     """
 
-    def __new__(cls, *values: Any, **fields: Any) -> "Method":
+    def __new__(cls, *values: Any, **named: Any) -> "Method":
         """Raise ValueError for an unknown field, where Python would raise TypeError."""
-        _fields.check_names(cls, name_of(cls), values, fields)
+        fields.check_names(cls, name_of(cls), values, named)
         return super().__new__(cls)
 
     def __post_init__(self) -> None:
@@ -59,7 +61,7 @@ class Method:
             value = getattr(self, field.name)
             if type(value) is int and value > MAX_SIZE:
                 raise ValueError(f"{field.name} must be at most {MAX_SIZE}, got {value}")
-        _fields.check_fields(self)
+        fields.check_fields(self)
         alpha = getattr(self, "alpha", None)
         if alpha is not None and not 1 / MAX_ALPHA <= abs(alpha) <= MAX_ALPHA:
             raise ValueError(
@@ -72,6 +74,8 @@ class Method:
     """True if the method trains the base weights themselves."""
     additive: ClassVar[bool] = True
     """True if the adapted layer computes x @ kernel + delta."""
+    is_low_rank_sum: ClassVar[bool] = True
+    """True if the layer computes exactly x W + z U; False for a method that overrides `apply`."""
 
     @property
     def splits_kernel(self) -> bool:
@@ -82,11 +86,6 @@ class Method:
     def down_in_fp32(self) -> bool:
         """True to keep x P in fp32, whatever the dtype of x."""
         return False
-
-    @property
-    def is_low_rank_sum(self) -> bool:
-        """True if the method does not override `apply`, so the layer computes exactly x W + z U."""
-        return type(self).apply is Method.apply
 
     @property
     def name(self) -> str:
@@ -120,8 +119,8 @@ class Method:
           ValueError: the kernel is not a matrix, or `key` is not a random key.
         """
         del statistics
-        _validate.matrix(kernel)
-        return self.init_params(_validate.key(key), *kernel.shape), kernel
+        fields.check_kernel(kernel)
+        return self.init_params(fields.checked_key(key), *kernel.shape), kernel
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
         """Initialize parameters for a kernel [d_in, d_out]; a pure function of key and shape."""
@@ -150,9 +149,10 @@ class Method:
         """
         raise NotImplementedError
 
-    def fused_kernel(self, params: Params) -> BatchedBottleneck | None:
-        """A fused GPU kernel for `bottleneck`, or None if none supports these parameters."""
+    def implementation(self, params: Params) -> Bottleneck:
+        """What computes `bottleneck` for these parameters: the method itself, or a fused kernel."""
         del params
+        return self
 
     def up(self, params: Params) -> jax.Array:
         """Up-projection U [R, O]."""
@@ -169,25 +169,21 @@ class Method:
           token_mask: bool [...tokens]; False marks padding, excluded from losses and statistics.
 
         Raises:
-          ValueError: the method is not additive, x or the mask has the wrong shape or dtype, or
-            the parameters belong to another method.
+          ValueError: the method is not additive.
         """
-        _validate.tokens(x, token_mask)
         if not self.additive:
             raise ValueError(f"{type(self).__name__} is not additive and has no delta; use apply")
         z, aux = self.bottleneck_from_input(params, x, token_mask)
-        up = self.up(params).astype(x.dtype)
-        self._check_params(params, (x.shape[-1], up.shape[-1]))
-        return z @ up, dataclasses.replace(aux, token_mask=token_mask)
+        return z @ self.up(params).astype(x.dtype), dataclasses.replace(aux, token_mask=token_mask)
 
     def bottleneck_from_input(
         self, params: Params, x: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
         """Compute z [...tokens, R], in the dtype of x, and aux from x itself."""
         down = self.down(params).astype(x.dtype)
-        rows = jnp.matmul(x, down, preferred_element_type=self.rows_dtype(x))
-        implementation = self.fused_kernel(params) or self
-        z, aux = implementation.bottleneck(self.bottleneck_params(params), rows, token_mask)
+        rows = jnp.matmul(x, down, preferred_element_type=self.rows_dtype(x.dtype))
+        f = self.implementation(params)
+        z, aux = f.bottleneck(self.bottleneck_params(params), rows, token_mask)
         return z.astype(x.dtype), aux
 
     def apply(
@@ -200,17 +196,11 @@ class Method:
     ) -> tuple[jax.Array, Aux]:
         """Apply the adapted linear layer without its bias: x @ kernel + delta, [...tokens, O].
 
-        `kernel` receives no gradient. See `delta` for the other arguments.
-
-        Raises:
-          ValueError: x, the mask or the kernel has the wrong shape or dtype, or the parameters
-            belong to another method.
+        `kernel` receives no gradient. See `delta` for the other arguments. Nothing is checked here;
+        `lorasp_jax.dense.dense` does that.
         """
-        _validate.tokens(x, token_mask)
-        self.check(params, x, kernel)
-        implementation = self.fused_kernel(params) or self
-        layer = self.low_rank_layer(params, kernel)
-        ((y, aux),) = low_rank_matmul((implementation,), self.rows_dtype(x), [layer], x, token_mask)
+        f, layer = self.implementation(params), self.low_rank_layer(params, kernel)
+        ((y, aux),) = low_rank_matmul(f, self.rows_dtype(x.dtype), [layer], x, token_mask)
         return y, dataclasses.replace(aux, token_mask=token_mask)
 
     def apply_with_dropout(
@@ -241,24 +231,11 @@ class Method:
         bottleneck_params = self.bottleneck_params(params)
         return LowRankLayer(bottleneck_params, kernel, self.down(params), self.up(params))
 
-    def rows_dtype(self, x: jax.Array) -> Any:
-        """The dtype of x P."""
-        return jnp.float32 if self.down_in_fp32 else x.dtype
+    def rows_dtype(self, dtype: Any) -> Any:
+        """The dtype of x P, for the dtype of x."""
+        return jnp.float32 if self.down_in_fp32 else dtype
 
-    def check(self, params: Params, x: jax.Array, kernel: jax.Array) -> None:
-        """Raise ValueError unless the shapes of x, kernel and parameters match."""
-        _validate.matrix(kernel)
-        if x.shape[-1] != kernel.shape[0]:
-            raise ValueError(
-                f"input width {x.shape[-1]} does not match kernel shape {list(kernel.shape)}"
-            )
-        self._check_params(params, kernel.shape)
-
-    def _check_params(self, params: Params, shape: tuple[int, ...]) -> None:
-        if type(self).init_params is not Method.init_params:
-            _validate.params(self, params, shape)
-
-    def shapes(self, initial: _validate.Shapes, actual: _validate.Shapes) -> _validate.Shapes:
+    def shapes(self, initial: Shapes, actual: Shapes) -> Shapes:
         """The shapes that parameters must have.
 
         Args:
