@@ -2,7 +2,7 @@
 
 import dataclasses
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,11 +26,19 @@ UNADAPTED = "base"
 
 @dataclass(frozen=True)
 class Loaded:
-    """Policies and their tokenizers by adapter name; metadata for clients."""
+    """A policy that was loaded.
 
-    policies: dict[str, Policy]
-    words: dict[str, Tokenizer]
-    metadata: dict[str, Any]
+    Attributes:
+        policy: the policy.
+        words: its tokenizer.
+        continues: whether it was trained to continue chunks; None: its files do not say.
+        metadata: what they say of its robot.
+    """
+
+    policy: Policy
+    words: Tokenizer
+    continues: bool | None = None
+    metadata: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -66,48 +74,22 @@ def is_run(where: str | os.PathLike[str]) -> bool:
     return (path / native.DESCRIPTION).is_file() or (path / export.BASE).is_dir()
 
 
-def load_runs(runs: Mapping[str, str], *, base: str = "", words: str = "") -> Loaded:
-    """Load finished runs.
-
-    Args:
-        runs: name -> folder.
-        base: location of the frozen base, if it has moved.
-        words: location of the tokenizer, if it has moved.
-
-    Raises:
-        ValueError: see `load_policy`; or the runs are for different robots or control periods.
-    """
-    policies, tokenizers, metadata = {}, {}, {}
-    for name, folder in runs.items():
-        described = export.describe(folder)
-        policies[name] = export.load_policy(folder, base=base, words=words)
-        recorded = hub.resolve_portable(described["policy"]["tokenizer"])
-        tokenizers[name] = tokenizer.load_tokenizer(words or recorded)
-        own = {key: described.get(key) for key in ("robot", "control_dt")}
-        if metadata and own != metadata:
-            raise ValueError(f"the runs must agree on robot and control_dt, got {metadata}, {own}")
-        metadata = own
-    return Loaded(policies, tokenizers, metadata)
+def load_run(folder: str, *, base: str = "", words: str = "") -> Loaded:
+    """Load a finished run; arguments and errors are those of `load_policy`."""
+    described = export.describe(folder)
+    policy = export.load_policy(folder, base=base, words=words)
+    recorded = hub.resolve_portable(described["policy"]["tokenizer"])
+    config = read_json(Path(folder) / CONFIG_FILE, {"optim": {}})
+    return Loaded(
+        policy,
+        tokenizer.load_tokenizer(words or recorded),
+        continues=bool(config["optim"].get("rtc_max_delay")) if config else None,
+        metadata={key: described.get(key) for key in ("robot", "control_dt")},
+    )
 
 
-def was_trained(run: str | os.PathLike[str]) -> bool | None:
-    """Return whether a run was trained to continue chunks; None if it does not say."""
-    config = read_json(Path(run) / CONFIG_FILE, {"optim": {}})
-    return bool(config["optim"].get("rtc_max_delay")) if config else None
-
-
-def check_trained(runs: Iterable[str]) -> None:
-    """Raise ValueError unless runs were trained to continue chunks, as far as they say."""
-    for folder in runs:
-        if was_trained(folder) is False:
-            raise ValueError(
-                f"{folder} was not trained to continue chunks (--optim.rtc-max-delay): use "
-                "--execution guided"
-            )
-
-
-def load_checkpoint(checkpoint: Checkpoint) -> Loaded:
-    """Load a published checkpoint.
+def load_checkpoint(checkpoint: Checkpoint) -> dict[str, Loaded]:
+    """Load a published checkpoint, as `UNADAPTED` and with each of its adapters.
 
     Raises:
         ValueError: something is missing or does not fit; see `models.load`, `statistics_files.read`
@@ -142,8 +124,7 @@ def load_checkpoint(checkpoint: Checkpoint) -> Loaded:
     model = found.load(config)
     models = {UNADAPTED: model}
     models |= {n: native.load_adapters(f, model) for n, f in checkpoint.adapters.items()}
-    policies = {name: Policy(adapted, processor) for name, adapted in models.items()}
-    return Loaded(policies, dict.fromkeys(policies, words), {})
+    return {name: Loaded(Policy(adapted, processor), words) for name, adapted in models.items()}
 
 
 def _config(size: str) -> Any:
