@@ -14,7 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from rich.console import Console
@@ -32,7 +32,7 @@ PERCENTILES = (25, 50, 75, 90, 95, 99)
 class Waiting:
     """A policy that waits for a fixed time per batch."""
 
-    instructions = {"base": ()}
+    instructions: ClassVar = {"base": ()}
     sizes = (1, 2, 4, 8)
 
     def __init__(self, image_size: int, cameras: int, seconds: float) -> None:

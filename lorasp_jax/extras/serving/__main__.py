@@ -82,21 +82,13 @@ def _add_checkpoint_options(group: Any) -> None:
 
 
 def _serve(options: argparse.Namespace, console: Console) -> None:
-    server, token = _server_module(), _read_token(options.token_file)
+    from lorasp_jax.extras.serving import server
+
+    token = _read_token(options.token_file)
     with server.bind(options.host, options.port, token=token) as port:  # before what takes long
         policy = _load(options, console)
         policy_server = server.PolicyServer(policy, policy.metadata, token=token)
         asyncio.run(_run(policy_server, port, console))
-
-
-def _server_module() -> Any:
-    try:
-        from lorasp_jax.extras.serving import server
-    except ModuleNotFoundError as error:
-        if str(error.name).partition(".")[0] not in ("msgpack", "websockets"):
-            raise
-        raise ValueError(f'{error}: pip install "lorasp_jax[serving]"') from error
-    return server
 
 
 async def _run(policy_server: Any, port: socket.socket, console: Console) -> None:

@@ -47,7 +47,7 @@ class StandIn:
 
 @contextlib.contextmanager
 def serving(policy, **options):
-    """Serve in a thread; yields the server, with the attribute `address`."""
+    """Serve in a thread; yields the server, with the attributes `address`, `port` and `policy`."""
     port = bind("127.0.0.1", options.pop("port", 0))
     server, loop = PolicyServer(policy, **options), asyncio.new_event_loop()
     started, stop = threading.Event(), asyncio.Event()
@@ -60,7 +60,7 @@ def serving(policy, **options):
     thread = threading.Thread(target=lambda: loop.run_until_complete(run()), daemon=True)
     thread.start()
     assert started.wait(60)
-    server.port = port.getsockname()[1]
+    server.policy, server.port = policy, port.getsockname()[1]
     server.address = f"ws://127.0.0.1:{server.port}"
     try:
         yield server

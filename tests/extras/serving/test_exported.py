@@ -166,7 +166,9 @@ def test_weights_and_statistics_are_data(folder, other_folder, copy):
     resign(copy)
     changed = exported.load(copy)
     given = arguments(changed)
-    np.testing.assert_allclose(changed.act(**given), in_process(make_policy(seed=1), given), atol=1e-5)
+    np.testing.assert_allclose(
+        changed.act(**given), in_process(make_policy(seed=1), given), atol=1e-5
+    )
 
 
 def test_programs_are_portable(folder):

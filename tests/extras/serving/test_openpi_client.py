@@ -7,7 +7,8 @@ import subprocess
 import numpy as np
 import pytest
 
-from lorasp_jax.extras.serving.policies import CompiledPolicies
+from lorasp_jax.extras.serving.policies import CompiledPolicy
+from lorasp_jax.extras.serving.served import ServedPolicies
 from lorasp_jax.models.inputs import OPENPI
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.policies import tokenizer
@@ -21,7 +22,7 @@ from tests.models.random_models import random_backbone
 
 pytestmark = pytest.mark.slow
 
-SCRIPT = ROOT / "tests" / "serving" / "openpi_script.py"
+SCRIPT = ROOT / "tests" / "extras" / "serving" / "openpi_script.py"
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")
 
 
@@ -42,10 +43,10 @@ def policy(dims):
     words = tokenizer.Offline()
     prompts = PromptTable.of(words, ["do something"], config, num_joints=dims - 1)
     processor = Processor.of(config, Statistics(moments, moments), prompts, num_joints=dims - 1)
-    policies = {"base": Policy(random_backbone(config), processor)}
-    compiled = CompiledPolicies(policies, {"base": words}, max_batch=1, num_steps=2)
-    compiled.warm_up()
-    return compiled
+    policy = Policy(random_backbone(config), processor)
+    served = ServedPolicies({"base": CompiledPolicy(policy, words, max_batch=1, num_steps=2)})
+    served.warm_up()
+    return served
 
 
 @pytest.mark.parametrize(
@@ -66,4 +67,4 @@ def test_openpi_client(python, dims, shapes, token):
         assert result["steps"] == [shapes[result["form"]][1:]] * 11
         assert result["timing"].keys() == {"infer_ms", "prev_total_ms"}
         assert result["metadata"]["cameras"] == list(CAMERAS)
-        assert "a request must have the keys of one of these forms" in result["error"]
+        assert "keys of one of these forms" in result["error"]

@@ -123,9 +123,10 @@ def test_a_chunk_continues_what_remains_of_the_previous_one(execution, served):
     previous = np.random.default_rng(5).normal(size=(2, spec.chunk, 7)).astype(np.float32)
     pairs = [(1, 2), (2, 1)]
     sent = [
-        request(spec, i, executed=s, delay=d, previous=previous[i]) for i, (s, d) in enumerate(pairs)
+        request(spec, i, executed=s, delay=d, previous=previous[i])
+        for i, (s, d) in enumerate(pairs)
     ]
-    rest = np.stack([np.pad(p[s:], ((0, s), (0, 0))) for p, (s, _) in zip(previous, pairs)])
+    rest = np.stack([np.pad(previous[i, s:], ((0, s), (0, 0))) for i, (s, _) in enumerate(pairs)])
     expected = reference(
         policy,
         sent,
