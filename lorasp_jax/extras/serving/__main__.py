@@ -2,6 +2,7 @@
 
 import argparse
 import asyncio
+import functools
 import secrets
 import signal
 import socket
@@ -45,9 +46,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--host", default="127.0.0.1", help="address to listen on; others than the default need a "
         "token (default: %(default)s)")  # fmt: skip
     add("--port", type=int, default=8000, help="default: %(default)s")
-    add(
-        "--token-file", type=Path, metavar="FILE", help="file with the token that clients must send"
-    )
+    add("--token-file", type=Path, metavar="FILE", help="file with the token of the clients")
     add("--prompt", default="", help="instruction of requests that have none")
     add("--max-batch", type=int, help="largest batch (default: 8)")
     add("--num-steps", type=int, help="flow steps (default: 10)")
@@ -69,9 +68,7 @@ def parser(program: str) -> argparse.ArgumentParser:
 
 def _add_checkpoint_options(group: Any) -> None:
     checkpoint = group.add_argument
-    checkpoint(
-        "--statistics", default="", help="normalization statistics, if not in the checkpoint"
-    )
+    checkpoint("--statistics", default="", help="normalization, if not in the checkpoint")
     checkpoint("--dataset", default="", help="which statistics, if there are several")
     checkpoint("--joints", type=int, default=0, help="the robot's number of joints")
     checkpoint("--size", default="", help="size of an openpi checkpoint, such as base_pi05")
@@ -120,13 +117,7 @@ def _load(options: argparse.Namespace, console: Console) -> Any:
     policies = (_exported if all(map(is_exported, named.values())) else _compiled)(options, named)
     settings = {"prompt": options.prompt, "execution": options.execution}
     policy = ServedPolicies(policies, seed=seed, **settings)
-    pairs = [(name, size) for name in policies for size in policy.sizes]
-
-    def report(name: str, size: int) -> None:
-        step = pairs.index((name, size)) + 1
-        _say(console, f"compiling {name}, batch {size} ({step} of {len(pairs)})")
-
-    policy.warm_up(report)
+    policy.warm_up(functools.partial(_say, console))
     _say(console, f"ready after {time.monotonic() - start:.0f} s")
     return policy
 
@@ -168,7 +159,13 @@ def _compiled(options: argparse.Namespace, named: dict[str, str]) -> dict[str, A
     if len(named) > 1:
         raise ValueError("several policies must all be finished runs, or all be exported")
     _refuse(options, ("base",), "is for runs")
-    loaded = loading.load_checkpoint(_checkpoint(options, *named.values()))
+    names = ("tokenizer", "statistics", "dataset", "joints", "size", "dtype")
+    loaded = loading.load_checkpoint(
+        *named.values(),
+        **{name: getattr(options, name) for name in names},
+        cameras=dict(map(_pair, options.camera)),
+        adapters=dict(map(_pair, options.adapter)),
+    )
     return {name: compiled(each) for name, each in loaded.items()}
 
 
@@ -177,18 +174,6 @@ def _refuse(options: argparse.Namespace, names: Sequence[str], reason: str) -> N
     for name in names:
         if getattr(options, name):
             raise ValueError(f"--{name.replace('_', '-')} {reason}")
-
-
-def _checkpoint(options: argparse.Namespace, where: str) -> Any:
-    from lorasp_jax.extras.serving.loading import Checkpoint
-
-    same = ("tokenizer", "statistics", "dataset", "joints", "size", "dtype")
-    return Checkpoint(
-        where,
-        **{name: getattr(options, name) for name in same},
-        cameras=dict(map(_pair, options.camera)),
-        adapters=dict(map(_pair, options.adapter)),
-    )
 
 
 def _named(text: str) -> tuple[str, str]:
@@ -206,11 +191,7 @@ def _pair(text: str) -> tuple[str, str]:
 
 
 def _read_token(path: Path | None) -> str:
-    """Read the token, without a final newline.
-
-    Raises:
-        ValueError: the file is empty or not text.
-    """
+    """Read the token, without a final newline."""
     if path is None:
         return ""
     token = path.read_text().strip()

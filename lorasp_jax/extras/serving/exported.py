@@ -317,10 +317,7 @@ def _read_description(path: Path) -> dict[str, Any]:
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path} is damaged: {_REMEDY}") from error
     if version != FORMAT:
-        raise ValueError(
-            f"{path.parent} has format {version}, but this version of the code reads format "
-            f"{FORMAT}: export the policy again"
-        )
+        raise ValueError(f"{path.parent} has format {version}, not {FORMAT}: export it again")
     if digest(values) != expected:
         raise ValueError(f"{path} is damaged: {_REMEDY}")
     return values

@@ -72,7 +72,7 @@ def write(
         (unfinished / exported.WEIGHTS).write_bytes(safetensors.numpy.save(weights))
         for each, program in programs.items():
             (unfinished / exported.program_file(*each)).write_bytes(program.serialize())
-        _write_json(unfinished / exported.DESCRIPTION, _contents(unfinished, description, programs))
+        _write_json(unfinished / exported.DESCRIPTION, _contents(unfinished, description))
 
 
 def _tokens(policy: Policy) -> dict[str, Any]:
@@ -95,15 +95,12 @@ def _by_kind(statistics: Statistics) -> dict[str, dict[str, jax.Array]]:
     return {"state": dict(statistics.state), "action": dict(statistics.action)}
 
 
-def _contents(
-    folder: Path, description: Description, programs: Mapping[Any, export.Exported]
-) -> dict[str, Any]:
+def _contents(folder: Path, description: Description) -> dict[str, Any]:
     """Return what policy.json contains."""
     values = {
         "format": exported.FORMAT,
         "lorasp_jax": lorasp_jax.__version__,
         "jax": jax.__version_info__,
-        "calling_convention": max(p.calling_convention_version for p in programs.values()),
         "platforms": exported.PLATFORMS,
         "policy": dataclasses.asdict(description),
         "files": {name: exported.file_digest(folder / name) for name in description.files},
@@ -160,7 +157,7 @@ def _with_weights(
 
 
 def _inputs(description: Description, tokens: int, kind: str, batch: int) -> dict[str, Any]:
-    """Return the shapes of a batch of `ExportedPolicy.row`."""
+    """Return the shapes of the inputs of `ExportedPolicy.run`."""
     size, dim, chunk = description.image_size, description.state_dim, description.chunk
 
     def each(dtype: Any, *shape: int) -> jax.ShapeDtypeStruct:

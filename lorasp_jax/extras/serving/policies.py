@@ -59,15 +59,7 @@ class CompiledPolicy:
         self._table, self._words = policy.processor.prompts, words
         self._policy = without_prompts(policy)
         self._guidance = None if guidance is None else np.float32(guidance)
-        self._cached_tokens = functools.lru_cache(CACHED_PROMPTS)(self._tokenize)
-
-    def tokens(self, instruction: str) -> Mapping[str, np.ndarray]:
-        """Return the tokens of an instruction, `ids` and `mask` `[T]`.
-
-        Raises:
-            ValueError: the tokenizer rejects it.
-        """
-        return self._cached_tokens(instruction)
+        self.tokens = functools.lru_cache(CACHED_PROMPTS)(self._tokenize)
 
     def run(self, batch: Mapping[str, Any]) -> np.ndarray:
         """Return actions f32 `[B, C, J+1]`; see `sample`."""
@@ -75,6 +67,7 @@ class CompiledPolicy:
         return np.asarray(_program()(self._policy, batch, self._guidance, num_steps=steps))
 
     def _tokenize(self, instruction: str) -> dict[str, np.ndarray]:
+        """Return the tokens of an instruction as `ExportedPolicy.tokens` does."""
         start = self._table.with_instructions(self._words, [instruction]).start
         return {"ids": np.asarray(start.ids[0]), "mask": np.asarray(start.mask[0])}
 

@@ -55,11 +55,6 @@ class Form:
     actions: int | None = None
     required: int | None = None
 
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """Keys by which a request is recognized."""
-        return (*self.state, self.pictures[0] if self.pictures else "image")
-
 
 FORMS = (
     Form("lorasp_jax", ("state",)),
@@ -167,13 +162,14 @@ def _progress(message: Mapping[str, Any], spec: PolicySpec) -> tuple[int | None,
 
 
 def _form(message: Mapping[str, Any]) -> Form:
+    known = []
     for form in FORMS:
-        picture = form.keys[-1]
+        picture = form.pictures[0] if form.pictures else "image"
         has_picture = picture in message or picture.partition("/")[0] in message
         if has_picture and all(key in message for key in form.state):
             return form
-    known = "; ".join(f"{form.name}: {', '.join(form.keys)}" for form in FORMS)
-    got = ", ".join(sorted(message))[:200] or "none"
+        known.append(f"{form.name}: {', '.join([*form.state, picture])}")
+    got, known = ", ".join(sorted(message))[:200] or "none", "; ".join(known)
     raise ValueError(f"a request must have the keys of one of these forms ({known}), got {got}")
 
 

@@ -56,13 +56,14 @@ class ServedPolicies:
         draw = jax.vmap(functools.partial(draw_noise, jax.random.key(seed)), (0, None))
         self._draw = jax.jit(draw, static_argnums=1)
 
-    def warm_up(self, progress: Callable[[str, int], None] = lambda *_: None) -> None:
-        """Compile and run every program; `progress` is told of each before it starts."""
+    def warm_up(self, say: Callable[[str], None] = lambda _: None) -> None:
+        """Compile and run every program; `say` is told of each before it starts."""
         spec = self.spec
         picture = np.zeros((spec.image_size, spec.image_size, 3), np.uint8)
         images, state = dict.fromkeys(spec.cameras, picture), np.zeros(spec.state_dim, np.float32)
-        for adapter, size in itertools.product(self._policies, self.sizes):
-            progress(adapter, size)
+        programs = list(itertools.product(self._policies, self.sizes))
+        for number, (adapter, size) in enumerate(programs, start=1):
+            say(f"compiling {adapter}, batch {size} ({number} of {len(programs)})")
             prompt = (self._prompt, *self.instructions[adapter], "press the button")
             request = Request(images, state, next(filter(None, prompt)), adapter)
             for _ in range(2):

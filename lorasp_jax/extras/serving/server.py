@@ -35,7 +35,6 @@ from lorasp_jax.extras.serving.requests import Request, parse
 
 MAX_CLIENTS = 64
 """Maximum number of connections."""
-MAX_PORT = 65_535
 _log = logging.getLogger(__name__)
 
 
@@ -119,7 +118,8 @@ class PolicyServer:
         """Answer pages, and refuse connections without the token or beyond the limit."""
         if request.path == "/healthz":
             return connection.respond(http.HTTPStatus.OK, "OK\n")
-        if not self._is_authorized(request):
+        given = request.headers.get("Authorization", "").removeprefix("Api-Key ")
+        if self._token and not hmac.compare_digest(given.encode(), self._token.encode()):
             text = "this server requires a token: Authorization: Api-Key TOKEN\n"
             return connection.respond(http.HTTPStatus.UNAUTHORIZED, text)
         if request.path == "/status":
@@ -128,12 +128,6 @@ class PolicyServer:
             text = f"this server has its maximum of {MAX_CLIENTS} connections\n"
             return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, text)
         return None
-
-    def _is_authorized(self, request: HttpRequest) -> bool:
-        if not self._token:
-            return True
-        given = request.headers.get("Authorization", "").removeprefix("Api-Key ")
-        return hmac.compare_digest(given.encode(), self._token.encode())
 
     async def _handle(self, connection: ServerConnection) -> None:
         """Serve one connection until it closes."""
@@ -219,8 +213,8 @@ def bind(host: str, port: int, *, token: str = "") -> socket.socket:
         ValueError: the port is taken or invalid, the host is not an address of this machine, or
             other machines could connect without a token.
     """
-    if not 0 <= port <= MAX_PORT:
-        raise ValueError(f"the port must be 0 to {MAX_PORT}, got {port}")
+    if not 0 <= port < 2**16:
+        raise ValueError(f"the port must be 0 to 65535, got {port}")
     try:
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         if not token and not ipaddress.ip_address(address[0]).is_loopback:

@@ -17,11 +17,7 @@ from lorasp_jax.adapters.io import native
 from lorasp_jax.extras.serving import __main__ as command
 from lorasp_jax.extras.serving import loading
 from lorasp_jax.extras.serving.client import PolicyClient
-from lorasp_jax.extras.serving.loading import Checkpoint
-from lorasp_jax.extras.serving.policies import CompiledPolicy
-from lorasp_jax.extras.serving.served import ServedPolicies
 from lorasp_jax.peft import LoRA
-from lorasp_jax.policies import tokenizer
 from tests import ROOT
 from tests.extras.serving.stand_in import observation
 from tests.models.random_models import with_noise
@@ -45,16 +41,6 @@ def test_a_run_is_loaded(run):
     assert loaded.policy.processor.prompts.instructions[0] == "press the button"
 
 
-def test_only_trained_runs_can_continue_chunks_as_trained(finished):
-    def serve(continues):
-        policy = CompiledPolicy(finished.policy, tokenizer.Offline(), continues=continues)
-        return ServedPolicies({"base": policy}, execution="trained")
-
-    assert serve(True).spec.execution == "trained"
-    with pytest.raises(ValueError, match="not trained to continue chunks"):
-        serve(False)
-
-
 def test_a_checkpoint_is_loaded_with_and_without_adapters(dummy_base, tmp_path):
     adapted = lorasp_jax.adapt(
         models.load(dummy_base), [("q_proj", LoRA(rank=2))], rngs=nnx.Rngs(0)
@@ -62,8 +48,7 @@ def test_a_checkpoint_is_loaded_with_and_without_adapters(dummy_base, tmp_path):
     graphdef, adapters, frozen = lorasp_jax.split(adapted)
     adapted = nnx.merge(graphdef, with_noise(adapters, 0.1), frozen)
     native.save_adapters(tmp_path / "ours", adapted)
-    checkpoint = Checkpoint(str(dummy_base), adapters={"mine": str(tmp_path / "ours")})
-    loaded = loading.load_checkpoint(checkpoint)
+    loaded = loading.load_checkpoint(str(dummy_base), adapters={"mine": str(tmp_path / "ours")})
     adapted_paths = {n: len(adaptation.methods(each.policy.model)) for n, each in loaded.items()}
     assert adapted_paths == {"base": 0, "mine": 3}  # vision, language, action
     processor = loaded["base"].policy.processor
@@ -82,7 +67,7 @@ def test_a_checkpoint_is_loaded_with_and_without_adapters(dummy_base, tmp_path):
 )
 def test_checkpoints_that_do_not_say_enough(options, refusal, dummy_base):
     with pytest.raises(ValueError, match=refusal):
-        loading.load_checkpoint(Checkpoint(**{"where": str(dummy_base)} | options))
+        loading.load_checkpoint(**{"where": str(dummy_base)} | options)
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from rich.console import Console
 
 from lorasp_jax.extras.serving import __main__ as command
 from lorasp_jax.extras.serving import exported
+from lorasp_jax.extras.serving.requests import Request
 from lorasp_jax.extras.serving.served import ServedPolicies
 from tests import ROOT
 from tests.extras.serving.conftest import ROBOT
@@ -43,10 +44,7 @@ def arguments(loaded, seed=0, **changes):
 
 def in_process(policy, given, **condition):
     """Actions of the policy itself; `prefix` is in the robot's units."""
-    sent = request(exported.PolicyInterface(tuple(given["images"]), 1, 7, 4))
-    sent = dataclasses.replace(
-        sent, images=given["images"], state=given["state"], prompt=given["instruction"]
-    )
+    sent = Request(given["images"], given["state"], given["instruction"])
     return reference(policy, [sent], given["noise"][None], **condition)[0]
 
 

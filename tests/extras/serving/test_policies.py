@@ -25,22 +25,19 @@ WORDS = tokenizer.Offline()
 STEPS = 2
 
 
-def make_policy(config=None, *, seed=0, instructions=INSTRUCTIONS, cameras=None):
+def make_policy(config=None, *, seed=0, instructions=INSTRUCTIONS, cameras=None, dims=7):
     config = config or Pi0Config.dummy()
     rng = np.random.default_rng(1 + seed)
-    moments = {"mean": rng.normal(size=7), "std": rng.uniform(0.5, 1, 7)}
+    moments = {"mean": rng.normal(size=dims), "std": rng.uniform(0.5, 1, dims)}
     statistics = Statistics(*({k: np.float32(v) for k, v in moments.items()} for _ in range(2)))
-    prompts = PromptTable.of(WORDS, instructions, config, num_joints=6)
-    processor = Processor.of(config, statistics, prompts, num_joints=6, cameras=cameras)
+    prompts = PromptTable.of(WORDS, instructions, config, num_joints=dims - 1)
+    processor = Processor.of(config, statistics, prompts, num_joints=dims - 1, cameras=cameras)
     return Policy(random_backbone(config, seed=seed), processor)
 
 
 def compiled(policies, *, max_batch=2, guidance=None, metadata=None, **options):
-    settings = {"num_steps": STEPS, "max_batch": max_batch, "guidance": guidance}
-    made = {
-        name: CompiledPolicy(policy, WORDS, metadata=metadata, **settings)
-        for name, policy in policies.items()
-    }
+    settings = {"max_batch": max_batch, "guidance": guidance, "metadata": metadata}
+    made = {n: CompiledPolicy(p, WORDS, num_steps=STEPS, **settings) for n, p in policies.items()}
     return ServedPolicies(made, **options)
 
 
@@ -151,8 +148,8 @@ def test_programs_are_shared_and_compiled_in_advance():
     policies_of_two = {"base": make_policy(), "other": make_policy(seed=1)}
     fresh, progress, program = compiled(policies_of_two, max_batch=3), [], policies._program()
     program.clear_cache()
-    fresh.warm_up(lambda *step: progress.append(step))
-    assert progress == [(name, size) for name in policies_of_two for size in (1, 2, 3)]
+    fresh.warm_up(progress.append)
+    assert progress[-1] == "compiling other, batch 3 (6 of 6)"
     assert program._cache_size() == 3
     actions(fresh, request(fresh.spec, prompt="open the pot", adapter="other"), index=(7, 7))
     assert program._cache_size() == 3
