@@ -22,11 +22,6 @@ def free_port():
         return taken.getsockname()[1]
 
 
-def test_no_server(free_port):
-    with pytest.raises(ServerGone, match=f"^no policy server at ws://127.0.0.1:{free_port}: "):
-        PolicyClient(f"ws://127.0.0.1:{free_port}")
-
-
 @pytest.mark.parametrize("address", ["nonsense", "http://127.0.0.1:1", "ws://127.0.0.1:x"])
 def test_addresses_that_are_none(address):
     with pytest.raises((ServerGone, ValueError)):
@@ -48,9 +43,9 @@ def test_waiting_for_a_server(free_port):
 def test_a_waiting_client_says_so_once(free_port, monkeypatch):
     monkeypatch.setattr("lorasp_jax.extras.serving.client.SILENCE", 0.3)
     said = []
-    with pytest.raises(ServerGone):
-        PolicyClient(f"ws://127.0.0.1:{free_port}", wait=1.5, say=said.append)
-    assert said == ["no server there yet: trying for up to 1.5 s"]
+    with pytest.raises(ServerGone, match=f"^no policy server at ws://127.0.0.1:{free_port}: "):
+        PolicyClient(f"ws://127.0.0.1:{free_port}", wait=0.8, say=said.append)
+    assert said == ["no server there yet: trying for up to 0.8 s"]
 
 
 def test_a_late_reply_is_never_taken_for_the_next_one():
@@ -62,15 +57,6 @@ def test_a_late_reply_is_never_taken_for_the_next_one():
         policy.gate.set()
         with pytest.raises(ServerGone, match=r"the connection to .* is closed"):
             client.infer(observation())
-
-
-def test_a_server_that_stops():
-    with serving(StandIn()) as server:
-        client = connect(server)
-        client.infer(observation())
-    with pytest.raises(ServerGone, match="closed the connection"):
-        client.infer(observation())
-    client.close()
 
 
 @pytest.fixture

@@ -116,6 +116,10 @@ def test_a_failure_leaves_nothing_behind(tmp_path, monkeypatch):
     assert jax.config.jax_hlo_source_file_canonicalization_regex == before
 
 
+def dummy(config=Pi0Config, **changes):
+    return make_policy(dataclasses.replace(config.dummy(), **changes))
+
+
 def quantized(policy, kind):
     model, _ = lorasp_jax.quantize(policy.model, [(".*", kind)])
     return dataclasses.replace(policy, model=model)
@@ -126,19 +130,12 @@ def pruned(policy):
     return transforms.pruned(policy, episodes, batch_size=4, batches=1, tolerance=0.5)
 
 
-def distilled(policy):
+def merged(policy):
+    """Return the policy distilled to adapters that do not depend on the input, and merged."""
     episodes = {"press": random_episodes("press", 5)}
     pairs = transforms.keyed_batches(policy, episodes, 4, 1)["press"]
     model, _ = lorasp_jax.distill(policy.model, pairs, 4, forward=transforms._forward)
-    return dataclasses.replace(policy, model=model)
-
-
-def merged(policy):
-    return dataclasses.replace(policy, model=adaptation.merge(policy.model))
-
-
-def dummy(config=Pi0Config, **changes):
-    return make_policy(dataclasses.replace(config.dummy(), **changes))
+    return dataclasses.replace(policy, model=adaptation.merge(model))
 
 
 POLICIES = {
@@ -147,11 +144,9 @@ POLICIES = {
     "bfloat16": lambda _: dummy(param_dtype="bfloat16"),
     "int8": lambda _: quantized(dummy(), "int8"),
     "adapters, nf4": lambda run: quantized(load_policy(run), "nf4"),
-    "pruned": lambda run: pruned(load_policy(run)),
     "pruned, nf4": lambda run: quantized(pruned(load_policy(run)), "nf4"),
-    "distilled": lambda run: distilled(load_policy(run)),
-    "merged": lambda run: merged(distilled(load_policy(run))),
-    "merged, int8": lambda run: quantized(merged(distilled(load_policy(run))), "int8"),
+    "merged": lambda run: merged(load_policy(run)),
+    "merged, int8": lambda run: quantized(merged(load_policy(run)), "int8"),
 }
 
 

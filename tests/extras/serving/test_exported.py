@@ -169,18 +169,14 @@ def test_weights_and_statistics_are_data(folder, other_folder, copy):
     )
 
 
-def test_programs_are_portable(folder):
+def test_programs_are_portable(folder, loaded):
     for path in folder.glob("*.bin"):
         program = jax.export.deserialize(bytearray(path.read_bytes()))
         assert program.platforms == ("cpu", "cuda")
         assert "custom_call" not in program.mlir_module()
-        assert b"/lorasp_jax" not in path.read_bytes()
-        assert str(ROOT).encode() not in path.read_bytes()
-
-
-def test_only_weights_in_use_are_stored(loaded):
+        assert not any(name in path.read_bytes() for name in (b"/lorasp_jax", str(ROOT).encode()))
     backbone = sum(leaf.nbytes for leaf in jax.tree.leaves(make_policy().model))
-    assert sum(array.nbytes for array in loaded._weights) < 1.05 * backbone
+    assert sum(array.nbytes for array in loaded._weights) < 1.05 * backbone  # those in use
 
 
 def test_the_loader_imports_nothing_else_of_the_package():
@@ -254,20 +250,22 @@ def test_every_damaged_or_missing_file_is_named(folder, copy):
     assert exported.load(copy).instructions == INSTRUCTIONS
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", "[" * 100_000, '{"format": 1, "digest": 3}'])
-def test_a_description_that_is_none(copy, text):
+@pytest.mark.parametrize(
+    ("text", "refusal"),
+    [
+        *((text, "is damaged") for text in ("", "[]", "{}", "[" * 100_000, '{"format": 1}')),
+        ('{"format": 2}', "has format 2"),
+    ],
+)
+def test_a_description_that_is_none(copy, text, refusal):
     (copy / "policy.json").write_text(text)
-    with pytest.raises(ValueError, match="is damaged"):
+    with pytest.raises(ValueError, match=refusal):
         exported.load(copy)
 
 
-@pytest.mark.parametrize(
-    ("changes", "refusal"),
-    [({"format": 2}, "has format 2"), ({"jax": [99, 0, 0]}, r"install JAX 99\.0\.0")],
-)
-def test_folders_for_something_else(copy, changes, refusal):
-    resign(copy, lambda values: values.update(changes))
-    with pytest.raises(ValueError, match=refusal):
+def test_folders_of_a_newer_jax(copy):
+    resign(copy, lambda values: values.update(jax=[99, 0, 0]))
+    with pytest.raises(ValueError, match=r"install JAX 99\.0\.0"):
         exported.load(copy)
 
 

@@ -85,15 +85,6 @@ def test_a_connection_has_a_previous_chunk():
             client.infer(observation(executed=2))
 
 
-def test_forms_of_openpi_get_as_many_dimensions_as_their_clients_expect():
-    picture = np.zeros((16, 16, 3), np.uint8)
-    pictures = {"observation/image": picture, "observation/wrist_image": picture}
-    policy = StandIn(dataclasses.replace(SPEC, state_dim=8))
-    with serving(policy) as server, connect(server) as client:
-        reply = client.infer({"observation/state": np.zeros(8), **pictures})
-    assert reply["actions"].shape == (10, 7)
-
-
 def test_adapters_are_chosen_by_a_key(client):
     base, pour = (client.infer(observation(adapter=name)) for name in ("base", "pour"))
     assert pour["actions"][0, 0] == base["actions"][0, 0] + 1001
