@@ -14,7 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -32,12 +32,12 @@ PERCENTILES = (25, 50, 75, 90, 95, 99)
 class Waiting:
     """A policy that waits for a fixed time per batch."""
 
-    instructions: ClassVar = {"base": ()}
     sizes = (1, 2, 4, 8)
 
     def __init__(self, image_size: int, cameras: int, seconds: float) -> None:
         names = tuple(f"camera{i}" for i in range(cameras))
         self.spec, self._seconds = PolicySpec(names, image_size, 7, 50), seconds
+        self.instructions = {"base": ()}
 
     def prepare(self, request: Request, index: tuple[int, int]) -> np.ndarray:
         """Return the state."""
