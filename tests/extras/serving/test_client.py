@@ -59,6 +59,15 @@ def test_a_late_reply_is_never_taken_for_the_next_one():
             client.infer(observation())
 
 
+def test_a_server_that_stops():
+    with serving(StandIn()) as server:
+        client = connect(server)
+        client.infer(observation())
+    with pytest.raises(ServerGone, match="closed the connection"):
+        client.infer(observation())
+    client.close()
+
+
 @pytest.fixture
 def interruptible():
     """Make SIGINT raise KeyboardInterrupt; a shell's background processes ignore it."""
