@@ -74,15 +74,10 @@ def test_hold_and_replan_count_environment_steps():
     assert len(mover.seen) == 2  # looks at steps 0 and 6
 
 
-def test_groups_pool_their_episodes():
-    results = judge(tasks(), Mover(), 2)
+def test_groups_pool_their_episodes_and_films_have_a_frame_per_action(tmp_path):
+    results = judge(tasks(), Mover(), 2, films=tmp_path / "films")
     assert results["episodes"] == 4
-    assert list(results["groups"]) == ["easy"]
-    assert results["groups"]["easy"]["episodes"] == 2
-
-
-def test_film_has_a_frame_per_action(tmp_path):
-    judge([TASK], Mover(), 1, films=tmp_path / "films")
+    assert {name: group["episodes"] for name, group in results["groups"].items()} == {"easy": 2}
     with Image.open(tmp_path / "films" / "line.webp") as film:
         assert film.size == (8, 8)
 
