@@ -21,23 +21,23 @@ from rich.console import Console
 
 from benchmarks.measuring import print_table
 from lorasp_jax.extras.serving.client import PolicyClient
-from lorasp_jax.extras.serving.metrics import COLUMNS, summary
 from lorasp_jax.extras.serving.requests import PolicySpec, Request
 
 WARM_UP = 2
 """Calls of each client before the clock starts, as in openpi's example client."""
+PERCENTILES = (25, 50, 75, 90, 95, 99)
+"""As in the table that openpi's example client prints (examples/simple_client/main.py)."""
 
 
 class Waiting:
     """A policy that waits for a fixed time per batch."""
 
-    adapters = ("base",)
     sizes = (1, 2, 4, 8)
 
     def __init__(self, image_size: int, cameras: int, seconds: float) -> None:
         names = tuple(f"camera{i}" for i in range(cameras))
         self.spec, self._seconds = PolicySpec(names, image_size, 7, 50), seconds
-        self.instructions = {"base": self.spec.instructions}
+        self.instructions = {"base": ()}
 
     def prepare(self, request: Request, index: tuple[int, int]) -> np.ndarray:
         """Return the state."""
@@ -140,7 +140,8 @@ def latency_rows(name: str, times: np.ndarray) -> list[dict[str, Any]]:
         "in server": server - policy,
     }
     return [
-        {"policy": name, "ms": part, **dict(zip(COLUMNS, summary(values), strict=True))}
+        {"policy": name, "ms": part, "mean": float(values.mean()), "std": float(values.std())}
+        | {f"p{q}": float(np.percentile(values, q)) for q in PERCENTILES}
         for part, values in parts.items()
     ]
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lorasp_jax.extras.judge import Task
+from lorasp_jax.extras.judge import GymTask
 from studies.metaworld.tasks import GROUPS, INSTALL
 
 try:
@@ -90,10 +90,10 @@ def state(observation: np.ndarray) -> np.ndarray:
     return observation[:STATE_DIM]
 
 
-def mt50() -> list[Task]:
+def mt50() -> list[GymTask]:
     """Return all fifty tasks, with the package's own limit of 500 steps."""
     return [
-        Task(
+        GymTask(
             name=name,
             instruction=instruction,
             make=functools.partial(World, name),

@@ -9,7 +9,7 @@ from typing import ClassVar
 import gymnasium
 import numpy as np
 
-from lorasp_jax.extras.judge import Task
+from lorasp_jax.extras.judge import GymTask
 
 
 class Line(gymnasium.Env):
@@ -34,7 +34,7 @@ class Line(gymnasium.Env):
         return {"pixels": np.full((8, 8, 3), 100, np.uint8), "at": np.array([self.at])}
 
 
-TASK = Task("line", "go to zero", Line, {"front": "pixels"}, "at", replan=2, max_steps=40)
+TASK = GymTask("line", "go to zero", Line, {"front": "pixels"}, "at", replan=2, max_steps=40)
 
 
 def tasks():

@@ -7,6 +7,6 @@ The second form needs neither JAX nor the policy's files, only NumPy, lazy_loade
 websockets, so it runs where the environment's own pins rule out this project's dependencies.
 """
 
-from lorasp_jax.extras.judge.task import Task
+from lorasp_jax.extras.judge.task import GymTask
 
-__all__ = ["Task"]
+__all__ = ["GymTask"]

@@ -13,7 +13,7 @@ from typing import Any
 from lorasp_jax.extras.judge.actors import Actor, RunActor, ServerActor
 from lorasp_jax.extras.judge.judge import judge
 from lorasp_jax.extras.judge.parallel import judge_in_processes
-from lorasp_jax.extras.judge.task import Task, load_tasks
+from lorasp_jax.extras.judge.task import GymTask, load_tasks
 
 # As in `lorasp_jax.base.errors`, which imports JAX: this command runs without it.
 REFUSED = 2
@@ -77,7 +77,7 @@ def _check(options: argparse.Namespace) -> None:
 
 
 @contextlib.contextmanager
-def _actor(options: argparse.Namespace, tasks: Sequence[Task]) -> Iterator[Actor]:
+def _actor(options: argparse.Namespace, tasks: Sequence[GymTask]) -> Iterator[Actor]:
     if not options.server:
         yield RunActor(options.run, [task.instruction for task in tasks])
         return

@@ -10,7 +10,7 @@ import numpy as np
 
 from lorasp_jax.evaluation.intervals import wilson_interval
 from lorasp_jax.extras.judge.actors import Actor
-from lorasp_jax.extras.judge.task import Task
+from lorasp_jax.extras.judge.task import GymTask
 
 Progress = Callable[[str, int, int], None]
 """Called with a task, its finished episodes and their successes."""
@@ -19,7 +19,7 @@ FILM_FPS = 10.0
 
 
 @dataclass
-class Episode:
+class EpisodeResult:
     """An episode, as it runs.
 
     Attributes:
@@ -37,15 +37,17 @@ class Episode:
     frames: list[np.ndarray] = field(default_factory=list)
 
 
-def run_episode(task: Task, env: Any, actor: Actor, seed: int, *, film: bool = False) -> Episode:
+def run_episode(
+    task: GymTask, env: Any, actor: Actor, seed: int, *, film: bool = False
+) -> EpisodeResult:
     """Run one episode.
 
     Raises:
-        ValueError: task, environment and policy do not fit together; see `Task`.
+        ValueError: task, environment and policy do not fit together; see `GymTask`.
     """
     observation, _ = env.reset(seed=seed)
     actor.reset(seed)
-    episode = Episode()
+    episode = EpisodeResult()
     while not episode.ended:
         images, state = task.images(env, observation), task.read_state(observation)
         chunk = actor.act(images, state, task.instruction)
@@ -68,7 +70,7 @@ def run_episode(task: Task, env: Any, actor: Actor, seed: int, *, film: bool = F
     return episode
 
 
-def _hold(task: Task, env: Any, action: np.ndarray, episode: Episode) -> Any:
+def _hold(task: GymTask, env: Any, action: np.ndarray, episode: EpisodeResult) -> Any:
     """Apply an action for `task.hold` environment steps; return the last observation."""
     command, observation = task.command(env, action), None
     for _ in range(task.hold):
@@ -85,7 +87,7 @@ def _hold(task: Task, env: Any, action: np.ndarray, episode: Episode) -> Any:
 
 
 def judge(
-    tasks: Sequence[Task],
+    tasks: Sequence[GymTask],
     actor: Actor,
     episodes: int,
     *,
@@ -127,16 +129,16 @@ def check_episodes(episodes: int) -> None:
 
 
 def judge_task(
-    task: Task,
+    task: GymTask,
     actor: Actor,
     episodes: int,
     *,
     seed: int = 0,
     films: Path | None = None,
     progress: Progress | None = None,
-) -> list[Episode]:
+) -> list[EpisodeResult]:
     """Run the episodes of one task; arguments and errors are those of `judge`."""
-    env, done = task.make(), list[Episode]()
+    env, done = task.make(), list[EpisodeResult]()
     try:
         for number in range(episodes):
             film = films is not None and number == 0
@@ -151,7 +153,7 @@ def judge_task(
 
 
 def summarize(
-    tasks: Sequence[Task], runs: Mapping[str, Sequence[Episode]], seconds: float
+    tasks: Sequence[GymTask], runs: Mapping[str, Sequence[EpisodeResult]], seconds: float
 ) -> dict[str, Any]:
     """Return what `judge` returns, from the episodes of each task and the time they took."""
     names = dict.fromkeys(task.group for task in tasks if task.group)
@@ -172,7 +174,7 @@ def summarize(
     }
 
 
-def _rate(episodes: Sequence[Episode]) -> dict[str, Any]:
+def _rate(episodes: Sequence[EpisodeResult]) -> dict[str, Any]:
     successes = sum(bool(each.success) for each in episodes)
     return {
         "success": successes / len(episodes),
@@ -182,7 +184,7 @@ def _rate(episodes: Sequence[Episode]) -> dict[str, Any]:
     }
 
 
-def _fps(task: Task, env: Any) -> float:
+def _fps(task: GymTask, env: Any) -> float:
     rate = (getattr(env, "metadata", None) or {}).get("render_fps")
     return rate / task.hold if rate else FILM_FPS
 

@@ -13,7 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from lorasp_jax.extras.judge.actors import ServerActor
-from lorasp_jax.extras.judge.judge import Episode, Progress, check_episodes, judge_task, summarize
+from lorasp_jax.extras.judge.judge import (
+    EpisodeResult,
+    Progress,
+    check_episodes,
+    judge_task,
+    summarize,
+)
 from lorasp_jax.extras.judge.task import load_tasks
 
 
@@ -47,7 +53,7 @@ def judge_in_processes(
     check_episodes(episodes)
     started, tasks = time.perf_counter(), load_tasks(env, names)
     run = functools.partial(_run, env, connect, episodes, seed, films)
-    runs = dict[str, list[Episode]]()
+    runs = dict[str, list[EpisodeResult]]()
     context = multiprocessing.get_context("spawn")  # a copy of a process with threads may hang
     try:
         with ProcessPoolExecutor(processes, context, initializer=_end_with_parent) as pool:
@@ -79,7 +85,7 @@ def _run(
     seed: int,
     films: Path | None,
     name: str,
-) -> tuple[str, list[Episode]]:
+) -> tuple[str, list[EpisodeResult]]:
     """Judge one task; return its name and episodes, without the frames of its film."""
     (task,) = load_tasks(env, [name])
     with contextlib.closing(connect()) as actor:

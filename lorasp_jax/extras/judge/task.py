@@ -14,7 +14,7 @@ Images = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
-class Task:
+class GymTask:
     """One task of an environment, and the mapping between the environment and a policy.
 
     Attributes:
@@ -108,21 +108,21 @@ class Task:
         return command
 
 
-def load_tasks(name: str, only: Sequence[str] = ()) -> tuple[Task, ...]:
+def load_tasks(name: str, only: Sequence[str] = ()) -> tuple[GymTask, ...]:
     """Call a factory and return its tasks.
 
     Args:
         name: MODULE:factory, importable from the working directory. The factory takes no arguments
-            and returns a `Task` or several.
+            and returns a `GymTask` or several.
         only: names of the tasks to return; empty: all.
 
     Raises:
         ValueError: there is no such module, factory or task, or the factory returns something else.
     """
     made = _factory(name)()
-    tasks = (made,) if isinstance(made, Task) else made
-    if not isinstance(tasks, Sequence) or not all(isinstance(each, Task) for each in tasks):
-        raise ValueError(f"{name} must return a Task or a sequence of them, got {made!r:.80}")
+    tasks = (made,) if isinstance(made, GymTask) else made
+    if not isinstance(tasks, Sequence) or not all(isinstance(each, GymTask) for each in tasks):
+        raise ValueError(f"{name} must return a GymTask or a sequence of them, got {made!r:.80}")
     by_name = {task.name: task for task in tasks}
     if len(by_name) < len(tasks) or not tasks:
         raise ValueError(f"{name} must return at least one task, each with a name of its own")

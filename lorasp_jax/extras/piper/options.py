@@ -31,7 +31,6 @@ def add_shared(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("policy").add_argument
     add("--server", default="ws://127.0.0.1:8000", help="address (default: %(default)s)")
     add("--token-file", type=Path, metavar="FILE", help="file with the server's token")
-    add("--certificate", default="", metavar="FILE", help="PEM file to trust, for wss://")
     add("--adapter", default="", metavar="NAME", help="one of the server's adapters; default: its "
         "first")  # fmt: skip
     add("--prompt", default="", help="the request in words; default: one of the task's")
@@ -169,8 +168,7 @@ def policy(options: argparse.Namespace) -> Iterator[Server]:
         OSError: the token cannot be read.
     """
     token = options.token_file.read_text().strip() if options.token_file else ""
-    secret = {"token": token, "certificate": options.certificate}
     say = functools.partial(print, flush=True)
     say(f"connecting to {options.server}")
-    with PolicyClient(options.server, wait=_WAIT, say=say, **secret) as client:
+    with PolicyClient(options.server, token=token, wait=_WAIT, say=say) as client:
         yield Server(client, options.adapter)

@@ -2,6 +2,7 @@
 
 import argparse
 import asyncio
+import functools
 import secrets
 import signal
 import socket
@@ -31,7 +32,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=program,
         description="Serve a policy over websockets, in openpi's protocol.",
-        epilog="Pages on the same port: /healthz and /metrics. See docs/serving.md.",
+        epilog="Pages on the same port: /healthz and /status. See docs/serving.md.",
     )
     add = parser.add_argument
     add(
@@ -45,11 +46,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--host", default="127.0.0.1", help="address to listen on; others than the default need a "
         "token (default: %(default)s)")  # fmt: skip
     add("--port", type=int, default=8000, help="default: %(default)s")
-    add(
-        "--token-file", type=Path, metavar="FILE", help="file with the token that clients must send"
-    )
-    add("--certificate", type=Path, metavar="FILE", help="PEM certificate chain, for wss://")
-    add("--key", type=Path, metavar="FILE", help="PEM private key of the certificate")
+    add("--token-file", type=Path, metavar="FILE", help="file with the token of the clients")
     add("--prompt", default="", help="instruction of requests that have none")
     add("--max-batch", type=int, help="largest batch (default: 8)")
     add("--num-steps", type=int, help="flow steps (default: 10)")
@@ -71,9 +68,7 @@ def parser(program: str) -> argparse.ArgumentParser:
 
 def _add_checkpoint_options(group: Any) -> None:
     checkpoint = group.add_argument
-    checkpoint(
-        "--statistics", default="", help="normalization statistics, if not in the checkpoint"
-    )
+    checkpoint("--statistics", default="", help="normalization, if not in the checkpoint")
     checkpoint("--dataset", default="", help="which statistics, if there are several")
     checkpoint("--joints", type=int, default=0, help="the robot's number of joints")
     checkpoint("--size", default="", help="size of an openpi checkpoint, such as base_pi05")
@@ -84,107 +79,94 @@ def _add_checkpoint_options(group: Any) -> None:
 
 
 def _serve(options: argparse.Namespace, console: Console) -> None:
-    server, token = _server_module(), _read_token(options.token_file)
-    if bool(options.certificate) != bool(options.key):
-        raise ValueError("--certificate and --key must be given together")
-    tls = server.tls_context(options.certificate, options.key) if options.key else None
-    with server.bind(options.host, options.port) as port:  # before anything that takes long
-        server.check_exposure(port, token)
-        policy, metadata = _load(options, console)
-        policy_server = server.PolicyServer(policy, metadata, token=token)
-        asyncio.run(_run(policy_server, port, tls, console))
+    from lorasp_jax.extras.serving import server
+
+    token = _read_token(options.token_file)
+    with server.bind(options.host, options.port, token=token) as port:  # before what takes long
+        policy = _load(options, console)
+        policy_server = server.PolicyServer(policy, policy.metadata, token=token)
+        asyncio.run(_run(policy_server, port, console))
 
 
-def _server_module() -> Any:
-    try:
-        from lorasp_jax.extras.serving import server
-    except ModuleNotFoundError as error:
-        if str(error.name).partition(".")[0] not in ("msgpack", "websockets"):
-            raise
-        raise ValueError(f'{error}: pip install "lorasp_jax[serving]"') from error
-    return server
-
-
-async def _run(policy_server: Any, port: socket.socket, tls: Any, console: Console) -> None:
+async def _run(policy_server: Any, port: socket.socket, console: Console) -> None:
     """Serve until SIGINT or SIGTERM."""
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    async with policy_server.listen(port, tls=tls):
+    async with policy_server.listen(port):
         host, number = port.getsockname()[:2]
         host = f"[{host}]" if ":" in host else host
-        _say(console, f"listening on {'wss' if tls else 'ws'}://{host}:{number}")
+        _say(console, f"listening on ws://{host}:{number}")
         await stop.wait()
         _say(console, "closing connections")
     policy_server.close()
 
 
-def _load(options: argparse.Namespace, console: Console) -> tuple[Any, dict[str, Any]]:
+def _load(options: argparse.Namespace, console: Console) -> Any:
     """Load and compile the policies, saying what takes long."""
     from lorasp_jax.base import compilation_cache as cache
     from lorasp_jax.extras.serving.exported import is_exported
+    from lorasp_jax.extras.serving.served import ServedPolicies
 
     named, start = dict(map(_named, options.policy)), time.monotonic()
     if len(named) < len(options.policy):
         raise ValueError("the policies must have different names: pass NAME=POLICY")
     cache.enable()
-    if options.seed is None:
-        options.seed = secrets.randbelow(2**31)
-    _say(console, f"loading {', '.join(options.policy)} with --seed {options.seed}")
-    load = _exported if all(map(is_exported, named.values())) else _compiled
-    policy, metadata = load(options, named)
-    pairs = [(name, size) for name in policy.adapters for size in policy.sizes]
-
-    def report(name: str, size: int) -> None:
-        step = pairs.index((name, size)) + 1
-        _say(console, f"compiling {name}, batch {size} ({step} of {len(pairs)})")
-
-    policy.warm_up(report)
+    seed = secrets.randbelow(2**31) if options.seed is None else options.seed
+    _say(console, f"loading {', '.join(options.policy)} with --seed {seed}")
+    policies = (_exported if all(map(is_exported, named.values())) else _compiled)(options, named)
+    settings = {"prompt": options.prompt, "execution": options.execution}
+    policy = ServedPolicies(policies, seed=seed, **settings)
+    policy.warm_up(functools.partial(_say, console))
     _say(console, f"ready after {time.monotonic() - start:.0f} s")
-    return policy, metadata
+    return policy
 
 
-def _exported(options: argparse.Namespace, named: dict[str, str]) -> tuple[Any, dict[str, Any]]:
+def _exported(options: argparse.Namespace, named: dict[str, str]) -> dict[str, Any]:
     """Load exported policies."""
     from lorasp_jax.extras.serving.exported import load
-    from lorasp_jax.extras.serving.exported_policies import ExportedPolicies
 
     settings = ("num_steps", "max_batch", "guidance", "base", "tokenizer", *CHECKPOINT_OPTIONS)
     _refuse(options, settings, "has no effect on exported policies")
-    policies = {name: load(folder) for name, folder in named.items()}
-    settings = {"prompt": options.prompt, "seed": options.seed, "execution": options.execution}
-    policy = ExportedPolicies(policies, **settings)
-    return policy, policy.metadata
+    if options.execution == "guided":
+        raise ValueError("exported policies cannot be guided: use --execution naive or trained")
+    return {name: load(folder) for name, folder in named.items()}
 
 
-def _compiled(options: argparse.Namespace, named: dict[str, str]) -> tuple[Any, dict[str, Any]]:
+def _compiled(options: argparse.Namespace, named: dict[str, str]) -> dict[str, Any]:
     """Load runs or a checkpoint."""
-    from lorasp_jax.extras.serving.policies import CompiledPolicies, batch_sizes
+    from lorasp_jax.extras.serving import loading
+    from lorasp_jax.extras.serving.policies import CompiledPolicy, batch_sizes
 
     if options.max_batch is not None:
-        batch_sizes(options.max_batch)  # an invalid one is refused before anything that takes long
-    loaded = _loaded(options, named)
-    names = ("num_steps", "max_batch", "guidance", "prompt", "seed", "execution")
-    given = {name: getattr(options, name) for name in names}
+        batch_sizes(options.max_batch)  # an invalid one is refused before what takes long
+    given = {name: getattr(options, name) for name in ("num_steps", "max_batch")}
     settings = {name: value for name, value in given.items() if value is not None}
-    policy = CompiledPolicies(loaded.policies, loaded.words, **settings)
-    loaded.policies.clear()  # the prepared weights are copies
-    return policy, loaded.metadata
+    if options.execution == "guided":
+        settings["guidance"] = 10.0 if options.guidance is None else options.guidance
 
-
-def _loaded(options: argparse.Namespace, named: dict[str, str]) -> Any:
-    """Load the runs or the checkpoint."""
-    from lorasp_jax.extras.serving import loading
+    def compiled(loaded: loading.Loaded) -> CompiledPolicy:
+        continues, metadata = loaded.continues is not False, loaded.metadata
+        return CompiledPolicy(
+            loaded.policy, loaded.words, continues=continues, metadata=metadata, **settings
+        )
 
     if all(map(loading.is_run, named.values())):
         _refuse(options, CHECKPOINT_OPTIONS, "is for published checkpoints: runs record theirs")
-        if options.execution == "trained":
-            loading.check_trained(named.values())
-        return loading.load_runs(named, base=options.base, words=options.tokenizer)
+        where = {"base": options.base, "words": options.tokenizer}
+        # One at a time, as the prepared weights are copies.
+        return {name: compiled(loading.load_run(run, **where)) for name, run in named.items()}
     if len(named) > 1:
         raise ValueError("several policies must all be finished runs, or all be exported")
     _refuse(options, ("base",), "is for runs")
-    return loading.load_checkpoint(_checkpoint(options, *named.values()))
+    names = ("tokenizer", "statistics", "dataset", "joints", "size", "dtype")
+    loaded = loading.load_checkpoint(
+        *named.values(),
+        **{name: getattr(options, name) for name in names},
+        cameras=dict(map(_pair, options.camera)),
+        adapters=dict(map(_pair, options.adapter)),
+    )
+    return {name: compiled(each) for name, each in loaded.items()}
 
 
 def _refuse(options: argparse.Namespace, names: Sequence[str], reason: str) -> None:
@@ -192,22 +174,6 @@ def _refuse(options: argparse.Namespace, names: Sequence[str], reason: str) -> N
     for name in names:
         if getattr(options, name):
             raise ValueError(f"--{name.replace('_', '-')} {reason}")
-
-
-def _checkpoint(options: argparse.Namespace, where: str) -> Any:
-    from lorasp_jax.extras.serving.loading import Checkpoint
-
-    return Checkpoint(
-        where,
-        tokenizer=options.tokenizer,
-        statistics=options.statistics,
-        dataset=options.dataset,
-        joints=options.joints,
-        size=options.size,
-        dtype=options.dtype,
-        cameras=dict(map(_pair, options.camera)),
-        adapters=dict(map(_pair, options.adapter)),
-    )
 
 
 def _named(text: str) -> tuple[str, str]:
@@ -225,11 +191,7 @@ def _pair(text: str) -> tuple[str, str]:
 
 
 def _read_token(path: Path | None) -> str:
-    """Read the token, without a final newline.
-
-    Raises:
-        ValueError: the file is empty or not text.
-    """
+    """Read the token, without a final newline."""
     if path is None:
         return ""
     token = path.read_text().strip()

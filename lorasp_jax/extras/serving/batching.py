@@ -9,21 +9,23 @@ can, so share batches instead of taking turns.
 """
 
 import asyncio
+import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 
-from lorasp_jax.extras.serving.metrics import Metrics
 from lorasp_jax.extras.serving.requests import PolicySpec, Request
 
 WAIT = 0.003
 """Longest time to wait for the clients of the previous batch [s]."""
+_log = logging.getLogger(__name__)
 
 
 class PolicyFailure(RuntimeError):
@@ -39,13 +41,11 @@ class BatchPolicy(Protocol):
         ...
 
     @property
-    def adapters(self) -> tuple[str, ...]:
-        """Names of the adapters that a request may choose; the first is the default."""
-        ...
-
-    @property
     def instructions(self) -> Mapping[str, Sequence[str]]:
-        """The instructions that each adapter was trained with."""
+        """Adapters that a request may choose, and the instructions that each was trained with.
+
+        The first adapter is the default.
+        """
         ...
 
     @property
@@ -70,44 +70,25 @@ class BatchPolicy(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class Answer:
-    """Actions of one request.
-
-    Attributes:
-        actions: f32 `[C, J+1]`.
-        milliseconds: time that the policy took for the batch.
-    """
-
-    actions: np.ndarray
-    milliseconds: float
-
-
 @dataclass(eq=False)
 class _Job:
     client: int
     adapter: str
     row: Any
-    future: Future[Answer] = field(default_factory=Future)
+    future: Future[tuple[np.ndarray, float]] = field(default_factory=Future)
 
 
 class Batcher:
     """Collects rows and runs them in batches, in its own thread until `close`."""
 
-    def __init__(
-        self,
-        policy: BatchPolicy,
-        metrics: Metrics,
-        on_failure: Callable[[BaseException], None] = lambda _: None,
-    ) -> None:
+    def __init__(self, policy: BatchPolicy, counts: Counter[str]) -> None:
         """Start the thread.
 
         Args:
             policy: runs the batches; its `run` is only called from the thread.
-            metrics: receives batch sizes and inference times.
-            on_failure: is told of exceptions of the policy, whose details are not for clients.
+            counts: receives the numbers of batches and of their requests.
         """
-        self._policy, self._metrics, self._on_failure = policy, metrics, on_failure
+        self._policy, self._counts = policy, counts
         self._queue: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         self._pending: list[_Job] = []
         self._awaited: set[int] = set()
@@ -115,8 +96,11 @@ class Batcher:
         self._thread = threading.Thread(target=self._work, name="policy", daemon=True)
         self._thread.start()
 
-    async def infer(self, client: int, adapter: str, row: Any) -> Answer:
+    async def infer(self, client: int, adapter: str, row: Any) -> tuple[np.ndarray, float]:
         """Run one row, in a batch with others.
+
+        Returns:
+            actions f32 `[C, J+1]`, and the time that the policy took for the batch [ms].
 
         Raises:
             PolicyFailure: the policy failed, or returned values that are not finite.
@@ -176,18 +160,17 @@ class Batcher:
         start = time.perf_counter()
         try:
             actions = self._policy.run(batch[0].adapter, rows)
-        except Exception as error:  # a failed batch must not stop the server
-            self._on_failure(error)
+        except Exception:  # a failed batch must not stop the server
+            _log.exception("the policy failed")
             for job in batch:
                 job.future.set_exception(PolicyFailure("the policy failed: see the server's log"))
             return
         milliseconds = (time.perf_counter() - start) * 1e3
-        self._metrics.count("batches")
-        self._metrics.count("batched_requests", len(batch))
-        self._metrics.observe("policy infer", milliseconds)
+        self._counts["batches"] += 1
+        self._counts["batched_requests"] += len(batch)
         for job, chunk in zip(batch, actions, strict=False):
             if np.isfinite(chunk).all():
-                job.future.set_result(Answer(chunk, milliseconds))
+                job.future.set_result((chunk, milliseconds))
             else:
                 message = "the policy returned actions that are not finite"
                 job.future.set_exception(PolicyFailure(message))

@@ -9,7 +9,6 @@ Needs only NumPy, msgpack and websockets. Works with openpi's servers too.
 """
 
 import asyncio
-import ssl
 import threading
 import time
 from collections.abc import Callable, Coroutine, Mapping
@@ -51,7 +50,6 @@ class PolicyClient:
         address: str = "ws://127.0.0.1:8000",
         *,
         token: str = "",
-        certificate: str = "",
         timeout: float = 10.0,
         wait: float = 0.0,
         say: Callable[[str], None] = lambda _: None,
@@ -59,9 +57,9 @@ class PolicyClient:
         """Connect to a server.
 
         Args:
-            address: ws://host:port or wss://host:port.
+            address: ws://host:port, or wss://host:port of a proxy whose certificate the system
+                trusts.
             token: the server's token, if it requires one.
-            certificate: path of a PEM file to trust in addition to the system's certificates.
             timeout: how long to wait for the connection and for each reply [s].
             wait: how long to try again if there is no server yet [s].
             say: called once, in another thread, with a sentence if that takes long.
@@ -73,10 +71,8 @@ class PolicyClient:
         self.address: str = address
         self._timeout, self._reset = timeout, False
         self._closing = threading.Lock()
-        context = ssl.create_default_context(cafile=certificate or None)
         self._options: dict[str, Any] = {
             "additional_headers": {"Authorization": f"Api-Key {token}"} if token else {},
-            "ssl": context if address.startswith("wss:") else None,
             "compression": None,
             "max_size": wire.MAX_FRAME,
             "open_timeout": timeout,

@@ -43,11 +43,11 @@ def _export(options: argparse.Namespace, console: Console) -> None:
     jax.config.update("jax_platforms", "cpu")
     from lorasp_jax.extras.serving import exporting, loading
 
-    loaded = loading.load_runs({"run": options.run}, base=options.base, words=options.tokenizer)
+    loaded = loading.load_run(options.run, base=options.base, words=options.tokenizer)
     exporting.write(
-        loaded.policies["run"],
+        loaded.policy,
         options.out,
-        continues=bool(loading.was_trained(options.run)),
+        continues=bool(loaded.continues),
         num_steps=options.num_steps,
         max_batch=options.max_batch,
         metadata=loaded.metadata,

@@ -33,38 +33,45 @@ DESCRIPTION = "policy.json"
 PROCESSOR, INSTRUCTIONS, WEIGHTS = "processor.json", "instructions.json", "weights.safetensors"
 ACT, CONTINUE = "act", "continue"
 """Kinds of programs."""
-SHOWN = 10
-"""Maximum number of instructions in a message."""
 _REMEDY = "copy the folder or export the policy again"
 
 
 @dataclass(frozen=True)
-class Description:
-    """What a policy needs and returns.
+class PolicyInterface:
+    """What a policy needs to know of a robot, and what it returns.
 
     Attributes:
-        cameras: names of the robot's cameras.
+        cameras: names of the robot's cameras; the third-person view comes first.
         image_size: S, height and width of pictures [pixels].
+        state_dim: J+1, the length of states and actions.
+        chunk: C, actions per call.
         masks_missing: whether the policy works without some of its cameras.
         centred: whether pictures that are not square were padded on both sides in training.
         antialias: whether they were smoothed before downsampling.
-        state_dim: J+1, the length of states and actions.
+    """
+
+    cameras: tuple[str, ...]
+    image_size: int
+    state_dim: int
+    chunk: int
+    masks_missing: bool = False
+    centred: bool = True
+    antialias: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Description(PolicyInterface):
+    """What is known of a policy.
+
+    Attributes:
         action_dim: A, the length of the noise's vectors.
-        chunk: C, actions per call.
         num_steps: flow steps.
         batch_sizes: numbers of observations that there are programs for, ascending.
         continues: whether a chunk can continue the previous one.
         metadata: what the run says of its robot.
     """
 
-    cameras: Sequence[str]
-    image_size: int
-    masks_missing: bool
-    centred: bool
-    antialias: bool
-    state_dim: int
     action_dim: int
-    chunk: int
     num_steps: int
     batch_sizes: Sequence[int]
     continues: bool
@@ -146,109 +153,136 @@ class ExportedPolicy:
         Raises:
             ValueError: an input does not fit, or the policy cannot continue chunks.
         """
-        return self.run([self.row(images, state, instruction, noise, previous, delay)])[0]
+        self._check_observation(images, state, noise)
+        self._check_continuation(previous, delay)
+        tokens = self.tokens(instruction)
+        row = build_row(self.description, images, state, tokens, previous, delay)
+        return self.run(jax.tree.map(lambda leaf: leaf[None], {**row, "noise": noise}))[0]
 
-    def row(
-        self,
-        images: Mapping[str, np.ndarray],
-        state: np.ndarray,
-        instruction: str,
-        noise: np.ndarray,
-        previous: np.ndarray | None = None,
-        delay: int = 0,
-    ) -> dict[str, Any]:
-        """Check the arguments of `act` and return a row of a batch for `run`."""
+    def tokens(self, instruction: str) -> Mapping[str, np.ndarray]:
+        """Return the tokens of an instruction, `ids` and `mask` `[T]`.
+
+        Raises:
+            ValueError: the policy does not know it.
+        """
+        if instruction not in self._tokens:
+            known = ", ".join(map(repr, self._tokens))
+            known = known if len(known) < 500 else f"{known[:500]}..."
+            raise ValueError(f"the instruction must be one of {known}, got {instruction!r}")
+        return self._tokens[instruction]
+
+    def run(self, batch: Mapping[str, Any]) -> np.ndarray:
+        """Return actions f32 `[B, C, J+1]`.
+
+        Args:
+            batch: B rows of `build_row`, stacked, and their `noise` `[B, C, A]`; B is one of
+                `description.batch_sizes`.
+        """
+        program = self._programs[CONTINUE if "previous" in batch else ACT, len(batch["state"])]
+        return np.asarray(program(self._weights, self._statistics, batch))
+
+    def _check_observation(self, images: Any, state: Any, noise: Any) -> None:
         needs = self.description
-        if not _are_cameras(images, needs):
+        given, known = set(images), set(needs.cameras)
+        if given != known and not (needs.masks_missing and given and given < known):
             raise ValueError(
                 f"images must be those of the cameras {', '.join(needs.cameras)}, got "
                 f"{', '.join(images) or 'none'}"
             )
-        picture = (needs.image_size, needs.image_size, 3)
         for name, image in images.items():
-            _check(f"the image of {name}", image, picture, np.uint8)
+            shape = (needs.image_size, needs.image_size, 3)
+            _check(f"the image of {name}", image, shape, np.uint8)
         _check("state", state, (needs.state_dim,), np.float32)
         _check("noise", noise, self.noise_shape, np.float32)
-        if instruction not in self._tokens:
-            known = ", ".join(map(repr, self.instructions[:SHOWN]))
-            more = f" and {len(self._tokens) - SHOWN} others" if self.instructions[SHOWN:] else ""
-            raise ValueError(f"the instruction must be one of {known}{more}, got {instruction!r}")
-        if previous is None and delay != 0:
-            raise ValueError(f"delay {delay} was given without previous")
-        black = np.zeros(picture, np.uint8)
-        row = {
-            "images": {name: images.get(name, black) for name in needs.cameras},
-            "present": {name: np.array(name in images) for name in needs.cameras},
-            "state": state,
-            "noise": noise,
-            **self._tokens[instruction],
-        }
-        return row if previous is None else row | self._remaining(previous, delay)
 
-    def run(self, rows: Sequence[Mapping[str, Any]]) -> np.ndarray:
-        """Return actions f32 `[B, C, J+1]` of B rows, of which all or none continue a chunk.
-
-        Raises:
-            ValueError: there is no program for B observations.
-        """
-        sizes = self.description.batch_sizes
-        if len(rows) not in sizes:
-            known = ", ".join(map(str, sizes))
-            raise ValueError(f"the policy runs batches of {known} observations, got {len(rows)}")
-        program = self._programs[CONTINUE if "previous" in rows[0] else ACT, len(rows)]
-        batch = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
-        return np.asarray(program(self._weights, self._statistics, batch))
-
-    def _remaining(self, previous: np.ndarray, delay: int) -> dict[str, Any]:
-        chunk, dim = self.description.chunk, self.description.state_dim
+    def _check_continuation(self, previous: Any, delay: Any) -> None:
+        if previous is None:
+            if delay != 0:
+                raise ValueError(f"delay {delay} was given without previous")
+            return
         if not self.description.continues:
             raise ValueError(
                 "the policy was not trained to continue chunks (--optim.rtc-max-delay): leave out "
                 "previous"
             )
-        is_short = (
-            isinstance(previous, np.ndarray) and previous.ndim == 2 and len(previous) <= chunk
-        )
-        length = len(previous) if is_short else chunk
-        _check("previous", previous, (length, dim), np.float32)
+        chunk, rows = self.description.chunk, np.shape(previous)[:1]
+        length = rows[0] if rows and rows[0] <= chunk else chunk
+        _check("previous", previous, (length, self.description.state_dim), np.float32)
         if not isinstance(delay, int | np.integer) or not 0 <= delay <= length:
             raise ValueError(
                 f"delay must be an integer from 0 to {length}, the length of previous, got {delay}"
             )
-        padded = np.concatenate([previous, np.zeros((chunk - length, dim), np.float32)])
-        return {"previous": padded, "delay": np.array(delay, np.int32)}
+
+
+def build_row(
+    needs: PolicyInterface,
+    images: Mapping[str, np.ndarray],
+    state: np.ndarray,
+    tokens: Mapping[str, np.ndarray],
+    previous: np.ndarray | None = None,
+    delay: int = 0,
+) -> dict[str, Any]:
+    """Return the inputs of a policy for one observation, apart from the noise.
+
+    Args:
+        needs: the policy's.
+        images: as in `ExportedPolicy.act`; cameras without a picture are masked.
+        state: f32 `[J+1]`.
+        tokens: `ids` and `mask` `[T]` of the instruction.
+        previous: f32 `[P, J+1]`, what remains of the previous chunk; None: chunks are independent.
+        delay: number of these actions that the robot executes before it switches.
+    """
+    black = np.zeros((needs.image_size, needs.image_size, 3), np.uint8)
+    row = {
+        "images": {name: images.get(name, black) for name in needs.cameras},
+        "present": {name: np.array(name in images) for name in needs.cameras},
+        "state": state,
+        **tokens,
+    }
+    if previous is None:
+        return row
+    padded = np.zeros((needs.chunk, needs.state_dim), np.float32)
+    padded[: len(previous)] = previous
+    return row | {"previous": padded, "delay": np.array(delay, np.int32)}
 
 
 def load(folder: str | os.PathLike[str]) -> ExportedPolicy:
     """Load an exported policy.
 
     Raises:
-        ValueError: the folder contains none, a file is damaged or missing, or this version of JAX
-            or its platform cannot run the programs.
+        ValueError: the folder contains none, a file is damaged or missing, or a newer version of
+            JAX wrote it.
     """
     folder = Path(folder)
     values = _read_description(folder / DESCRIPTION)
-    _check_versions(folder, values)
-    description = Description(**values["policy"])
+    if tuple(values["jax"]) > jax.__version_info__:
+        name = ".".join(map(str, values["jax"]))
+        raise ValueError(
+            f"{folder} was exported with JAX {name}, which JAX {jax.__version__} may not run: "
+            f"install JAX {name}, or export the policy again"
+        )
+    description = Description(**values["policy"] | {"cameras": tuple(values["policy"]["cameras"])})
     for name in description.files:
-        if not (folder / name).is_file():
-            raise ValueError(f"{folder / name} is missing: {_REMEDY}")
-        if file_digest(folder / name) != values["files"].get(name):
-            raise ValueError(f"{folder / name} is damaged: {_REMEDY}")
+        path = folder / name
+        if not path.is_file() or file_digest(path) != values["files"].get(name):
+            raise ValueError(f"{path} is missing or damaged: {_REMEDY}")
     with safetensors.safe_open(folder / WEIGHTS, framework="np") as file:
         weights = [jnp.asarray(file.get_tensor(name)) for name in sorted(file.keys())]
     statistics = json.loads((folder / PROCESSOR).read_bytes())["statistics"]
     tokens = json.loads((folder / INSTRUCTIONS).read_bytes())
-    dtypes = {"ids": np.int32, "mask": np.bool_}
+    programs = {each: folder / program_file(*each) for each in description.programs}
     return ExportedPolicy(
         description,
-        {each: _read_program(folder / program_file(*each)) for each in description.programs},
+        {k: export.deserialize(bytearray(path.read_bytes())) for k, path in programs.items()},
         weights,
         {
-            k: {n: jnp.array(v, jnp.float32) for n, v in both.items()}
-            for k, both in statistics.items()
+            kind: {name: jnp.array(values, jnp.float32) for name, values in by_name.items()}
+            for kind, by_name in statistics.items()
         },
-        {text: {k: np.array(row[k], dtypes[k]) for k in dtypes} for text, row in tokens.items()},
+        {
+            text: {"ids": np.array(row["ids"], np.int32), "mask": np.array(row["mask"], np.bool_)}
+            for text, row in tokens.items()
+        },
     )
 
 
@@ -283,51 +317,10 @@ def _read_description(path: Path) -> dict[str, Any]:
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path} is damaged: {_REMEDY}") from error
     if version != FORMAT:
-        raise ValueError(
-            f"{path.parent} has format {version}, but this version of the code reads format "
-            f"{FORMAT}: export the policy again"
-        )
+        raise ValueError(f"{path.parent} has format {version}, not {FORMAT}: export it again")
     if digest(values) != expected:
         raise ValueError(f"{path} is damaged: {_REMEDY}")
     return values
-
-
-def _check_versions(folder: Path, values: Mapping[str, Any]) -> None:
-    """Raise ValueError unless this JAX and its platform run the programs.
-
-    New versions of JAX read programs of earlier ones as far back as their calling conventions go.
-    """
-    oldest = export.minimum_supported_calling_convention_version
-    written, here = values["jax"], jax.__version_info__
-    if tuple(written) > here or values["calling_convention"] < oldest:
-        name = ".".join(map(str, written))
-        raise ValueError(
-            f"{folder} was exported with JAX {name}, which JAX {jax.__version__} cannot run: "
-            f"install JAX {name}, or export the policy again"
-        )
-    if (platform := _platform()) not in values["platforms"]:
-        raise ValueError(
-            f"{folder} was exported for {' and '.join(values['platforms'])}, but JAX uses "
-            f"{platform} here: set JAX_PLATFORMS=cpu"
-        )
-
-
-def _platform() -> str:
-    """Return the name that JAX's exported programs use for the default platform."""
-    device = jax.devices()[0]
-    if device.platform != "gpu":
-        return device.platform
-    return "rocm" if "rocm" in device.client.platform_version else "cuda"
-
-
-def _read_program(path: Path) -> export.Exported:
-    return export.deserialize(bytearray(path.read_bytes()))
-
-
-def _are_cameras(images: Mapping[str, np.ndarray], needs: Description) -> bool:
-    """Return whether images are those of all cameras, or of some if the policy accepts that."""
-    given, known = set(images), set(needs.cameras)
-    return given == known or (needs.masks_missing and bool(given) and given < known)
 
 
 def _check(name: str, array: Any, shape: tuple[int, ...], dtype: type[np.generic]) -> None:

@@ -23,7 +23,7 @@ from lorasp_jax.base.locks import locked
 from lorasp_jax.base.writing import atomic_folder
 from lorasp_jax.extras.serving import exported
 from lorasp_jax.extras.serving.exported import Description
-from lorasp_jax.extras.serving.policies import Rows, batch_sizes, sample, spec_of, without_prompts
+from lorasp_jax.extras.serving.policies import batch_sizes, describe, sample, without_prompts
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.statistics import Statistics
 
@@ -58,40 +58,21 @@ def write(
         raise ValueError("a policy without instructions cannot be exported")
     if num_steps < 1:
         raise ValueError(f"the number of flow steps must be at least 1, got {num_steps}")
-    sizes = batch_sizes(max_batch)
+    description = describe(
+        policy,
+        num_steps=num_steps,
+        batch_sizes=batch_sizes(max_batch),
+        continues=continues,
+        metadata=metadata or {},
+    )
     with locked(folder), atomic_folder(folder) as unfinished:
-        description = _describe(policy, continues, num_steps, sizes, metadata or {})
         _write_json(unfinished / exported.INSTRUCTIONS, _tokens(policy))
         _write_json(unfinished / exported.PROCESSOR, _normalization(policy))
         programs, weights = _export(without_prompts(policy), description)
         (unfinished / exported.WEIGHTS).write_bytes(safetensors.numpy.save(weights))
         for each, program in programs.items():
             (unfinished / exported.program_file(*each)).write_bytes(program.serialize())
-        _write_json(unfinished / exported.DESCRIPTION, _contents(unfinished, description, programs))
-
-
-def _describe(
-    policy: Policy,
-    continues: bool,
-    num_steps: int,
-    sizes: Sequence[int],
-    metadata: Mapping[str, Any],
-) -> Description:
-    spec = spec_of(policy)
-    return Description(
-        cameras=spec.cameras,
-        image_size=spec.image_size,
-        masks_missing=spec.masks_missing,
-        centred=spec.centred,
-        antialias=spec.antialias,
-        state_dim=spec.state_dim,
-        action_dim=policy.model.config.action_dim,
-        chunk=spec.chunk,
-        num_steps=num_steps,
-        batch_sizes=sizes,
-        continues=continues,
-        metadata=metadata,
-    )
+        _write_json(unfinished / exported.DESCRIPTION, _contents(unfinished, description))
 
 
 def _tokens(policy: Policy) -> dict[str, Any]:
@@ -105,27 +86,21 @@ def _tokens(policy: Policy) -> dict[str, Any]:
 def _normalization(policy: Policy) -> dict[str, Any]:
     """Return what processor.json contains: statistics by slot, the robot's slots, conventions."""
     processor = policy.processor
-    statistics = {
-        kind: {name: np.asarray(values).tolist() for name, values in by_name.items()}
-        for kind, by_name in _by_kind(processor.statistics).items()
-    }
+    statistics = jax.tree.map(lambda a: np.asarray(a).tolist(), _by_kind(processor.statistics))
     inputs = dataclasses.asdict(processor.inputs)
     return {"statistics": statistics, "slots": processor.robot_slots, "inputs": inputs}
 
 
-def _by_kind(statistics: Statistics) -> dict[str, Mapping[str, jax.Array]]:
-    return {"state": statistics.state, "action": statistics.action}
+def _by_kind(statistics: Statistics) -> dict[str, dict[str, jax.Array]]:
+    return {"state": dict(statistics.state), "action": dict(statistics.action)}
 
 
-def _contents(
-    folder: Path, description: Description, programs: Mapping[Any, export.Exported]
-) -> dict[str, Any]:
+def _contents(folder: Path, description: Description) -> dict[str, Any]:
     """Return what policy.json contains."""
     values = {
         "format": exported.FORMAT,
         "lorasp_jax": lorasp_jax.__version__,
         "jax": jax.__version_info__,
-        "calling_convention": max(p.calling_convention_version for p in programs.values()),
         "platforms": exported.PLATFORMS,
         "policy": dataclasses.asdict(description),
         "files": {name: exported.file_digest(folder / name) for name in description.files},
@@ -143,15 +118,10 @@ def _export(
     leaves, tree = jax.tree.flatten(dataclasses.replace(policy, processor=bare))
 
     def act(weights: list[jax.Array], statistics: Any, inputs: dict[str, Any]) -> jax.Array:
-        policy, rows = jax.tree.unflatten(tree, weights), dict(inputs)
+        policy = jax.tree.unflatten(tree, weights)
         processor = dataclasses.replace(policy.processor, statistics=Statistics(**statistics))
-        return sample(
-            dataclasses.replace(policy, processor=processor),
-            noise=rows.pop("noise"),
-            rows=Rows(**rows),
-            num_steps=description.num_steps,
-            continues="previous" in inputs,
-        )
+        policy = dataclasses.replace(policy, processor=processor)
+        return sample(policy, inputs, num_steps=description.num_steps)
 
     with _without_paths():
         inputs = {each: _inputs(description, tokens, *each) for each in description.programs}
@@ -187,7 +157,7 @@ def _with_weights(
 
 
 def _inputs(description: Description, tokens: int, kind: str, batch: int) -> dict[str, Any]:
-    """Return the shapes of a batch of `ExportedPolicy.row`."""
+    """Return the shapes of the inputs of `ExportedPolicy.run`."""
     size, dim, chunk = description.image_size, description.state_dim, description.chunk
 
     def each(dtype: Any, *shape: int) -> jax.ShapeDtypeStruct:

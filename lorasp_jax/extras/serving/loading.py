@@ -2,7 +2,7 @@
 
 import dataclasses
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,11 +11,11 @@ from lorasp_jax.adapters.io import native
 from lorasp_jax.base import hub
 from lorasp_jax.models import backbone
 from lorasp_jax.models.checkpoints import loading
-from lorasp_jax.policies import statistics_files, tokenizer
+from lorasp_jax.policies import statistics_files
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor
 from lorasp_jax.policies.prompt_table import PromptTable
-from lorasp_jax.policies.tokenizer import Tokenizer
+from lorasp_jax.policies.tokenizer import Tokenizer, load_tokenizer
 from lorasp_jax.training import export
 from lorasp_jax.training.base import SIZES
 from lorasp_jax.training.run_folder import CONFIG_FILE, read_json
@@ -26,18 +26,56 @@ UNADAPTED = "base"
 
 @dataclass(frozen=True)
 class Loaded:
-    """Policies and their tokenizers by adapter name; metadata for clients."""
-
-    policies: dict[str, Policy]
-    words: dict[str, Tokenizer]
-    metadata: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """A published checkpoint, and what its files do not say.
+    """A policy that was loaded.
 
     Attributes:
+        policy: the policy.
+        words: its tokenizer.
+        continues: whether it was trained to continue chunks; None: its files do not say.
+        metadata: what they say of its robot.
+    """
+
+    policy: Policy
+    words: Tokenizer
+    continues: bool | None = None
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+
+def is_run(where: str | os.PathLike[str]) -> bool:
+    """Return whether `where` is the folder of a run, as opposed to a checkpoint."""
+    path = Path(where)
+    return (path / native.DESCRIPTION).is_file() or (path / export.BASE).is_dir()
+
+
+def load_run(folder: str, *, base: str = "", words: str = "") -> Loaded:
+    """Load a finished run; arguments and errors are those of `load_policy`."""
+    described = export.describe(folder)
+    policy = export.load_policy(folder, base=base, words=words)
+    recorded = hub.resolve_portable(described["policy"]["tokenizer"])
+    config = read_json(Path(folder) / CONFIG_FILE, {"optim": {}})
+    return Loaded(
+        policy,
+        load_tokenizer(words or recorded),
+        continues=bool(config["optim"].get("rtc_max_delay")) if config else None,
+        metadata={key: described.get(key) for key in ("robot", "control_dt")},
+    )
+
+
+def load_checkpoint(
+    where: str,
+    *,
+    tokenizer: str = "",
+    statistics: str = "",
+    dataset: str = "",
+    joints: int = 0,
+    size: str = "",
+    dtype: str = "",
+    cameras: Mapping[str, str] | None = None,
+    adapters: Mapping[str, str] | None = None,
+) -> dict[str, Loaded]:
+    """Load a published checkpoint, as `UNADAPTED` and with each of its adapters.
+
+    Args:
         where: folder, Hub repository or bucket; see `models.load`.
         tokenizer: see `tokenizer.load_tokenizer`.
         statistics: see `statistics_files.read`; "" searches the checkpoint.
@@ -47,103 +85,31 @@ class Checkpoint:
         dtype: of parameters and products; "" leaves the default.
         cameras: backbone camera -> the robot's name for it; empty: the backbone's names.
         adapters: name -> folder; see `load_adapters`.
-    """
-
-    where: str
-    tokenizer: str = ""
-    statistics: str = ""
-    dataset: str = ""
-    joints: int = 0
-    size: str = ""
-    dtype: str = ""
-    cameras: Mapping[str, str] = field(default_factory=dict)
-    adapters: Mapping[str, str] = field(default_factory=dict)
-
-
-def is_run(where: str | os.PathLike[str]) -> bool:
-    """Return whether `where` is the folder of a run, as opposed to a checkpoint."""
-    path = Path(where)
-    return (path / native.DESCRIPTION).is_file() or (path / export.BASE).is_dir()
-
-
-def load_runs(runs: Mapping[str, str], *, base: str = "", words: str = "") -> Loaded:
-    """Load finished runs.
-
-    Args:
-        runs: name -> folder.
-        base: location of the frozen base, if it has moved.
-        words: location of the tokenizer, if it has moved.
-
-    Raises:
-        ValueError: see `load_policy`; or the runs are for different robots or control periods.
-    """
-    policies, tokenizers, metadata = {}, {}, {}
-    for name, folder in runs.items():
-        described = export.describe(folder)
-        policies[name] = export.load_policy(folder, base=base, words=words)
-        recorded = hub.resolve_portable(described["policy"]["tokenizer"])
-        tokenizers[name] = tokenizer.load_tokenizer(words or recorded)
-        own = {key: described.get(key) for key in ("robot", "control_dt")}
-        if metadata and own != metadata:
-            raise ValueError(f"the runs must agree on robot and control_dt, got {metadata}, {own}")
-        metadata = own
-    return Loaded(policies, tokenizers, metadata)
-
-
-def was_trained(run: str | os.PathLike[str]) -> bool | None:
-    """Return whether a run was trained to continue chunks; None if it does not say."""
-    config = read_json(Path(run) / CONFIG_FILE, {"optim": {}})
-    return bool(config["optim"].get("rtc_max_delay")) if config else None
-
-
-def check_trained(runs: Iterable[str]) -> None:
-    """Raise ValueError unless runs were trained to continue chunks, as far as they say."""
-    for folder in runs:
-        if was_trained(folder) is False:
-            raise ValueError(
-                f"{folder} was not trained to continue chunks (--optim.rtc-max-delay): use "
-                "--execution guided"
-            )
-
-
-def load_checkpoint(checkpoint: Checkpoint) -> Loaded:
-    """Load a published checkpoint.
 
     Raises:
         ValueError: something is missing or does not fit; see `models.load`, `statistics_files.read`
             and `Processor.of`.
     """
-    found = loading.find(checkpoint.where)
-    config = found.config
-    if checkpoint.size:
-        config = _config(checkpoint.size)
-    if checkpoint.dtype:
-        dtypes = {"dtype": checkpoint.dtype, "param_dtype": checkpoint.dtype}
-        config = dataclasses.replace(config, **dtypes)
-    statistics = statistics_files.read(
-        checkpoint.statistics or found.folder, dataset=checkpoint.dataset
-    )
-    if not checkpoint.joints and statistics.dim == config.action_dim:
+    found = loading.find(where)
+    config = _config(size) if size else found.config
+    if dtype:
+        config = dataclasses.replace(config, dtype=dtype, param_dtype=dtype)
+    moments = statistics_files.read(statistics or found.folder, dataset=dataset)
+    if not joints and moments.dim == config.action_dim:
         raise ValueError(
-            f"the statistics of {checkpoint.where} do not show the robot's number of joints: pass "
-            "--joints"
+            f"the statistics of {where} do not show the robot's number of joints: pass --joints"
         )
-    joints = checkpoint.joints or statistics.dim - 1
-    words = tokenizer.load_tokenizer(checkpoint.tokenizer)
+    joints, words = joints or moments.dim - 1, load_tokenizer(tokenizer)
     # The instructions come with the requests; these only measure the table.
     prompts = PromptTable.of(words, ["press the button"], config, num_joints=joints)
-    processor = Processor.of(
-        config,
-        statistics,
-        dataclasses.replace(prompts, instructions=()),
-        num_joints=joints,
-        cameras=checkpoint.cameras or None,
-    )
+    prompts = dataclasses.replace(prompts, instructions=())
+    processor = Processor.of(config, moments, prompts, num_joints=joints, cameras=cameras or None)
     model = found.load(config)
-    models = {UNADAPTED: model}
-    models |= {n: native.load_adapters(f, model) for n, f in checkpoint.adapters.items()}
-    policies = {name: Policy(adapted, processor) for name, adapted in models.items()}
-    return Loaded(policies, dict.fromkeys(policies, words), {})
+    models = {name: native.load_adapters(path, model) for name, path in (adapters or {}).items()}
+    return {
+        name: Loaded(Policy(adapted, processor), words)
+        for name, adapted in {UNADAPTED: model, **models}.items()
+    }
 
 
 def _config(size: str) -> Any:

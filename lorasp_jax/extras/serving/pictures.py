@@ -45,9 +45,8 @@ def to_square(
 
 def _to_height_width_channels(name: str, picture: Any) -> np.ndarray:
     if not isinstance(picture, np.ndarray) or picture.ndim != 3 or 3 not in picture.shape[::2]:
-        got = (
-            f"shape {picture.shape}" if isinstance(picture, np.ndarray) else type(picture).__name__
-        )
+        is_array = isinstance(picture, np.ndarray)
+        got = f"shape {picture.shape}" if is_array else type(picture).__name__
         raise ValueError(f"{name} must be a picture [H, W, 3] or [3, H, W], got {got}")
     if picture.shape[2] != 3:
         picture = picture.transpose(1, 2, 0)

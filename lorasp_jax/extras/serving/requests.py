@@ -12,53 +12,28 @@ them:
 `executed` makes the new chunk continue the previous one, as in `models.real_time_chunking`.
 """
 
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from lorasp_jax.extras.serving.exported import PolicyInterface
 from lorasp_jax.extras.serving.pictures import to_square
 
 MAX_PROMPT = 1000
 """Maximum length of an instruction [characters]."""
-_ABSENT = object()
 
 
 @dataclass(frozen=True)
-class PolicySpec:
-    """What a policy needs to know of a robot, and what it returns.
+class PolicySpec(PolicyInterface):
+    """What a server's policies need and return.
 
     Attributes:
-        cameras: names of the robot's cameras; the third-person view comes first.
-        image_size: height and width of the images [pixels].
-        state_dim: J+1, the length of states and actions.
-        chunk: C, actions per reply.
-        masks_missing: whether the policy works without some of its cameras.
-        centred: how pictures that are not square are padded; see `pictures.to_square`.
-        antialias: how pictures are resized.
-        instructions: those that the policy was trained with.
         execution: "naive", or how chunks continue the previous one: "trained" or "guided".
     """
 
-    cameras: tuple[str, ...]
-    image_size: int
-    state_dim: int
-    chunk: int
-    masks_missing: bool = False
-    centred: bool = True
-    antialias: bool = True
-    instructions: tuple[str, ...] = ()
     execution: str = "naive"
-
-
-@dataclass(frozen=True)
-class View:
-    """A picture of a form: its key, or the keys of nested maps."""
-
-    path: tuple[str, ...]
-    required: bool = True
 
 
 @dataclass(frozen=True)
@@ -66,17 +41,19 @@ class Form:
     """Keys of a request.
 
     Attributes:
-        name: for messages and the server's metadata.
+        name: for messages.
         state: keys whose values make up the state, in this order.
-        views: pictures, in the order of the policy's cameras. Empty: the key `image` maps the
-            policy's camera names to pictures.
+        pictures: keys in the order of the policy's cameras; "a/b" is the key b of the map a, unless
+            the request has such a key. Empty: `image` maps the policy's camera names to pictures.
         actions: number of action dimensions that the client expects; None: all.
+        required: number of pictures that the client must send; None: all.
     """
 
     name: str
     state: tuple[str, ...]
-    views: tuple[View, ...] = ()
+    pictures: tuple[str, ...] = ()
     actions: int | None = None
+    required: int | None = None
 
 
 FORMS = (
@@ -85,26 +62,23 @@ FORMS = (
     Form(
         "LIBERO",
         ("observation/state",),
-        (View(("observation/image",)), View(("observation/wrist_image",))),
+        ("observation/image", "observation/wrist_image"),
         actions=7,
     ),
     Form(
         "DROID",
         ("observation/joint_position", "observation/gripper_position"),
-        (View(("observation/exterior_image_1_left",)), View(("observation/wrist_image_left",))),
+        ("observation/exterior_image_1_left", "observation/wrist_image_left"),
         actions=8,
     ),
     Form(
         "ALOHA",
         ("state",),
-        (
-            View(("images", "cam_high")),
-            View(("images", "cam_left_wrist"), required=False),
-            View(("images", "cam_right_wrist"), required=False),
-        ),
+        ("images/cam_high", "images/cam_left_wrist", "images/cam_right_wrist"),
         actions=14,
+        required=1,
     ),
-    Form("UR5", ("joints", "gripper"), (View(("base_rgb",)), View(("wrist_rgb",))), actions=7),
+    Form("UR5", ("joints", "gripper"), ("base_rgb", "wrist_rgb"), actions=7),
 )
 
 
@@ -118,69 +92,37 @@ class Request:
         prompt: instruction, or None.
         adapter: name of an adapter, or None.
         reset: whether an episode starts.
-        actions: number of action dimensions to return.
+        actions: number of action dimensions to return; None: all.
         executed: s, actions of the previous chunk that the robot has executed; None: the new chunk
             does not continue it.
         delay: d, further actions of the previous chunk that the robot will execute.
-        previous: f32 `[C, J+1]`, the previous chunk. The session knows it.
+        previous: f32 `[C, J+1]`, the previous chunk. The server knows it.
     """
 
     images: Mapping[str, np.ndarray] = field(repr=False)
     state: np.ndarray
-    prompt: str | None
-    adapter: str | None
-    reset: bool
-    actions: int
+    prompt: str | None = None
+    adapter: str | None = None
+    reset: bool = False
+    actions: int | None = None
     executed: int | None = None
     delay: int = 0
     previous: np.ndarray | None = field(default=None, repr=False)
 
 
-def choose_prompt(request: Request, default: str, spec: PolicySpec) -> str:
-    """Return the request's instruction, the default, or a policy's only one.
-
-    Raises:
-        ValueError: there is none.
-    """
-    only = spec.instructions[0] if len(spec.instructions) == 1 else ""
-    prompt = request.prompt or default or only
-    if not prompt:
-        raise ValueError("the request must contain a prompt")
-    return prompt
-
-
-def common_spec(specs: Mapping[str, PolicySpec]) -> PolicySpec:
-    """Return what all policies need, without their instructions.
-
-    Raises:
-        ValueError: they need different observations.
-    """
-    (first, expected), *others = specs.items()
-    for name, spec in others:
-        for key in (each.name for each in dataclasses.fields(spec)):
-            a, b = getattr(expected, key), getattr(spec, key)
-            if a != b and key != "instructions":
-                raise ValueError(
-                    f"{first} and {name} cannot be served together: their {key} is {a} and {b}"
-                )
-    return dataclasses.replace(expected, instructions=())
-
-
 def parse(message: Any, spec: PolicySpec) -> Request:
-    """Check a decoded message and convert it to a request.
+    """Check a message and convert its pictures.
 
     Raises:
-        ValueError: keys are missing, or a value has the wrong type, shape or range; the message is
-            one sentence for the client.
+        ValueError: it is no request that the policy can answer, in a sentence for the client.
     """
     if not isinstance(message, dict) or not all(isinstance(key, str) for key in message):
         raise ValueError("a request must be a map with text keys")
     form = _form(message)
     state = np.concatenate([_vector(key, message[key]) for key in form.state])
     if state.shape != (spec.state_dim,):
-        raise ValueError(
-            f"{' and '.join(form.state)} must have {spec.state_dim} values, got {state.size}"
-        )
+        names = " and ".join(form.state)
+        raise ValueError(f"{names} must have {spec.state_dim} values, got {state.size}")
     executed, delay = _progress(message, spec)
     reset = message.get("reset", False)
     if not isinstance(reset, bool | np.bool_):
@@ -191,7 +133,7 @@ def parse(message: Any, spec: PolicySpec) -> Request:
         prompt=_text("prompt", message.get("prompt")),
         adapter=_text("adapter", message.get("adapter")),
         reset=bool(reset),
-        actions=min(form.actions or spec.state_dim, spec.state_dim),
+        actions=form.actions,
         executed=executed,
         delay=delay,
     )
@@ -202,9 +144,10 @@ def _progress(message: Mapping[str, Any], spec: PolicySpec) -> tuple[int | None,
     executed, delay = message.get("executed"), message.get("delay", 0)
     if executed is None and delay == 0:
         return None, 0
-    for name, value, most in (("executed", executed, spec.chunk), ("delay", delay, spec.chunk)):
-        if type(value) is not int or not 0 <= value <= most:
-            raise ValueError(f"{name} must be an integer from 0 to {most}, got {str(value)[:40]}")
+    for name, value in (("executed", executed), ("delay", delay)):
+        if type(value) is not int or not 0 <= value <= spec.chunk:
+            got = str(value)[:40]
+            raise ValueError(f"{name} must be an integer from 0 to {spec.chunk}, got {got}")
     if executed + delay > spec.chunk:
         raise ValueError(
             f"executed and delay must be at most {spec.chunk} together, the length of a chunk, got "
@@ -219,49 +162,43 @@ def _progress(message: Mapping[str, Any], spec: PolicySpec) -> tuple[int | None,
 
 
 def _form(message: Mapping[str, Any]) -> Form:
+    known = []
     for form in FORMS:
-        first = form.views[0].path if form.views else ("image",)
-        if all(key in message for key in form.state) and first[0] in message:
+        picture = form.pictures[0] if form.pictures else "image"
+        has_picture = picture in message or picture.partition("/")[0] in message
+        if has_picture and all(key in message for key in form.state):
             return form
-    known = "; ".join(f"{form.name}: {', '.join(_keys(form))}" for form in FORMS)
-    got = ", ".join(sorted(message))[:200] or "none"
+        known.append(f"{form.name}: {', '.join([*form.state, picture])}")
+    got, known = ", ".join(sorted(message))[:200] or "none", "; ".join(known)
     raise ValueError(f"a request must have the keys of one of these forms ({known}), got {got}")
 
 
-def _keys(form: Form) -> list[str]:
-    pictures = ["/".join(view.path) for view in form.views if view.required] or ["image"]
-    return [*form.state, *pictures]
-
-
 def _images(message: Mapping[str, Any], form: Form, spec: PolicySpec) -> dict[str, np.ndarray]:
-    if form.views:
-        pairs = zip(spec.cameras, form.views, strict=False)
-        views = {camera: view for camera, view in pairs}
-    else:
-        views = {camera: View(("image", camera)) for camera in spec.cameras}
-    if len(views) < len(spec.cameras) and not spec.masks_missing:
+    keys = form.pictures or [f"image/{camera}" for camera in spec.cameras]
+    if len(keys) < len(spec.cameras) and not spec.masks_missing:
         raise ValueError(
             f"the policy needs {len(spec.cameras)} cameras ({', '.join(spec.cameras)}), but "
-            f"{form.name} requests have {len(views)}"
+            f"{form.name} requests have {len(keys)}"
         )
     images = {}
-    for camera, view in views.items():
-        name, picture = "/".join(view.path), _lookup(message, view.path)
-        if picture is _ABSENT and (view.required or not spec.masks_missing):
-            raise ValueError(f"the request must contain the picture {name}")
-        if picture is not _ABSENT:
+    for number, (camera, key) in enumerate(zip(spec.cameras, keys, strict=False)):
+        picture = _lookup(message, key)
+        if picture is not None:
             images[camera] = to_square(
-                name, picture, spec.image_size, centred=spec.centred, antialias=spec.antialias
+                key, picture, spec.image_size, centred=spec.centred, antialias=spec.antialias
             )
+        elif form.required is None or number < form.required or not spec.masks_missing:
+            raise ValueError(f"the request must contain the picture {key}")
     return images
 
 
-def _lookup(message: Any, path: tuple[str, ...]) -> Any:
-    for key in path:
-        if not isinstance(message, dict) or key not in message:
-            return _ABSENT
-        message = message[key]
-    return message
+def _lookup(message: Mapping[str, Any], key: str) -> Any:
+    """Return the value of a key, or of a key in a map; None if there is none."""
+    if key in message:
+        return message[key]
+    head, _, rest = key.partition("/")
+    inner = message.get(head)
+    return inner.get(rest) if isinstance(inner, dict) else None
 
 
 def _vector(name: str, value: Any) -> np.ndarray:

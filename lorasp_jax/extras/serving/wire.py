@@ -75,21 +75,16 @@ class _Decoder:
         self._values = 0
 
     def list(self, values: list[Any]) -> list[Any]:
-        self._count(len(values))
+        self._values += len(values)
+        if self._values > MAX_VALUES:
+            raise FrameError(f"a frame must have at most {MAX_VALUES} values, arrays apart")
         return values
 
     def map(self, fields: dict[Any, Any]) -> Any:
-        self._count(len(fields))
+        self.list([*fields])
         if b"__ndarray__" in fields:
             return _array(fields)
-        if b"__npgeneric__" in fields:
-            return _scalar(fields)
-        return fields
-
-    def _count(self, number: int) -> None:
-        self._values += number
-        if self._values > MAX_VALUES:
-            raise FrameError(f"a frame must have at most {MAX_VALUES} values, arrays apart")
+        return _scalar(fields) if b"__npgeneric__" in fields else fields
 
 
 def _encode(value: Any) -> Any:
@@ -106,12 +101,8 @@ def _encode(value: Any) -> Any:
         raise TypeError(f"a message cannot contain an array of {array.dtype}")
     if isinstance(value, np.generic):
         return {b"__npgeneric__": True, b"data": array.item(), b"dtype": array.dtype.str}
-    return {
-        b"__ndarray__": True,
-        b"data": array.tobytes(),
-        b"dtype": array.dtype.str,
-        b"shape": array.shape,
-    }
+    header = {b"__ndarray__": True, b"dtype": array.dtype.str, b"shape": array.shape}
+    return {**header, b"data": array.tobytes()}
 
 
 def _array(fields: dict[Any, Any]) -> np.ndarray:

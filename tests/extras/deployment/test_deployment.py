@@ -143,9 +143,9 @@ def test_a_saved_variant_is_served(run, tmp_path, capsys, name):
     out = tmp_path / "policy"
     assert command.main([str(run), "--save", name, "--out", str(out)]) == 0
     assert capsys.readouterr().out == f"written: {out}\n"
-    loaded = loading.load_runs({"": str(out)})
+    loaded = loading.load_run(str(out))
     assert loaded.metadata == {"robot": "piper", "control_dt": 0.1}
-    (served,) = loaded.policies.values()
+    served = loaded.policy
     policy, _, settings = measurement.load(run)
     form, kind = name.split("-")
     made = variants.in_form(policy, form, measurement.calibration_episodes(settings))

@@ -1,6 +1,5 @@
 """Test the judge with an environment of another package's kind: a point on a line, and pictures."""
 
-import contextlib
 import dataclasses
 import json
 import os
@@ -14,21 +13,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lorasp_jax import models
 from lorasp_jax.evaluation.intervals import wilson_interval
 from lorasp_jax.extras.judge.__main__ import main
-from lorasp_jax.extras.judge.actors import RunActor, ServerActor
+from lorasp_jax.extras.judge.actors import RunActor
 from lorasp_jax.extras.judge.judge import judge
 from lorasp_jax.extras.judge.parallel import judge_in_processes
 from lorasp_jax.extras.judge.task import load_tasks
-from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.peft import FullFineTuning
-from lorasp_jax.training import export
 from tests import ROOT
+from tests.cases import mostly_slow
 from tests.evaluation.line_world import TASK, Line, tasks
 from tests.evaluation.policy_servers import policy_server
-from tests.models.random_models import random_backbone
-from tests.runs import CONFIG, make_run
 
 
 class Mover:
@@ -80,46 +74,32 @@ def test_hold_and_replan_count_environment_steps():
     assert len(mover.seen) == 2  # looks at steps 0 and 6
 
 
-def test_groups_pool_their_episodes():
-    results = judge(tasks(), Mover(), 2)
+def test_groups_pool_their_episodes_and_films_have_a_frame_per_action(tmp_path):
+    results = judge(tasks(), Mover(), 2, films=tmp_path / "films")
     assert results["episodes"] == 4
-    assert list(results["groups"]) == ["easy"]
-    assert results["groups"]["easy"]["episodes"] == 2
-
-
-def test_film_has_a_frame_per_action(tmp_path):
-    judge([TASK], Mover(), 1, films=tmp_path / "films")
+    assert {name: group["episodes"] for name, group in results["groups"].items()} == {"easy": 2}
     with Image.open(tmp_path / "films" / "line.webp") as film:
         assert film.size == (8, 8)
 
 
-CHANGES = {
-    "never reported 'won' in info, which had success": {"success": "won"},
-    "the observation has no side: it has pixels, at": {"cameras": {"side": "side"}},
-    "must return uint8 pictures [H, W, 3], got float64 [1]": {"cameras": {"side": "at"}},
-    "has no speed: it has pixels, at": {"state": "speed"},
-    "must have one axis, got shape [8, 8, 3]": {"state": "pixels"},
-    "predicts 2: lower the task's replan": {"replan": 3},
-    "takes actions of shape [1], but the policy's have shape [2]": {
-        "action": lambda action: np.zeros(2)
-    },
-}
-
-
-@pytest.mark.parametrize("message", CHANGES)
-def test_misfits_are_named(message):
-    with pytest.raises(ValueError) as error:  # noqa: PT011
-        judge([dataclasses.replace(TASK, **CHANGES[message])], Mover(), 1)
-    assert message in str(error.value)
-
-
 @pytest.mark.parametrize(
     ("fields", "message"),
-    [({"hold": 0}, "hold of task"), ({"cameras": {}}, "camera"), ({"instruction": ""}, "instruc")],
+    [
+        ({"success": "won"}, "never reported 'won' in info, which had success"),
+        ({"cameras": {"side": "side"}}, "no side: it has pixels, at"),
+        ({"cameras": {"side": "at"}}, r"uint8 pictures \[H, W, 3\], got float64 \[1\]"),
+        ({"state": "speed"}, "no speed: it has pixels, at"),
+        ({"state": "pixels"}, r"one axis, got shape \[8, 8, 3\]"),
+        ({"replan": 3}, "predicts 2: lower the task's replan"),
+        ({"action": lambda action: np.zeros(2)}, r"shape \[1\], but .* shape \[2\]"),
+        ({"hold": 0}, "hold of task"),
+        ({"cameras": {}}, "camera"),
+        ({"instruction": ""}, "instruction"),
+    ],
 )
-def test_bad_tasks_are_refused(fields, message):
+def test_misfits_are_named(fields, message):
     with pytest.raises(ValueError, match=message):
-        dataclasses.replace(TASK, **fields)
+        judge([dataclasses.replace(TASK, **fields)], Mover(), 1)
 
 
 HERE = "tests.evaluation.line_world"
@@ -129,20 +109,16 @@ HERE = "tests.evaluation.line_world"
     ("name", "message"),
     [
         ("line", "must be MODULE:factory"),
-        ("tests.nowhere:tasks", "there is no module tests.nowhere"),
-        (f"{HERE}:nothing", "has no function nothing"),
-        (f"{HERE}:not_tasks", "must return a Task"),
+        ("tests.nowhere:tasks", "no module tests.nowhere"),
+        (f"{HERE}:nothing", "no function nothing"),
+        (f"{HERE}:not_tasks", "must return a GymTask"),
+        (f"{HERE}:tasks", "no task third: choose from line, other"),
     ],
 )
-def test_bad_factories_are_named(name, message):
-    with pytest.raises(ValueError, match=message):
-        load_tasks(name)
-
-
-def test_tasks_are_selected_by_name():
+def test_tasks_are_selected_by_name(name, message):
     assert [task.name for task in load_tasks(f"{HERE}:tasks", ["other"])] == ["other"]
-    with pytest.raises(ValueError, match="no task third: choose from line, other"):
-        load_tasks(f"{HERE}:tasks", ["third"])
+    with pytest.raises(ValueError, match=message):
+        load_tasks(name, ["third"])
 
 
 def act(request):
@@ -152,34 +128,29 @@ def act(request):
     return Mover().act(request["image"], request["state"], request["prompt"])
 
 
-def test_command_judges_a_server(tmp_path, capsys):
-    out = tmp_path / "results.json"
-    with policy_server(act) as url:
-        options = ["--server", url, "--env", f"{HERE}:tasks", "--episodes", "3", "--out", str(out)]
-        assert main(options) == 0
-        assert main(options) == 2  # does not overwrite
-    printed, errors = capsys.readouterr()
-    assert "line   100.0 %" in printed
-    assert "exists: choose another --out" in errors
-    results = json.loads(out.read_text())
-    assert results["tasks"]["other"]["outcomes"] == [True] * 3
+COMMAND = [sys.executable, "-m", "lorasp_jax.extras.judge", "--env", f"{HERE}:tasks"]
 
 
-def test_processes_judge_as_one_does(tmp_path):
-    command = [sys.executable, "-m", "lorasp_jax.extras.judge", "--env", f"{HERE}:tasks"]
+def test_processes_judge_as_one_does(tmp_path, capsys):
     found = {}
     with policy_server(act) as url:
         for count in ("1", "2"):
             out, films = tmp_path / f"{count}.json", tmp_path / f"films{count}"
             options = ["--server", url, "--processes", count, "--out", str(out)]
             options += ["--episodes", "3", "--seed", "4", "--films", str(films)]
-            subprocess.run([*command, *options], cwd=ROOT, timeout=120, check=True)
+            assert main([*COMMAND[3:], *options]) == 0
             found[count] = json.loads(out.read_text())
             assert sorted(path.name for path in films.iterdir()) == ["line.webp", "other.webp"]
+        assert main([*COMMAND[3:], *options]) == 2  # does not overwrite
+    printed, errors = capsys.readouterr()
+    assert printed.count("line   100.0 %") == 2
+    assert "exists: choose another --out" in errors
     for key in ("tasks", "groups", "steps"):
         assert found["1"][key] == found["2"][key]
+    assert found["1"]["tasks"]["other"]["outcomes"] == [True] * 3
 
 
+@pytest.mark.slow
 def test_processes_end_with_the_judge(tmp_path):
     """A killed judge must leave no process behind."""
 
@@ -188,9 +159,8 @@ def test_processes_end_with_the_judge(tmp_path):
         time.sleep(3)
         return np.zeros((2, 1), np.float32)
 
-    command = [sys.executable, "-m", "lorasp_jax.extras.judge", "--env", f"{HERE}:tasks"]
     with policy_server(wait) as url:
-        judging = subprocess.Popen([*command, "--server", url, "--processes", "2"], cwd=ROOT)
+        judging = subprocess.Popen([*COMMAND, "--server", url, "--processes", "2"], cwd=ROOT)
         while not (tmp_path / "asked").exists():
             time.sleep(0.1)
         children = Path(f"/proc/{judging.pid}/task/{judging.pid}/children").read_text().split()
@@ -215,16 +185,18 @@ def die():
     os._exit(1)
 
 
+@pytest.mark.slow
 def test_a_killed_process_is_named():
     with pytest.raises(ValueError, match="a process that judged a task was killed"):
         judge_in_processes(f"{HERE}:tasks", (), die, 1, 2)
 
 
-def test_an_error_in_a_process_is_one_sentence(tmp_path, capsys):
+@pytest.mark.parametrize("processes", mostly_slow(["1", "2"], ["1"]))
+def test_an_error_of_the_server_is_one_sentence(processes, capsys):
     def refuse(request):
         raise ValueError("no such prompt")
 
-    options = ["--env", f"{HERE}:tasks", "--processes", "2"]
+    options = ["--env", f"{HERE}:tasks", "--processes", processes]
     with policy_server(refuse) as url:
         assert main(["--server", url, *options]) == 2
     assert capsys.readouterr().err == "error: the policy server refused: no such prompt\n"
@@ -235,29 +207,15 @@ def test_an_error_in_a_process_is_one_sentence(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--server", "ws://127.0.0.1:9", "--processes", "0"], "must be at least 1, got 0"),
+        (["--server", "ws://127.0.0.1:9", "--processes", "0"], "at least 1, got 0"),
         (["runs/x", "--processes", "2"], "--processes needs --server"),
+        ([], "either the folder of a run or --server"),
+        (["runs/x", "--server", "ws://127.0.0.1:9"], "either the folder of a run or --server"),
     ],
 )
-def test_bad_numbers_of_processes_are_refused(arguments, message, capsys):
+def test_options_that_do_not_fit_are_refused(arguments, message, capsys):
     assert main([*arguments, "--env", f"{HERE}:tasks"]) == 2
     assert message in capsys.readouterr().err
-
-
-def test_server_refusals_are_one_sentence():
-    task = dataclasses.replace(TASK, instruction="fly")
-    with (
-        policy_server(act) as url,
-        contextlib.closing(ServerActor(url)) as actor,
-        pytest.raises(ValueError, match="refused: no such prompt"),
-    ):
-        judge([task], actor, 1)
-
-
-@pytest.mark.parametrize("arguments", [[], ["runs/x", "--server", "ws://127.0.0.1:9"]])
-def test_one_policy_is_required(arguments, capsys):
-    assert main([*arguments, "--env", f"{HERE}:tasks"]) == 2
-    assert "either the folder of a run or --server" in capsys.readouterr().err
 
 
 def test_client_needs_no_jax():
@@ -279,21 +237,8 @@ def test_run_without_jax_names_the_way_out(monkeypatch):
         RunActor(Path("runs/x"), ["go"])
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """Write a finished run of a robot with six joints and a gripper."""
-    folder = tmp_path_factory.mktemp("runs")
-    models.save(folder / "base", random_backbone(Pi0Config.dummy()))
-    model = dataclasses.replace(CONFIG.model, checkpoint=str(folder / "base"))
-    config = dataclasses.replace(CONFIG, model=model, peft=FullFineTuning())
-    run = make_run(folder / "run", config, models.load(folder / "base"))
-    run.base_hash = models.weights_hash(folder / "base")
-    export.write(run)
-    return run
-
-
-def test_run_acts_as_its_policy(run):
-    actor = RunActor(run.folder, ["push the button", "push button"])
+def test_run_acts_as_its_policy(finished):
+    actor = RunActor(finished.folder, ["push the button", "push button"], num_steps=2)
     rng = np.random.default_rng(0)
     images = {name: rng.integers(0, 255, (32, 32, 3), np.uint8) for name in ("side", "wrist")}
     state = rng.normal(size=7).astype(np.float32)
@@ -301,8 +246,9 @@ def test_run_acts_as_its_policy(run):
     chunk = actor.act(images, state, "push the button")
     observation = {"image": {k: v[None] for k, v in images.items()}, "state": state[None]}
     key = jax.random.split(jax.random.key(4))[1]
-    row = run.policy.processor.prompts.rows(["push the button"])
-    (expected,) = run.policy.sample(key, observation, row)
+    row = finished.policy.processor.prompts.rows(["push the button"])
+    sample = jax.jit(lambda policy: policy.sample(key, observation, row, num_steps=2))
+    (expected,) = sample(finished.policy)
     np.testing.assert_allclose(chunk, expected, rtol=1e-4, atol=1e-5)
     actor.reset(4)
     assert np.abs(actor.act(images, state, "push button") - chunk).max() > 1e-6

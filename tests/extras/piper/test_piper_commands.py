@@ -118,7 +118,7 @@ def test_a_server_that_leaves_ends_the_run(last, before, tmp_path, monkeypatch, 
 )
 def test_a_policy_of_another_task_is_warned_of(known, warned, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(press, "TASK", dataclasses.replace(press.TASK, time_limit=0.1))
-    with serving(Still(dataclasses.replace(SPEC, instructions=known))) as server:
+    with serving(Still(instructions=known)) as server:
         assert fake(["--server", server.address, "--log", str(tmp_path / "log")]) == 0
     before = capsys.readouterr().out.partition("episode 0")[0]
     expected = f"warning: the policy was not trained for {press.TASK.instructions[0]!r}, "
@@ -245,7 +245,7 @@ def test_the_real_command_with_an_arm_on_the_bus(server, linked, tmp_path, monke
 
 
 def test_a_dry_run_of_the_real_command(linked, tmp_path, capsys):
-    policy = Still(dataclasses.replace(SPEC, instructions=("pour it",)))
+    policy = Still(instructions=("pour it",))
     with serving(policy) as server:
         words = ["--server", server.address, *linked, "--seconds", "0.5", "--dry-run"]
         assert real([*words, "--log", str(tmp_path)]) == 0

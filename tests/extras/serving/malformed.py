@@ -17,14 +17,22 @@ VALUES = (
 """Values of wrong types, shapes and ranges."""
 HEADERS = {
     b"dtype": (
-        "|O", "V8", "<c16", "<M8[s]", "f4,f4", "", 3, None, "<f4" * 9, "<U4096", ">f8", "|u1"
+        "|O", "V8", "<c16", "<M8[s]", "f4,f4", "(7,)f4", "", 3, None, "<f4" * 9, "<f4" + " " * 9,
+        "<U0", "<U\u0663", "<U4096", "<U999999", ">f8", "|u1",
     ),
     b"shape": (
-        [], [0], [-1], [2**62, 4], [2**33], [7.0], [True], None, 7, [[7]], [1] * 100, [16, 16]
+        [], [0], [-1], [-7, -1], [2**62, 4], [2**33], [2**40, 0], [7.0], [True], None, 7, [[7]],
+        [7] + [1] * 8, [1] * 100, [16, 16],
     ),
-    b"data": (b"", b"\0", b"\0" * 27, b"\0" * 29, None, 7, "text", [1, 2]),
+    b"data": (b"", b"\0", b"\0" * 27, b"\0" * 29, None, 7, "text", "0" * 28, [1, 2]),
 }  # fmt: skip
-"""Values of the fields that describe an array."""
+"""Values of the fields that describe an array, none of which fits those of `HONEST`."""
+HONEST = {
+    b"__ndarray__": True,
+    b"data": bytes(4 * SPEC.state_dim),
+    b"dtype": "<f4",
+    b"shape": [SPEC.state_dim],
+}
 
 
 def malformed_frames(number, seed=0):
@@ -71,12 +79,7 @@ def _missing_key(rng):
 
 
 def _lying_array(rng):
-    fields = {
-        b"__ndarray__": True,
-        b"data": bytes(4 * SPEC.state_dim),
-        b"dtype": "<f4",
-        b"shape": [SPEC.state_dim],
-    }
+    fields = dict(HONEST)
     for key in rng.choice(sorted(HEADERS), rng.integers(1, 4), replace=False):
         values = HEADERS[bytes(key)]
         fields[bytes(key)] = values[rng.integers(len(values))]

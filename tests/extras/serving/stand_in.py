@@ -22,9 +22,9 @@ class StandIn:
     answer.
     """
 
-    def __init__(self, spec=SPEC, *, sizes=(1, 2, 4, 8), seconds=0.0, adapters=("base",)):
-        self.spec, self.sizes, self.seconds, self.adapters = spec, sizes, seconds, adapters
-        self.instructions = dict.fromkeys(adapters, spec.instructions)
+    def __init__(self, spec=SPEC, *, seconds=0.0, adapters=("base",), instructions=()):
+        self.spec, self.sizes, self.seconds = spec, (1, 2, 4, 8), seconds
+        self.instructions = dict.fromkeys(adapters, instructions)
         self.gate, self.failure = threading.Event(), None
         self.batches, self.indices = [], []
         self.gate.set()
@@ -41,29 +41,27 @@ class StandIn:
         time.sleep(self.seconds)
         if self.failure:
             raise self.failure
-        offset = self.adapters.index(adapter) * 1000
+        offset = list(self.instructions).index(adapter) * 1000
         return np.repeat(np.stack(rows)[:, None], self.spec.chunk, axis=1) + np.float32(offset)
 
 
 @contextlib.contextmanager
 def serving(policy, **options):
-    """Serve in a thread; yields the server, with the attribute `address`."""
+    """Serve in a thread; yields the server, with the attributes `address`, `port` and `policy`."""
     port = bind("127.0.0.1", options.pop("port", 0))
-    listen = {"tls": options.pop("tls")} if "tls" in options else {}
     server, loop = PolicyServer(policy, **options), asyncio.new_event_loop()
     started, stop = threading.Event(), asyncio.Event()
 
     async def run():
-        async with server.listen(port, **listen):
+        async with server.listen(port):
             started.set()
             await stop.wait()
 
     thread = threading.Thread(target=lambda: loop.run_until_complete(run()), daemon=True)
     thread.start()
     assert started.wait(60)
-    server.port = port.getsockname()[1]
-    scheme = "wss" if "tls" in listen else "ws"
-    server.address = f"{scheme}://127.0.0.1:{server.port}"
+    server.policy, server.port = policy, port.getsockname()[1]
+    server.address = f"ws://127.0.0.1:{server.port}"
     try:
         yield server
     finally:

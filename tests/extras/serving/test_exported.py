@@ -10,26 +10,24 @@ import sys
 import jax
 import numpy as np
 import pytest
+from rich.console import Console
 
+from lorasp_jax.extras.serving import __main__ as command
 from lorasp_jax.extras.serving import exported
-from lorasp_jax.extras.serving.exporting import write
+from lorasp_jax.extras.serving.requests import Request
+from lorasp_jax.extras.serving.served import ServedPolicies
 from tests import ROOT
-from tests.extras.serving.test_policies import INSTRUCTIONS, make_policy
+from tests.extras.serving.conftest import ROBOT
+from tests.extras.serving.stand_in import connect, observation, serving
+from tests.extras.serving.test_policies import (
+    INSTRUCTIONS,
+    compiled,
+    make_policy,
+    reference,
+    request,
+)
 
-STEPS = 2
 MODULES = "import sys; print(*sys.modules)"
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("exports") / "policy"
-    write(make_policy(), folder, continues=True, num_steps=STEPS, max_batch=2)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def loaded(folder):
-    return exported.load(folder)
 
 
 @pytest.fixture
@@ -38,39 +36,16 @@ def copy(folder, tmp_path):
 
 
 def arguments(loaded, seed=0, **changes):
-    rng, needs = np.random.default_rng(seed), loaded.description
-    shape = (needs.image_size, needs.image_size, 3)
-    given = {
-        "images": {name: rng.integers(0, 255, shape, np.uint8) for name in needs.cameras},
-        "state": rng.normal(size=needs.state_dim).astype(np.float32),
-        "instruction": loaded.instructions[0],
-        "noise": rng.standard_normal(loaded.noise_shape, np.float32),
-    }
+    noise = np.random.default_rng(seed).standard_normal(loaded.noise_shape, np.float32)
+    sent = request(loaded.description, seed, prompt=loaded.instructions[0])
+    given = {"images": sent.images, "state": sent.state, "instruction": sent.prompt, "noise": noise}
     return given | changes
 
 
-def in_process(policy, given, *, absent=(), **condition):
+def in_process(policy, given, **condition):
     """Actions of the policy itself; `prefix` is in the robot's units."""
-    state = given["state"][None]
-    raw = {"image": {name: image[None] for name, image in given["images"].items()}, "state": state}
-    row = policy.processor.prompts.rows([given["instruction"]])
-    encoded = policy.processor.encode(raw, row)
-    if absent:
-        masks = {name: np.array([name not in absent]) for name in raw["image"]}
-        images = {n: i if n not in absent else 0 * i - 1 for n, i in encoded.images.items()}
-        encoded = dataclasses.replace(encoded, images=images, image_masks=masks)
-    if condition:
-        prefix = policy.processor.normalize_actions(condition["prefix"][None], state)
-        condition |= {"prefix": prefix}
-    chunk = policy.model.sample_actions(
-        None,
-        encoded,
-        num_steps=STEPS,
-        noise=given["noise"][None],
-        slots=policy.processor.flow_slots,
-        **condition,
-    )
-    return np.asarray(policy.processor.decode(chunk, state))[0]
+    sent = Request(given["images"], given["state"], given["instruction"])
+    return reference(policy, [sent], given["noise"][None], **condition)[0]
 
 
 def resign(folder, change=lambda values: None):
@@ -88,14 +63,10 @@ def test_actions_are_those_of_the_policy(loaded):
     actions = loaded.act(**given)
     assert (actions.shape, actions.dtype) == ((4, 7), np.float32)
     np.testing.assert_allclose(actions, in_process(make_policy(), given), atol=1e-5)
-
-
-def test_a_camera_may_be_absent(loaded):
-    given = arguments(loaded)
     expected = in_process(make_policy(), given, absent=["wrist"])
     images = {"side": given["images"]["side"]}
     np.testing.assert_allclose(loaded.act(**given | {"images": images}), expected, atol=1e-5)
-    assert np.abs(loaded.act(**given) - expected).max() > 1e-3
+    assert np.abs(actions - expected).max() > 1e-3
 
 
 def test_everything_given_matters(loaded):
@@ -105,64 +76,115 @@ def test_everything_given_matters(loaded):
         assert np.abs(loaded.act(**given | {name: value}) - first).max() > 1e-3, name
 
 
-def test_a_batch_gives_the_actions_of_its_rows(loaded):
-    rows = [arguments(loaded, seed) for seed in (0, 1)]
-    together = loaded.run([loaded.row(**row) for row in rows])
-    for row, actions in zip(rows, together, strict=True):
-        np.testing.assert_allclose(actions, loaded.act(**row), atol=1e-5)
-    with pytest.raises(ValueError, match="runs batches of 1, 2 observations, got 3"):
-        loaded.run([loaded.row(**rows[0])] * 3)
-
-
 def test_a_chunk_continues_the_previous_one(loaded):
     rest = loaded.act(**arguments(loaded))[1:]
     given = arguments(loaded, seed=1)
     actions = loaded.act(**given, previous=rest, delay=2)
     np.testing.assert_allclose(actions[:2], rest[:2], atol=1e-5)
-    expected = in_process(make_policy(), given, prefix=rest, prefix_length=2)
+    expected = in_process(make_policy(), given, prefix=rest[None], prefix_length=2, guidance=None)
     np.testing.assert_allclose(actions, expected, atol=1e-5)
     nothing = loaded.act(**given, previous=rest[:0])
     np.testing.assert_allclose(nothing, loaded.act(**given), atol=1e-5)
 
 
-def test_weights_and_statistics_are_data(tmp_path):
+def test_served_exports_act_like_served_runs(loaded, other_folder):
+    """With the noise of the same seed, alone and in batches."""
+    exports = {"base": loaded, "other": exported.load(other_folder)}
+    runs = {"base": make_policy(), "other": make_policy(seed=1)}
+    served, expected = ServedPolicies(exports, seed=3), compiled(runs, seed=3, metadata=ROBOT)
+    assert served.spec == expected.spec
+    assert served.instructions == expected.instructions
+    assert (served.sizes, served.metadata) == ((1,), ROBOT)
+    asked = request(served.spec, absent=["wrist"], adapter="other")
+    actions = [p.run("other", [p.prepare(asked, (2, 5))]) for p in (served, expected)]
+    np.testing.assert_allclose(*actions, atol=1e-5)
+    two = [request(served.spec), request(served.spec, 1, INSTRUCTIONS[0])]
+    both = served.run("base", [served.prepare(each, (0, 0)) for each in two])
+    alone = [expected.run("base", [expected.prepare(each, (0, 0))])[0] for each in two]
+    np.testing.assert_allclose(both, alone, atol=1e-5)
+
+
+def test_served_exports_continue_chunks(loaded):
+    served = ServedPolicies({"base": loaded}, execution="trained")
+    first = request(served.spec)
+    previous = served.run("base", [served.prepare(first, (0, 0))])[0]
+    naive = ServedPolicies({"base": loaded})
+    independent = naive.run("base", [naive.prepare(first, (0, 0))])[0]
+    np.testing.assert_allclose(previous, independent, atol=1e-5)
+    second = dataclasses.replace(first, previous=previous, executed=1, delay=2)
+    actions = served.run("base", [served.prepare(second, (0, 1))])[0]
+    np.testing.assert_allclose(actions[:2], previous[1:3], atol=1e-5)
+    assert np.abs(actions[2] - independent[2]).max() > 1e-4
+
+
+def load(*words):
+    return command._load(command.parser("serve").parse_args(words), Console(quiet=True))
+
+
+def test_a_server_of_exported_policies(other_folder):
+    policy = load(str(other_folder), "--prompt", "push the button")
+    with serving(policy, metadata=policy.metadata) as server, connect(server) as client:
+        assert client.metadata["robot"] == "piper"
+        sent = observation(policy.spec)
+        del sent["prompt"]
+        assert client.infer(sent)["actions"].shape == (4, 7)
+        with pytest.raises(Exception, match="one of 'press the button', 'push the button'"):
+            client.infer(sent | {"prompt": "dance"})
+
+
+@pytest.mark.parametrize(
+    ("words", "refusal"),
+    [
+        (["--num-steps", "5"], "--num-steps"),
+        (["--max-batch", "2"], "--max-batch"),
+        (["--base", "x"], "--base"),
+        (["--joints", "6"], "--joints"),
+        (["--execution", "guided"], "cannot be guided"),
+        (["--execution", "trained"], "other was not trained to continue"),
+        (["assets/pi0_nano"], "several policies"),
+    ],
+)
+def test_what_exported_policies_cannot_do(other_folder, words, refusal):
+    with pytest.raises(ValueError, match=refusal):
+        load(str(other_folder), *words)
+
+
+def test_policies_of_different_robots_are_not_served_together(loaded):
+    needs = dataclasses.replace(loaded.description, metadata={"robot": "panda"})
+    other = exported.ExportedPolicy(needs, {}, [], {}, {})
+    with pytest.raises(ValueError, match="cannot be served together: their metadata"):
+        ServedPolicies({"base": loaded, "panda": other})
+
+
+def test_weights_and_statistics_are_data(folder, other_folder, copy):
     """Programs do not depend on the weights: other weights make them another policy."""
-    other = make_policy(seed=1)
-    statistics = jax.tree.map(lambda a: a * 1.5, other.processor.statistics)
-    processor = dataclasses.replace(other.processor, statistics=statistics)
-    other = dataclasses.replace(other, processor=processor)
-    for name, policy in {"first": make_policy(), "other": other}.items():
-        write(policy, tmp_path / name, num_steps=STEPS, max_batch=1)
-    first, second = (tmp_path / name for name in ("first", "other"))
-    assert (first / "act-1.bin").read_bytes() == (second / "act-1.bin").read_bytes()
+    assert (folder / "act-1.bin").read_bytes() == (other_folder / "act-1.bin").read_bytes()
     for name in ("weights.safetensors", "processor.json"):
-        shutil.copy(second / name, first / name)
-    resign(first)
-    changed = exported.load(first)
+        shutil.copy(other_folder / name, copy / name)
+    resign(copy)
+    changed = exported.load(copy)
     given = arguments(changed)
-    np.testing.assert_allclose(changed.act(**given), in_process(other, given), atol=1e-5)
+    np.testing.assert_allclose(
+        changed.act(**given), in_process(make_policy(seed=1), given), atol=1e-5
+    )
 
 
-def test_programs_are_portable(folder):
+def test_programs_are_portable(folder, loaded):
     for path in folder.glob("*.bin"):
         program = jax.export.deserialize(bytearray(path.read_bytes()))
         assert program.platforms == ("cpu", "cuda")
         assert "custom_call" not in program.mlir_module()
-        assert b"/lorasp_jax" not in path.read_bytes()
-        assert str(ROOT).encode() not in path.read_bytes()
-
-
-def test_only_weights_in_use_are_stored(folder):
-    names = exported.load(folder)._weights
+        assert not any(name in path.read_bytes() for name in (b"/lorasp_jax", str(ROOT).encode()))
     backbone = sum(leaf.nbytes for leaf in jax.tree.leaves(make_policy().model))
-    assert sum(array.nbytes for array in names) < 1.05 * backbone
+    assert sum(array.nbytes for array in loaded._weights) < 1.05 * backbone  # those in use
 
 
 def test_the_loader_imports_nothing_else_of_the_package():
     code = f"import lorasp_jax.extras.serving.exported; {MODULES}"
     modules = subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).split()
     ours = {name for name in modules if name.partition(".")[0] in ("lorasp_jax", "envs")}
-    assert ours == {"lorasp_jax", "lorasp_jax.extras.serving", "lorasp_jax.extras.serving.exported"}
+    packages = {"lorasp_jax", "lorasp_jax.extras", "lorasp_jax.extras.serving"}
+    assert ours == {*packages, "lorasp_jax.extras.serving.exported"}
 
 
 def test_the_client_of_the_documentation_runs_without_the_package(folder, tmp_path):
@@ -180,50 +202,37 @@ def test_the_client_of_the_documentation_runs_without_the_package(folder, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    ("changes", "refusal"),
     [
-        ({"images": {}}, "images must be those of the cameras side, wrist, got none"),
-        ({"images": {"top": 0}}, "images must be those of the cameras side, wrist, got top"),
+        ({"images": {}}, "cameras side, wrist, got none"),
+        ({"images": {"top": 0}}, "cameras side, wrist, got top"),
         ({"images": {"side": np.zeros((32, 32, 3))}}, r"image of side must be uint8 \[32, 32, 3\]"),
         ({"images": {"side": np.zeros((9, 9, 3), np.uint8)}}, r"got uint8 \[9, 9, 3\]"),
         ({"state": np.zeros(7)}, r"state must be float32 \[7\], got float64 \[7\]"),
         ({"state": [0.0] * 7}, r"state must be float32 \[7\], got list"),
         ({"state": np.full(7, np.nan, np.float32)}, "state must be finite"),
-        ({"noise": np.zeros((4, 7), np.float32)}, r"noise must be float32 \[4, 8\], got float32"),
-        ({"instruction": "dance"}, "instruction must be one of 'press the button', 'push the but"),
+        ({"noise": np.zeros((4, 7), np.float32)}, r"noise must be float32 \[4, 8\]"),
+        ({"instruction": "dance"}, "one of 'press the button', 'push the button', got 'dance'"),
         ({"delay": 1}, "delay 1 was given without previous"),
-        ({"previous": np.zeros((5, 7), np.float32)}, r"previous must be float32 \[4, 7\], got "),
-        ({"previous": np.zeros(7, np.float32)}, r"previous must be float32 \[4, 7\], got "),
-        ({"previous": np.zeros((2, 7), np.float32), "delay": 3}, "delay must be .* from 0 to 2"),
+        ({"previous": np.zeros((5, 7), np.float32)}, r"previous must be float32 \[4, 7\]"),
+        ({"previous": np.zeros(7, np.float32)}, r"previous must be float32 \[4, 7\]"),
+        ({"previous": np.zeros((2, 7), np.float32), "delay": 3}, "delay .* from 0 to 2"),
         ({"previous": np.zeros((2, 7), np.float32), "delay": 0.5}, "delay must be an integer"),
     ],
 )
-def test_inputs_that_do_not_fit(loaded, changes, sentence):
-    with pytest.raises(ValueError, match=sentence):
+def test_inputs_that_do_not_fit(loaded, changes, refusal):
+    with pytest.raises(ValueError, match=refusal):
         loaded.act(**arguments(loaded, **changes))
 
 
-def test_long_lists_of_instructions_are_shortened(loaded):
-    tokens = loaded._tokens[INSTRUCTIONS[0]]
-    many = exported.ExportedPolicy(
-        loaded.description, {}, [], {}, {f"go to {i}": tokens for i in range(12)}
-    )
-    with pytest.raises(ValueError, match="'go to 9' and 2 others, got 'dance'"):
-        many.row(**arguments(many, instruction="dance"))
-
-
-def test_policies_that_cannot_do_it(copy):
-    def change(values):
-        values["policy"] |= {"continues": False, "masks_missing": False}
-
-    resign(copy, change)
+def test_policies_that_cannot_do_it(other_folder, tmp_path):
+    copy = shutil.copytree(other_folder, tmp_path / "copy")
+    resign(copy, lambda values: values["policy"].update(masks_missing=False))
     loaded = exported.load(copy)
     given = arguments(loaded)
     with pytest.raises(ValueError, match="not trained to continue chunks"):
         loaded.act(**given, previous=np.zeros((4, 7), np.float32))
-    with pytest.raises(
-        ValueError, match="images must be those of the cameras side, wrist, got sid"
-    ):
+    with pytest.raises(ValueError, match="cameras side, wrist, got side"):
         loaded.act(**given | {"images": {"side": given["images"]["side"]}})
 
 
@@ -232,7 +241,7 @@ def test_every_damaged_or_missing_file_is_named(folder, copy):
         damaged = bytearray(path.read_bytes())
         damaged[len(damaged) // 2] ^= 1
         (copy / path.name).write_bytes(damaged)
-        with pytest.raises(ValueError, match=rf"{path.name} is damaged: copy the folder or export"):
+        with pytest.raises(ValueError, match=rf"{path.name} is .*damaged"):
             exported.load(copy)
         (copy / path.name).unlink()
         with pytest.raises(ValueError, match=rf"(lacks {path.name}|{path.name} is missing)"):
@@ -241,42 +250,23 @@ def test_every_damaged_or_missing_file_is_named(folder, copy):
     assert exported.load(copy).instructions == INSTRUCTIONS
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", "[" * 100_000, '{"format": 1, "digest": 3}'])
-def test_a_description_that_is_none(copy, text):
-    (copy / "policy.json").write_text(text)
-    with pytest.raises(ValueError, match="is damaged"):
-        exported.load(copy)
-
-
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    ("text", "refusal"),
     [
-        ({"format": 2}, "has format 2, but this version of the code reads format 1: export"),
-        (
-            {"jax": [99, 0, 0]},
-            r"exported with JAX 99\.0\.0, which JAX .* cannot run: install JAX 99",
-        ),
-        ({"calling_convention": 0}, "cannot run: install JAX"),
-        ({"platforms": ["cuda"]}, "exported for cuda, but JAX uses cpu here"),
+        *((text, "is damaged") for text in ("", "[]", "{}", "[" * 100_000, '{"format": 1}')),
+        ('{"format": 2}', "has format 2"),
     ],
 )
-def test_folders_for_something_else(copy, changes, sentence):
-    resign(copy, lambda values: values.update(changes))
-    with pytest.raises(ValueError, match=sentence):
+def test_a_description_that_is_none(copy, text, refusal):
+    (copy / "policy.json").write_text(text)
+    with pytest.raises(ValueError, match=refusal):
         exported.load(copy)
 
 
-def test_platforms_have_the_names_of_exported_programs(monkeypatch):
-    client = dataclasses.make_dataclass("Client", ["platform_version"])
-    device = dataclasses.make_dataclass("Device", ["platform", "client"])
-    for platform, version, expected in (
-        ("cpu", "cpu", "cpu"),
-        ("gpu", "PJRT C API\ncuda 13000", "cuda"),
-        ("gpu", "PJRT C API\nrocm 70000", "rocm"),
-        ("tpu", "PJRT C API\nTFRT TPU v5", "tpu"),
-    ):
-        monkeypatch.setattr(jax, "devices", lambda p=platform, v=version: [device(p, client(v))])
-        assert exported._platform() == expected
+def test_folders_of_a_newer_jax(copy):
+    resign(copy, lambda values: values.update(jax=[99, 0, 0]))
+    with pytest.raises(ValueError, match=r"install JAX 99\.0\.0"):
+        exported.load(copy)
 
 
 def test_kernels_run_at_once_only_where_xla_knows_the_option(monkeypatch):

@@ -3,26 +3,26 @@
 import dataclasses
 import json
 import subprocess
+from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
-from lorasp_jax.extras.serving.policies import CompiledPolicies
 from lorasp_jax.models.inputs import OPENPI
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.policies import tokenizer
-from lorasp_jax.policies.policy import Policy
-from lorasp_jax.policies.processor import Processor
-from lorasp_jax.policies.prompt_table import PromptTable
-from lorasp_jax.policies.statistics import Statistics
-from tests import ROOT, foreign
+from tests import foreign
 from tests.extras.serving.stand_in import serving
-from tests.models.random_models import random_backbone
+from tests.extras.serving.test_policies import compiled, make_policy
+from tests.extras.serving.test_requests import EXAMPLES
 
 pytestmark = pytest.mark.slow
 
-SCRIPT = ROOT / "tests" / "serving" / "openpi_script.py"
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")
+CONFIG = dataclasses.replace(
+    Pi0Config.dummy(), cameras=CAMERAS, inputs=OPENPI, chunk=10, action_dim=16, max_tokens=32
+)
+"""A small pi0 with openpi's cameras and conventions."""
 
 
 @pytest.fixture(scope="module")
@@ -33,28 +33,19 @@ def python():
         yield python
 
 
-def policy(dims):
-    """A small pi0 with openpi's cameras and conventions, for a robot of `dims` dimensions."""
-    config = dataclasses.replace(
-        Pi0Config.dummy(), cameras=CAMERAS, inputs=OPENPI, chunk=10, action_dim=16, max_tokens=32
-    )
-    moments = {"mean": np.zeros(dims, np.float32), "std": np.ones(dims, np.float32)}
-    words = tokenizer.Offline()
-    prompts = PromptTable.of(words, ["do something"], config, num_joints=dims - 1)
-    processor = Processor.of(config, Statistics(moments, moments), prompts, num_joints=dims - 1)
-    policies = {"base": Policy(random_backbone(config), processor)}
-    compiled = CompiledPolicies(policies, {"base": words}, max_batch=1, num_steps=2)
-    compiled.warm_up()
-    return compiled
-
-
 @pytest.mark.parametrize(
     ("dims", "shapes", "token"),
     [(8, {"LIBERO": [10, 7], "DROID": [10, 8]}, ""), (14, {"ALOHA": [10, 14]}, "secret")],
 )
 def test_openpi_client(python, dims, shapes, token):
-    with serving(policy(dims), token=token) as server:
-        command = [python, SCRIPT, str(server.port), token, *shapes]
+    policy = compiled({"base": make_policy(CONFIG, dims=dims)}, max_batch=1)
+    policy.warm_up()
+    sent = {
+        form: jax.tree.map(lambda value: list(np.shape(value)), EXAMPLES[form]) for form in shapes
+    }
+    with serving(policy, token=token) as server:
+        script = Path(__file__).with_name("openpi_script.py")
+        command = [python, script, str(server.port), token, json.dumps(sent)]
         process = subprocess.run(command, check=False, capture_output=True, text=True)
     assert process.returncode == 0, process.stderr
     results = [json.loads(line) for line in process.stdout.splitlines()]
@@ -66,4 +57,4 @@ def test_openpi_client(python, dims, shapes, token):
         assert result["steps"] == [shapes[result["form"]][1:]] * 11
         assert result["timing"].keys() == {"infer_ms", "prev_total_ms"}
         assert result["metadata"]["cameras"] == list(CAMERAS)
-        assert "a request must have the keys of one of these forms" in result["error"]
+        assert "keys of one of these forms" in result["error"]

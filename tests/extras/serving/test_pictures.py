@@ -15,9 +15,8 @@ def smooth(height, width):
     return (np.stack(waves, -1) * 127 + 128).astype(np.uint8)
 
 
-@pytest.mark.parametrize("shape", [(48, 64), (64, 48), (20, 20), (7, 31), (64, 1), (100, 100)])
-@pytest.mark.parametrize("centred", [True, False])
-@pytest.mark.parametrize("antialias", [True, False])
+@pytest.mark.parametrize("shape", [(48, 64), (20, 20), (7, 31), (64, 1)])
+@pytest.mark.parametrize(("centred", "antialias"), [(True, True), (True, False), (False, True)])
 def test_pictures_equal_those_of_the_processor(shape, centred, antialias):
     picture, options = smooth(*shape), {"centred": centred, "antialias": antialias}
     found = to_square("x", picture, 32, **options)
@@ -27,39 +26,31 @@ def test_pictures_equal_those_of_the_processor(shape, centred, antialias):
     assert np.abs(found - expected).max() <= 2
 
 
-def test_pictures_of_the_right_size_are_not_copied():
-    picture = smooth(32, 32)
-    assert to_square("x", picture, 32) is picture
-
-
-def test_channels_first_and_floats():
+def test_layouts_and_types():
     picture = smooth(24, 32)
     expected = to_square("x", picture, 16)
     np.testing.assert_array_equal(to_square("x", picture.transpose(2, 0, 1), 16), expected)
     floats = (picture / np.float64(255)).astype(np.float32) + 1e-6
     np.testing.assert_array_equal(to_square("x", floats.clip(0, 1), 16), expected)
-
-
-def test_a_picture_three_pixels_high_is_not_mistaken_for_channels_first():
+    assert to_square("x", expected, 16) is expected  # not copied
+    # Three pixels high, which is not channels first.
     assert to_square("x", np.zeros((3, 40, 3), np.uint8), 16).shape == (16, 16, 3)
 
 
 @pytest.mark.parametrize(
-    ("picture", "sentence"),
+    ("picture", "refusal"),
     [
         (None, r"view must be a picture \[H, W, 3\] or \[3, H, W\], got NoneType"),
         (np.zeros((4, 4)), r"got shape \(4, 4\)"),
-        (np.zeros((4, 4, 4), np.uint8), r"got shape \(4, 4, 4\)"),
         (np.zeros((4, 3, 4), np.uint8), r"got shape \(4, 3, 4\)"),
-        (np.zeros((0, 4, 3), np.uint8), "sides of view must be 1 to 8192 pixels"),
-        (np.zeros((1, MAX_SIDE + 1, 3), np.uint8), "sides of view must be 1 to 8192 pixels"),
-        (np.zeros((4, 4, 3), np.int32), r"view must be uint8, or float in \[0, 1\], got int32"),
-        (np.full((4, 4, 3), np.nan), "values of view must be finite"),
-        (np.full((4, 4, 3), np.inf), "values of view must be finite"),
-        (np.full((4, 4, 3), 255.0), r"values of view must be finite and in \[0, 1\]"),
-        (np.full((4, 4, 3), -0.1), "values of view must be finite"),
+        (np.zeros((0, 4, 3), np.uint8), "1 to 8192 pixels"),
+        (np.zeros((1, MAX_SIDE + 1, 3), np.uint8), "1 to 8192 pixels"),
+        (np.zeros((4, 4, 3), np.int32), "uint8, or float .* got int32"),
+        (np.full((4, 4, 3), np.nan), "finite"),
+        (np.full((4, 4, 3), 255.0), r"in \[0, 1\]"),
+        (np.full((4, 4, 3), -0.1), r"in \[0, 1\]"),
     ],
 )
-def test_mistakes(picture, sentence):
-    with pytest.raises(ValueError, match=sentence):
+def test_mistakes(picture, refusal):
+    with pytest.raises(ValueError, match=refusal):
         to_square("view", picture, 16)

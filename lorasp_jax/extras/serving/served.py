@@ -1,0 +1,134 @@
+"""The policies of a server: runs, a checkpoint or exported policies of one robot."""
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from lorasp_jax.extras.serving.exported import ExportedPolicy, PolicyInterface, build_row
+from lorasp_jax.extras.serving.policies import CompiledPolicy
+from lorasp_jax.extras.serving.requests import PolicySpec, Request
+
+
+class ServedPolicies:
+    """Policies of one robot by adapter name. See `BatchPolicy`.
+
+    The noise of the flow depends only on the server's seed and on the numbers of the connection and
+    of the request on it, so the n-th connection to a server can be repeated exactly. Neither a
+    reset nor a new connection starts the noise again: an unlucky draw would be that of every
+    episode.
+    """
+
+    def __init__(
+        self,
+        policies: Mapping[str, CompiledPolicy | ExportedPolicy],
+        *,
+        prompt: str = "",
+        seed: int = 0,
+        execution: str = "naive",
+    ) -> None:
+        """Check that the policies fit; `warm_up` compiles.
+
+        Args:
+            policies: by adapter name; the first is the default.
+            prompt: the instruction of requests that have none; "" selects the only instruction that
+                the policy was trained with, if there is just one.
+            seed: of the flow's noise.
+            execution: "naive", or "trained" or "guided" to continue chunks, see docs/latency.md.
+                Exported policies cannot be guided.
+
+        Raises:
+            ValueError: the policies need different observations or are of different robots, or
+                cannot continue chunks as `execution` demands.
+        """
+        self._policies, self._prompt = dict(policies), prompt
+        self.spec: PolicySpec = _common_spec(policies, execution)
+        self.metadata: dict[str, Any] = dict(next(iter(policies.values())).description.metadata)
+        self.instructions: dict[str, tuple[str, ...]] = {
+            name: policy.instructions for name, policy in policies.items()
+        }
+        sizes = [set(policy.description.batch_sizes) for policy in policies.values()]
+        self.sizes: tuple[int, ...] = tuple(sorted(set.intersection(*sizes)))
+        draw = jax.vmap(functools.partial(draw_noise, jax.random.key(seed)), (0, None))
+        self._draw = jax.jit(draw, static_argnums=1)
+
+    def warm_up(self, say: Callable[[str], None] = lambda _: None) -> None:
+        """Compile and run every program; `say` is told of each before it starts."""
+        spec = self.spec
+        picture = np.zeros((spec.image_size, spec.image_size, 3), np.uint8)
+        images, state = dict.fromkeys(spec.cameras, picture), np.zeros(spec.state_dim, np.float32)
+        programs = list(itertools.product(self._policies, self.sizes))
+        for number, (adapter, size) in enumerate(programs, start=1):
+            say(f"compiling {adapter}, batch {size} ({number} of {len(programs)})")
+            prompt = (self._prompt, *self.instructions[adapter], "press the button")
+            request = Request(images, state, next(filter(None, prompt)), adapter)
+            for _ in range(2):
+                self.run(adapter, [self.prepare(request, (0, 0))] * size)
+
+    def prepare(self, request: Request, index: tuple[int, int]) -> dict[str, Any]:
+        """Convert a request to a row of a batch.
+
+        Raises:
+            ValueError: there is no instruction, or the policy does not know it.
+        """
+        adapter, execution = request.adapter or next(iter(self._policies)), self.spec.execution
+        known = self.instructions[adapter]
+        prompt = request.prompt or self._prompt or (known[0] if len(known) == 1 else "")
+        if not prompt:
+            raise ValueError("the request must contain a prompt")
+        rest = None
+        if execution != "naive":
+            rest = np.zeros((0, self.spec.state_dim), np.float32)
+            if request.executed is not None and request.previous is not None:
+                rest = request.previous[request.executed :]
+        tokens = self._policies[adapter].tokens(prompt)
+        row = build_row(self.spec, request.images, request.state, tokens, rest, request.delay)
+        if rest is not None and execution == "guided":
+            row["overlap"] = np.array(len(rest), np.int32)
+        return {**row, "index": np.array(index, np.int32)}
+
+    def run(self, adapter: str, rows: Sequence[dict[str, Any]]) -> np.ndarray:
+        """Return actions f32 `[B, C, J+1]`."""
+        policy = self._policies[adapter]
+        batch = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
+        shape = (policy.description.chunk, policy.description.action_dim)
+        noise = self._draw(batch.pop("index"), shape)
+        return policy.run({**batch, "noise": noise})
+
+
+def draw_noise(key: jax.Array, index: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    """Draw the noise of one request, f32 of a shape.
+
+    Args:
+        key: of the server.
+        index: int32 `[2]`, numbers of the connection and of the request on it.
+        shape: `(C, A)`.
+    """
+    connection, request = index
+    key = jax.random.fold_in(jax.random.fold_in(key, connection), request)
+    return jax.random.normal(key, shape)
+
+
+def _common_spec(
+    policies: Mapping[str, CompiledPolicy | ExportedPolicy], execution: str
+) -> PolicySpec:
+    """Return what all policies need; raise ValueError if they differ or cannot be executed so."""
+    shared = [field.name for field in dataclasses.fields(PolicyInterface)]
+    (first, expected), *_ = ((name, policy.description) for name, policy in policies.items())
+    for name, policy in policies.items():
+        for key in (*shared, "metadata"):
+            a, b = getattr(expected, key), getattr(policy.description, key)
+            if a != b:
+                raise ValueError(
+                    f"{first} and {name} cannot be served together: their {key} is {a} and {b}"
+                )
+        if execution == "trained" and not policy.description.continues:
+            raise ValueError(
+                f"{name} was not trained to continue chunks (--optim.rtc-max-delay): choose "
+                "another --execution"
+            )
+    return PolicySpec(**{key: getattr(expected, key) for key in shared}, execution=execution)
