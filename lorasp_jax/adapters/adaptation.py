@@ -30,7 +30,6 @@ from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdaptedLayer, AdapterAux, AdapterParam, DropoutKey, validate
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import FullFineTuning, Method, _validate
-from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Params, dropout_rate
 
 Model = TypeVar("Model", bound=nnx.Module)
@@ -77,7 +76,6 @@ def adapt(
     """
     paths.check_method_rules(rules)
     nnx_layers.check_einsums(einsums)
-    _check_statistics(statistics)
     root, key = _wrapped_copy(model), validate.rngs(rngs).params()
     used = _attach_all(root, rules, key, einsums, statistics) | unfreeze(root, rules)
     for i, (pattern, _) in enumerate(rules):
@@ -162,11 +160,9 @@ def _merged(location: paths.Location) -> nnx.Module:
     """Fold the adapter into the kernel; return the layer without an adapter."""
     layer = location.child
     if layer.adapter is not None:
-        try:
+        with paths.naming("merge", location.path):
             kernel = layer.kernel_matrices()
             kernel = over_stack(layer.method.merge, kernel)(layer.adapter.get_value(), kernel)
-        except ValueError as error:
-            raise ValueError(f"cannot merge {location.path}: {error}") from error
         layer.set_kernel_matrices(kernel)
     return layer.without_adapter()
 
@@ -195,10 +191,7 @@ def attach(
         would split a quantized kernel.
     """
     if layer.adapter is not None and layer.method is not None:
-        raise ValueError(
-            f"the layer already has a {layer.method.name} adapter: adapt the base instead, merge "
-            "the model first, or exclude this layer with a leading (pattern, None) rule"
-        )
+        raise ValueError(f"it already has a {layer.method.name} adapter: merge the model first")
     if method.splits_kernel and isinstance(layer.kernel_matrices(), QuantizedKernel):
         raise ValueError("a quantized kernel cannot be split: adapt first, then quantize")
     _convert_variables(
@@ -210,21 +203,6 @@ def attach(
     if method.splits_kernel:
         layer.set_kernel_matrices(kernel)
     layer.adapter = AdapterParam(params)
-
-
-def _check_statistics(statistics: Any) -> None:
-    """Raise ValueError unless `statistics` maps paths to finite square matrices."""
-    if not isinstance(statistics, Mapping):
-        raise ValueError(
-            f"statistics must be a mapping from calibration.input_moments, got {short(statistics)}"
-        )
-    for path, value in statistics.items():
-        shape = getattr(value, "shape", (0, 1))
-        traced = isinstance(value, jax.core.Tracer)
-        if shape[-2:] != shape[-1:] * 2 or not (traced or jnp.isfinite(value).all()):
-            raise ValueError(
-                f"statistics of {path} must be finite, of shape [..., I, I], got {short(value)}"
-            )
 
 
 def _wrapped_copy(model: nnx.Module) -> nnx.List[Any]:
@@ -258,11 +236,9 @@ def _attach_all(
             return None
         method = cast(Method, rules[used[location.path]][1])
         layer_key = jax.random.fold_in(key, zlib.crc32(location.path.encode()))
-        try:
+        with paths.naming("adapt", location.path):
             layer = nnx_layers.make_adaptable(location.child, einsums)
             attach(layer, method, layer_key, statistics.get(location.path))
-        except ValueError as error:
-            raise ValueError(f"cannot adapt {location.path or 'the model'}: {error}") from error
         return layer
 
     paths.replace(layers, attach_to)
@@ -285,15 +261,9 @@ def unfreeze(root: nnx.List[Any], rules: paths.Rules) -> set[int]:
             if layer and layer.adapter is None:
                 layer.method = method
             elif layer and location.name == layer.kernel_name:
-                raise ValueError(
-                    f"{location.path} cannot be fully fine-tuned: its layer has an adapter"
-                )
+                raise ValueError(f"{location.path} has an adapter and cannot be fully fine-tuned")
             if jnp.issubdtype(location.child.get_value().dtype, jnp.floating):
                 unfrozen.append(location)
-    if shapes := [p for p in unfrozen if isinstance(p.child.get_value(), jax.ShapeDtypeStruct)]:
-        raise ValueError(
-            f"{shapes[0].path} has a shape but no value: call this inside nnx.eval_shape"
-        )
     _convert_variables(unfrozen, AdapterParam)
     return used
 
@@ -320,11 +290,10 @@ def init_stack(
 
     Not jitted as a whole, so that random draws compile once per I, not once per kernel shape.
     """
-    if len(getattr(kernel, "shape", ())) < 2:
-        raise ValueError(f"an adapter needs a kernel [..., I, O], got {short(kernel)}")
-    *leading, d_in, d_out = kernel.shape
+    leading = getattr(kernel, "shape", ())[:-2]
     if not leading:
         return init(key, kernel, statistics=statistics)
+    d_in, d_out = kernel.shape[-2:]
     if statistics is not None:
         statistics = statistics.reshape(-1, d_in, d_in)
     keys = jax.random.split(key, math.prod(leading))

@@ -27,7 +27,13 @@ from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.adapters.layers.einsum import to_matrices
 from lorasp_jax.adapters.layers.linen_layers import layer_call, supported_class, with_lora
 from lorasp_jax.adapters.layers.nnx_layers import Einsums
-from lorasp_jax.adapters.paths import Rules, check_method_rules, find_rule, no_match_message
+from lorasp_jax.adapters.paths import (
+    Rules,
+    check_method_rules,
+    find_rule,
+    naming,
+    no_match_message,
+)
 from lorasp_jax.dense import AUX_NAME, validate
 from lorasp_jax.peft import Method, _validate
 from lorasp_jax.peft._method import dropout_rate
@@ -66,10 +72,8 @@ class LinenAdapter:
         check_method_rules(self.rules)
         nnx_layers.check_einsums(self.einsums)
         if not isinstance(self.model, nn.Module):
-            raise ValueError(
-                f"the model must be a Linen module, got {type(self.model).__name__}; for NNX "
-                "modules use `adapt`"
-            )
+            name = type(self.model).__name__
+            raise ValueError(f"the model must be a Linen module, got {name}; `adapt` is for NNX")
 
     def init(self, key: Any, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """Initialize the variables with the model's own `init`, and add the collection "adapters".
@@ -99,9 +103,7 @@ class LinenAdapter:
           ValueError: a rule applies to nothing (the message lists near misses), a layer is
             unsupported, or the variables already have adapters.
         """
-        if ADAPTER in {
-            name for path in flatten_dict(validate.variables(variables)) for name in path
-        }:
+        if any(ADAPTER in path for path in flatten_dict(validate.variables(variables))):
             raise ValueError("the variables already have adapters: pass those of the bare model")
         rngs = _rngs(key)
         record = _Record()
@@ -223,12 +225,10 @@ class LinenAdapter:
         if rule is None or module.has_variable("params", ADAPTER):
             return
         i, method = rule
-        try:
+        with naming("adapt", path):
             layer = layer_call(module, self.einsums, args, kwargs)
             init, key = layer.adapter_init(method), module.make_rng("params")
             params, rest = init_stack(key, init, layer.matrices())
-        except ValueError as error:
-            raise ValueError(f"cannot adapt {path or 'the model'}: {error}") from error
         if method.splits_kernel:
             layer.set_matrices(rest)
         module.put_variable("params", ADAPTER, params)
@@ -242,10 +242,8 @@ class LinenAdapter:
             return
         layer = layer_call(module, self.einsums, args, kwargs)
         matrices = layer.matrices()
-        try:
+        with naming("merge", "/".join(module.path)):
             merged = over_stack(rule[1].merge, matrices)(flax.core.unfreeze(params), matrices)
-        except ValueError as error:
-            raise ValueError(f"cannot merge {'/'.join(module.path)}: {error}") from error
         layer.set_matrices(merged)
         module.put_variable("params", ADAPTER, None)  # a layer called twice is merged once
 
@@ -261,9 +259,7 @@ class LinenAdapter:
                 record.used.add(i)
             full = method is not None and method.trains_base
             if full and path in record.kernels:
-                raise ValueError(
-                    f"{'/'.join(path)} cannot be fully fine-tuned: its layer has an adapter"
-                )
+                raise ValueError(f"{'/'.join(path)} has an adapter and cannot be fully fine-tuned")
             if full:
                 # A copy, since the train step may donate trainable arrays.
                 value = jax.tree.map(lambda v: jnp.array(v, jnp.float32, copy=True), value)
@@ -277,11 +273,8 @@ class LinenAdapter:
             return next_fun(*args, **kwargs)
         params, rule = module.get_variable("params", ADAPTER), self._rule(module)
         if (params is None) != (rule is None):
-            has = "no adapter" if params is None else "an adapter"
-            raise ValueError(
-                f"{'/'.join(module.path)} has {has}, which does not match the rules: create the "
-                "variables using `init` or `attach` with the same rules"
-            )
+            path, has = "/".join(module.path), "no" if params is None else "an"
+            raise ValueError(f"{path} has {has} adapter: `attach` it with the same rules")
         if rule is None:
             return next_fun(*args, **kwargs)
         params, method = flax.core.unfreeze(params), cast(Any, rule[1])
@@ -336,10 +329,8 @@ def _dropout_key(module: nn.Module, method: Method) -> jax.Array | None:
     if not dropout_rate(method) or not module.scope.has_flag(DROPOUT_FLAG):
         return None
     if not module.has_rng("dropout"):
-        raise ValueError(
-            f"{'/'.join(module.path)} has no rngs for its adapter's dropout: add 'dropout' to "
-            "split_rngs of the enclosing scan or vmap"
-        )
+        path = "/".join(module.path)
+        raise ValueError(f"{path} needs 'dropout' in split_rngs of the enclosing scan or vmap")
     return module.make_rng("dropout")
 
 

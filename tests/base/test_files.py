@@ -141,7 +141,7 @@ def test_damage_is_one_line_with_the_path_and_the_remedy(error, word):
 
 
 def test_refusals_and_bugs_pass_unchanged():
-    with pytest.raises(files.RefusedError, match="^pipe$"), files.as_value_error(files.Path("x")):
+    with pytest.raises(files.RefusedError, match=r"^pipe$"), files.as_value_error(files.Path("x")):
         raise files.RefusedError("pipe")
     with pytest.raises(AssertionError), files.as_value_error(files.Path("x")):
         raise AssertionError  # a bug

@@ -26,7 +26,11 @@ def test_valid_values(value, kind):
         *[(bad, int, "x") for bad in (True, 1.5, 10**39)],
         *[(bad, float, "x") for bad in (False, float("nan"), float("inf"), "1")],
         *[(1, bool, "x"), (None, str, "x"), ({}, [int], "x"), ([1], (int, int), "x")],
-        *[([1, "a"], [int], "x[1]"), ([], {}, "x"), ({"a": {}}, {"a": {"b": int}}, "x.a lacks 'b'")],
+        *[
+            ([1, "a"], [int], "x[1]"),
+            ([], {}, "x"),
+            ({"a": {}}, {"a": {"b": int}}, "x.a lacks 'b'"),
+        ],
         *[({"a": "1"}, {"a?": int}, "x.a"), ({"a": {"c": 0.5}}, {str: {str: int}}, "x.a.c")],
     ],
 )

@@ -160,9 +160,7 @@ class AdapterSet(Method):
           ValueError: the weights are per example, or a delta depends on the input.
         """
         if params["choice"].ndim > 1:
-            raise ValueError(
-                "cannot merge adapters chosen per example: choose one for the whole batch first"
-            )
+            raise ValueError("adapters are chosen per example: choose one for the batch first")
         base, bank = kernel.astype(jnp.float32), params["bank"]
         weights = dict(zip(self.names, params["choice"], strict=True))
         scale = bank["scale"] * _stack([weights[name] for name in self.bank_names])
@@ -176,9 +174,7 @@ class AdapterSet(Method):
         if choice.ndim > 1:
             examples, rows = len(choice), x.shape[0] if x.ndim > 1 else 1
             if rows % examples:
-                raise ValueError(
-                    f"adapters were chosen for {examples} examples, but a layer got {rows} rows"
-                )
+                raise ValueError(f"adapters for {examples} examples do not fit {rows} rows")
             choice = jnp.repeat(choice, rows // examples, axis=0)
             choice = choice.reshape(rows, *(1 for _ in x.shape[1:-1]), -1)
         return {name: choice[..., i] for i, name in enumerate(self.names)}
@@ -204,9 +200,7 @@ def set_slot(bank: Params, slot: int, method: LoRA | None, params: Params) -> Pa
     bank, rank = dict(bank), 0 if method is None else method.rank
     capacity = bank["lora_a"].shape[-1]
     if rank > capacity:
-        raise ValueError(
-            f"LoRA rank {rank} exceeds the maximum rank {capacity}: combine with a larger rank"
-        )
+        raise ValueError(f"LoRA rank {rank} exceeds {capacity}: combine with a larger rank")
     a, b = bank["lora_a"].at[..., slot, :].set(0), bank["lora_b"].at[..., slot, :, :].set(0)
     if method is not None:
         a = a.at[..., slot, :rank].set(params["lora_a"])

@@ -14,7 +14,6 @@ from lorasp_jax.adapters.combine import named
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdaptedLayer, AdapterParam, validate
 from lorasp_jax.peft import FullFineTuning, LoRA
-from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Params
 
 
@@ -47,13 +46,9 @@ def fuse(
       ValueError: as for `choose`, or weights is empty, rank is below 1, or a named adapter is not
         plain LoRA.
     """
-    if rank is not None:
-        validate.size("rank", rank)
-    if not isinstance(weights, Mapping) or not weights:
-        raise ValueError(
-            f"weights must be a non-empty mapping from name to weight, got {short(weights)}"
-        )
-    named.weights(model, weights)  # raises for an unknown name or an invalid weight
+    if not weights:
+        raise ValueError("weights must name at least one adapter")
+    named.weights(model, weights)  # raises for an unknown name
     fused, errors = {}, {}
     for path, _, _, layer in named.adapter_sets(model):
         factors = []
@@ -98,10 +93,8 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
     def unmerge_layer(location: paths.Location) -> AdaptedLayer | None:
         if location.path not in adapters:
             return None
-        try:
+        with paths.naming("unmerge", location.path):
             return _unmerged_layer(location.child, adapters[location.path])
-        except (ValueError, TypeError) as error:
-            raise ValueError(f"cannot unmerge {location.path}: {error}") from error
 
     modules = paths.locate(root, nnx.Module)
     paths.replace(modules, unmerge_layer)

@@ -23,7 +23,6 @@ from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdapterAux, AdapterParam, validate
 from lorasp_jax.kernels.frozen_matmul import frozen_matmul
-from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Aux, Method, Params
 
 Forward = Callable[[Any, Any], Any]
@@ -134,22 +133,12 @@ def observe(
       ValueError: there are no batches or no valid tokens, values are not finite, a layer was not
         called, its aux was not returned by `forward`, or it has a custom matmul or precision.
     """
-    if not isinstance(batches, Iterable) or isinstance(batches, str | Mapping):
-        raise ValueError(f"batches must be an iterable of inputs, got {short(batches)}")
-    if not callable(forward):
-        raise ValueError(f"forward must be callable (model, batch), got {short(forward)}")
     step = _make_step(_make_observed(model, reports, references), forward)
     total: dict[str, Sums] = {}
     for batch in batches:
-        for leaf in jax.tree.leaves(batch):
-            if not isinstance(leaf, jax.Array | np.ndarray | np.generic | float | int):
-                raise ValueError(f"batch leaves must be arrays or numbers, got {short(leaf)}")
         _add(total, step(batch))
     if missing := sorted(reports.keys() - total.keys()):
-        raise ValueError(
-            f"no statistics for {paths.near_misses(missing[0], missing)}: every layer must be "
-            "called, and `forward` must return any aux that the model returns"
-        )
+        raise ValueError(f"no statistics for {missing[0]}: `forward` must call it and return aux")
     for path, sums in total.items():
         if not np.any(sums["tokens"]):
             raise ValueError(f"the batches have no valid tokens for {path or 'the model'}")
@@ -192,10 +181,8 @@ def _make_observed(
         path = location.path
         if path not in reports:
             continue
-        try:
+        with paths.naming("observe", path):
             layer = nnx_layers.make_adaptable(location.child, {})
-        except ValueError as error:
-            raise ValueError(f"cannot observe {path}: {error}") from error
         paths.set_child(location, layer)
         if layer.adapter is None:
             adaptation.attach(layer, Observed(path, None, reports[path]), jax.random.key(0))
@@ -243,8 +230,7 @@ def input_moments(
     ]
     reports = {path: second_moment for path in layer_paths if re.search(pattern, path)}
     if not reports:
-        close = paths.near_misses(pattern, layer_paths) or "none"
-        raise ValueError(f"{short(pattern)} matches no dense layer or einsum; available: {close}")
+        raise ValueError(paths.no_match_message(pattern, layer_paths, {}))
     sums_by_path = observe(model, batches, reports, forward)
     return {path: sums["moment"] for path, sums in sums_by_path.items()}
 

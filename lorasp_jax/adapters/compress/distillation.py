@@ -18,7 +18,6 @@ from lorasp_jax.adapters.compress.compaction import (
     replace_adapters,
 )
 from lorasp_jax.peft import LoRA
-from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Params
 
 
@@ -46,15 +45,14 @@ def distill(
     Raises:
       ValueError: rank is below 1, or the model has no LoRA-SP layers.
     """
-    if rank is not None and not (type(rank) is int and rank >= 1):
-        raise ValueError(f"rank must be an integer of at least 1, or None, got {short(rank)}")
     layers = lora_sp_layers(model)
     sums = calibration.observe(model, batches, dict.fromkeys(layers, _regression_sums), forward)
     replacements: Replacements = {}
     ranks = {}
     for path, layer in layers.items():
         kernel = layer.kernel_matrices()
-        r = min(rank or layer.method.rank, layer.method.rank, *kernel.shape[-2:])
+        largest = min(layer.method.rank, *kernel.shape[-2:])
+        r = largest if rank is None else min(rank, largest)
         fit = adaptation.over_stack(functools.partial(_fitted, rank=r), kernel)
         u = adaptation.over_stack(layer.method.up, kernel)(layer.adapter.get_value())
         params = fit(sums[path]["xx"], sums[path]["xz"], u)

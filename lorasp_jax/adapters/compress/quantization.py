@@ -27,7 +27,6 @@ from lorasp_jax.dense import AdaptedLayer, AdapterParam, Dense, validate
 from lorasp_jax.kernels.frozen_matmul import uses_float8
 from lorasp_jax.kernels.platform import multiplies_float8
 from lorasp_jax.kernels.quantized_weights import KINDS, Kind, QuantizedKernel, quantize_kernel
-from lorasp_jax.peft._fields import short
 
 # (id of a variable, equation, kind) -> (quantized variable, original variable, error). Storing the
 # original keeps its id valid.
@@ -73,18 +72,13 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
             continue
         used.add(matching[0])
         if (kind := matching[0][1]) is not None:
-            try:
+            with paths.naming("quantize", location.path):
                 layer, errors[location.path] = _quantize_layer(location.child, kind, shared)
-            except ValueError as error:
-                raise ValueError(f"cannot quantize {location.path}: {error}") from error
             paths.set_child(location, layer)
     for rule in rules:
         if rule not in used:
-            close = paths.near_misses(rule[0], [location.path for location in layers]) or "none"
-            raise ValueError(
-                f"rule {short(rule[0])} applies to nothing; available dense layers and einsums: "
-                f"{close}"
-            )
+            available = [location.path for location in layers]
+            raise ValueError(paths.no_match_message(rule[0], available, {}))
     return QuantizationResult(root[0], errors)
 
 

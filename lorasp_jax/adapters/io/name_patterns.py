@@ -35,13 +35,9 @@ def values_of(patterns: Mapping[str, Any], names: Collection[str], default: Any)
         try:
             ways += len(names) * _ways(_parse(pattern), longest)
         except re.error as error:
-            raise ValueError(
-                f"{pattern_text!r} is not a valid regular expression: {error}"
-            ) from error
+            raise ValueError(f"{pattern_text!r} is not a regular expression: {error}") from error
         if ways > MAX_WAYS:
-            raise ValueError(
-                f"the pattern {pattern_text!r} could take too long to match {len(names)} names"
-            )
+            raise ValueError(f"{pattern_text!r} could take too long to match {len(names)} names")
     compiled = [(re.compile(pattern), value) for pattern, value in anchored.items()]
     values = {}
     for name in names:

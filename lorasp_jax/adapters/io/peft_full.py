@@ -48,7 +48,7 @@ def full_parameters(
         if not parts:
             continue
         if len(parts) < len(keys):
-            raise ValueError(f"{folder} has the {kind} of only some layers of the stack {module}")
+            raise ValueError(f"{folder} has the {kind} of only some layers of {module}")
         value = np.stack([_from_torch(part) if name == "kernel" else part for part in parts])
         rows = value.shape[1:] if name == "kernel" else (value[0].size,)
         shape = tuple(size[len(leading) :])
@@ -77,9 +77,7 @@ def check_biases(
     ]
     trained = modules if bias == "all" else set(modules) & set(adapted)
     if bias != "none" and trained and not any(kind == "bias" for _, kind in full):
-        raise ValueError(
-            f"the adapter in {folder} was trained with bias {bias!r}, but has no bias tensors"
-        )
+        raise ValueError(f"{folder} was trained with bias {bias!r}, but has no bias tensors")
 
 
 def export_full_parameters(
