@@ -114,9 +114,7 @@ def to_ours(
     def pop(name: str, shape: Shape) -> np.ndarray:
         array = np.asarray(theirs.pop(name))
         if array.shape != shape:
-            raise ModelMismatchError(
-                f"{name} of {source} must have shape {shape}, got {array.shape}"
-            )
+            raise ModelMismatchError(f"{name} of {source} is {array.shape}, expected {shape}")
         if not jnp.issubdtype(array.dtype, jnp.floating) or not np.isfinite(array).all():
             raise ValueError(f"{name} of {source} must be floating point and finite")
         return array
