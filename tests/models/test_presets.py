@@ -105,8 +105,7 @@ def test_trained_share_lists_frozen_modules():
     [("expert-onyl", "expert-only"), ("expert_only", "expert-only"), ("Vision", "vision")],
 )
 def test_an_unknown_preset_gets_a_suggestion(wrong, meant):
-    message = f"unknown preset {wrong!r} (did you mean {meant!r}?): choose one of paper, all-linear"
-    with pytest.raises(ValueError, match=re.escape(message)):
+    with pytest.raises(ValueError, match=f"{wrong!r} .*{meant!r}.*paper, all-linear"):
         presets.rules(["q_proj", wrong], LoRA())
 
 
