@@ -177,7 +177,7 @@ class LeRobot:
             table = table.filter(pc.equal(table["episode_index"], number))
             frames = table["frame_index"].cast(pa.int64()).to_numpy()
             times = table["timestamp"].cast(pa.float64()).to_numpy()
-            if not np.array_equal(frames, np.arange(entry.length)):
+            if len(frames) != entry.length or np.any(frames != np.arange(len(frames))):
                 raise ValueError(f"episode {number} must have frames 0 to {entry.length - 1}")
             drift = np.abs(times - frames / self.index.fps) * self.index.fps
             if not np.all(drift <= _TIME_TOLERANCE):

@@ -57,7 +57,7 @@ def test_values_that_are_not_finite(path):
     episodes.state[1, 0, 2] = np.nan
     rewrite(path, episodes)
     before = content(path)
-    with pytest.raises(ValueError, match=r"press is damaged .*state is not finite in dimension 2"):
+    with pytest.raises(ValueError, match=r"press is damaged .*state .* dimension 2"):
         rlds.read(path)
     assert content(path) == before
 
