@@ -153,7 +153,6 @@ def expert_success(
     """
     env = make_repeatable(task, robot, num_envs=worlds(num_episodes, num_envs), **options)
     ranges = prepare(ranges, env.control_dt)
-    checks.key(key)
     calls = -(-num_episodes // env.num_envs)
     attempt = attempt or attempt_expert
     results = [attempt(env, chunk_key, ranges) for chunk_key in jax.random.split(key, calls)]
@@ -191,7 +190,6 @@ def gather(
     """
     record = record or record_expert
     ranges = prepare(ranges, env.control_dt)
-    checks.key(key)
     if checks.number("action_noise", action_noise) < 0:
         raise ValueError(f"action_noise must be at least 0, got {action_noise}")
     for _ in range(attempted // env.num_envs):

@@ -58,23 +58,17 @@ class BraxEnv(base.Env):
             ranges: domain randomization of every episode, as in `Env.reset`.
 
         Raises:
-            TypeError: `env` is not an environment.
             ValueError: a range is invalid.
         """
-        checks.instance("env", env, Env, "an environment from envs.make")
         self.env: Env = dataclasses.replace(env, num_envs=1)
         prepare(ranges, env.control_dt)
         self.ranges = ranges
 
     def reset(self, rng: jax.Array) -> base.State:
-        """Start one world; `rng` is the key for all randomness.
-
-        Raises:
-            TypeError: `rng` is not a key.
-        """
+        """Start one world; `rng` is the key for all randomness."""
         ranges = prepare(self.ranges, self.env.control_dt)
         with self.env._calls.first("reset", ranges is None):
-            world = _reset(self.env, ranges, checks.key(rng))
+            world = _reset(self.env, ranges, rng)
         return base.State(reward=world.reward, metrics=world.metrics, **self._fields(world))
 
     def step(self, state: base.State, action: jax.Array) -> base.State:
@@ -85,10 +79,9 @@ class BraxEnv(base.Env):
             action: [A] in [-1, 1], clipped.
 
         Raises:
-            TypeError, ValueError: as in `Env.step`.
+            ValueError: as in `Env.step`.
         """
         pipeline: Any = state.pipeline_state
-        checks.instance("state.pipeline_state", pipeline, State, "a state from reset or step")
         before = jax.tree.map(lambda x: x[0], pipeline)
         low, high = jnp.asarray(self.env.action_low), jnp.asarray(self.env.action_high)
         action = checks.action(action, low.shape)

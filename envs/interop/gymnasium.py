@@ -28,9 +28,7 @@ try:
     from gymnasium.vector import AutoresetMode
     from gymnasium.vector.utils import batch_space
 except ImportError as error:
-    raise ImportError(
-        'envs.interop.gymnasium needs Gymnasium: pip install -e ".[gymnasium]"'
-    ) from error
+    raise ImportError('this needs Gymnasium: pip install -e ".[gymnasium]"') from error
 
 
 Observation = Literal["pictures", "state", "full_state"]
@@ -73,10 +71,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             ranges: domain randomization of every episode, as in `Env.reset`.
 
         Raises:
-            TypeError: `env` is not an environment.
             ValueError: the observation is unknown, or a range is invalid.
         """
-        checks.instance("env", env, Env, "an environment from envs.make")
         self.env = env
         self.observation = observation
         prepare(ranges, env.control_dt)
@@ -123,7 +119,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
         Raises:
             gymnasium.error.ResetNeeded: before the first `reset`.
-            TypeError, ValueError: the actions are not numbers, or their shape is wrong.
+            ValueError: the shape of the actions is wrong.
         """
         if self.state is None:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
@@ -184,7 +180,6 @@ class SingleEnv(gymnasium.Env):
         """
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
-        checks.instance("env", env, Env, "an environment from envs.make")
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": round(1 / env.control_dt)}
         self.vector: VectorEnv = VectorEnv(dataclasses.replace(env, num_envs=1), **options)
@@ -208,7 +203,7 @@ class SingleEnv(gymnasium.Env):
 
         Raises:
             gymnasium.error.ResetNeeded: before the first `reset`, and after the end of an episode.
-            TypeError, ValueError: as in `VectorEnv.step`.
+            ValueError: as in `VectorEnv.step`.
         """
         state = self.vector.state
         if state is not None and bool(state.done[0]):
@@ -263,9 +258,7 @@ def make(
 def _space(env: Env, observation: str) -> spaces.Space[Any]:
     """Return one world's observation space; joints can exceed limits, so states are unbounded."""
     if observation not in OBSERVATIONS:
-        raise ValueError(
-            f"unknown observation {observation!r}: choose from {', '.join(OBSERVATIONS)}"
-        )
+        raise ValueError(f"observation must be {' or '.join(OBSERVATIONS)}, got {observation!r}")
     if observation == "full_state":
         length = max(part.stop for part in env.full_state_layout.values())
         return spaces.Box(-np.inf, np.inf, (length,))

@@ -53,8 +53,7 @@ def find(model: mujoco.MjModel, arm: ArmIds, tcp: str | None) -> Hand:
     left, right = (_end(_corners(model, data, joint) @ axes) for joint in arm.fingers)
     gap = left[0, 1] - right[1, 1]
     if gap < 2 * TIP_RADIUS:
-        least = f"{2000 * TIP_RADIUS:.0f} mm"
-        raise ValueError(f"the fingers must open to at least {least}, got {1000 * gap:.0f} mm")
+        raise ValueError(f"the fingers open by only {1000 * gap:.0f} mm")
     pose = _pose(axes @ _center(data, axes, left, right, site), axes)
     carrier = model.body_parentid[model.jnt_bodyid[arm.fingers[0]]]
     frames = [np.eye(4), *(_frame(model, data, joint) for joint in arm.joints)]
@@ -83,8 +82,7 @@ def _open(model: mujoco.MjModel, data: mujoco.MjData, arm: ArmIds) -> tuple[np.n
     line = data.xaxis[arm.fingers[0]]
     along = data.xaxis[arm.fingers] @ line
     if abs(along[1]) < _PARALLEL:
-        angle = _degrees(along[1])
-        raise ValueError(f"the fingers must slide along one line, got axes {angle} deg apart")
+        raise ValueError(f"the fingers' axes are {_degrees(along[1])} deg apart, not on one line")
     address = model.jnt_qposadr[arm.fingers]
     centers = [_corners(model, data, joint).mean(axis=(0, 1)) @ line for joint in arm.fingers]
 
@@ -111,10 +109,7 @@ def _corners(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> np.ndarr
             rotation = data.geom_xmat[geom].reshape(3, 3)
             corners.append(data.geom_xpos[geom] + (center + half * _CORNERS) @ rotation.T)
     if not corners:
-        raise ValueError(
-            f"finger {model.joint(joint).name} needs a geom that collides; its body "
-            f"{model.body(finger).name} has none with contype or conaffinity"
-        )
+        raise ValueError(f"finger {model.joint(joint).name} needs a geom with contype, conaffinity")
     return np.stack(corners)
 
 
@@ -137,18 +132,15 @@ def _axes(
     if site:
         _, y, z = data.site(site).xmat.reshape(3, 3).T
         if abs(y @ across) < _PARALLEL:
-            raise ValueError(
-                f"the y axis of site {site} is {_degrees(y @ across)} deg off the line "
-                "along which the fingers open"
-            )
+            raise ValueError(f"the y axis of site {site} is not along the fingers' motion")
         if z @ reach < 0:
             raise ValueError(f"the z axis of site {site} must point out of the hand, not into it")
     else:
         z = data.xaxis[last] * (1 if data.xaxis[last] @ reach > 0 else -1)
         if abs(z @ across) > 1 - _PARALLEL:
             raise ValueError(
-                "the last joint's axis is not perpendicular to the fingers' motion: add a site tcp "
-                "whose z axis points out of the hand and along whose y axis the fingers open"
+                "the last joint's axis is along the fingers' motion: add a site tcp whose z axis "
+                "points out of the hand and whose y axis is along the fingers' motion"
             )
     z = z - (z @ across) * across
     z /= np.linalg.norm(z)

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs import checks
 from envs.rendering.renderer import Appearance
 from envs.robots import BASE, multiply, turn
 from envs.scene.ranges import Randomization
@@ -55,8 +54,6 @@ class Draw:
 def prepare(ranges: Randomization | None, control_dt: float) -> Randomization | None:
     """Check ranges, unless they are traced, and convert them to strongly typed arrays."""
     leaves = jax.tree.leaves(ranges)
-    if ranges is not None:
-        checks.instance("ranges", ranges, Randomization, "an envs.Randomization or None")
     if ranges and not any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
         ranges.check(control_dt)
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), ranges)

@@ -1,7 +1,5 @@
 """Invalid arguments raise errors of one sentence before anything is compiled."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,8 +25,8 @@ def worlds():
     ("arguments", "valid"),
     [
         *[({"task": bad}, "open_pot, pick_place") for bad in ("prss", 3)],
-        *[({"robot": bad}, "panda, piper") for bad in ("pipe", 5, b"piper")],
-        ({"robot": f"{300 * 'a'}.xml"}, "no such file"),
+        ({"robot": "pipe"}, "panda, piper"),
+        ({"robot": f"{300 * 'a'}.xml"}, "damaged"),
         *[({name: bad}, name) for name in NUMBER for bad in (2.5, True, -1, 10**12)],
         *[({"num_envs": bad}, "num_envs") for bad in (np.nan, "3", None, [4])],
         *[({"control_dt": bad}, "control_dt") for bad in (0.03, 0.0, 1e308, np.inf, "3", True)],
@@ -49,57 +47,19 @@ def test_numpy_numbers_are_accepted():
     assert (env.num_envs, env.max_steps) == (2, 16)
 
 
-@pytest.mark.parametrize("key", [None, 0, "a", np.zeros(3), jax.random.split(KEY)], ids=str)
-def test_keys(worlds, key):
-    env, state = worlds
-    calls = [
-        lambda: env.reset(key),
-        lambda: env.reset_done(state, key),
-        lambda: env.rollout(lambda seen, key: 0, key),
-        lambda: envs.expert_success("press", num_episodes=1, key=key),
-        lambda: envs.collect("press", num_episodes=1, key=key),
-    ]
-    for call in calls:
-        with pytest.raises(TypeError, match="key"):
-            call()
-
-
 @pytest.mark.parametrize("raw", [jax.random.PRNGKey(0), np.zeros(2, np.uint32)])
 def test_raw_keys_are_accepted(worlds, raw):
     assert jax.eval_shape(worlds[0].reset, raw).done.shape == (2,)
 
 
-@pytest.mark.parametrize(
-    "action",
-    [[[0.0] * 7] * 2, None, np.full((2, 7), "a"), np.zeros((2, 7), bool), np.zeros((2, 6))],
-)
-def test_actions(worlds, action):
+@pytest.mark.parametrize("action", [np.zeros((2, 6)), np.zeros(7), [[0.0] * 7]])
+def test_actions_of_another_shape(worlds, action):
+    """They would be broadcast."""
     env, state = worlds
-    with pytest.raises((TypeError, ValueError), match=r"action .*2, 7"):
+    with pytest.raises(ValueError, match=r"action .*2, 7"):
         env.step(state, action)
-
-
-def test_states(worlds):
-    env, state = worlds
-    other = dataclasses.replace(env, num_envs=3)
-    for call in (
-        env.observe,
-        env.proprio,
-        env.full_state,
-        lambda s: env.step(s, np.zeros((2, 7))),
-        lambda s: env.reset_done(s, KEY),
-    ):
-        with pytest.raises(TypeError, match="state from reset"):
-            call(None)
-    with pytest.raises(ValueError, match="3 worlds, got 2"):
-        other.observe(state)
-
-
-def test_policies(worlds):
-    with pytest.raises(TypeError, match="policy"):
-        worlds[0].rollout("policy", KEY)
-    with pytest.raises(ValueError, match=r"\(2, 7\), got \(7,\)"):
-        jax.eval_shape(lambda k: worlds[0].rollout(lambda seen, key: jnp.zeros(7), k), KEY)
+    with pytest.raises(ValueError, match=r"action .*2, 7"):
+        jax.eval_shape(lambda k: env.rollout(lambda seen, key: jnp.zeros(7), k), KEY)
 
 
 @pytest.mark.parametrize(
@@ -115,24 +75,13 @@ def test_ranges(worlds, bad):
             wrap(worlds[0], ranges=envs.Randomization(position=bad))
 
 
-def test_ranges_of_a_wrong_type(worlds):
-    with pytest.raises(TypeError, match="Randomization"):
-        worlds[0].reset(KEY, {"mass": (1, 2)})
-
-
 @pytest.mark.parametrize(
     ("name", "bad"),
     [
         *[("num_episodes", 2.5), ("num_episodes", 10**12), ("num_envs", 2.5)],
-        *[("action_noise", "a"), ("action_noise", -1.0), ("ranges", 3)],
+        *[("action_noise", "a"), ("action_noise", -1.0)],
     ],
 )
 def test_collect(name, bad):
     with pytest.raises((TypeError, ValueError), match=name):
         envs.collect("press", **{"num_episodes": 1, "key": KEY, name: bad})
-
-
-@pytest.mark.parametrize("wrap", [VectorEnv, BraxEnv])
-def test_wrappers(wrap):
-    with pytest.raises(TypeError, match="environment"):
-        wrap("press")
