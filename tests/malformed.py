@@ -1,10 +1,20 @@
-"""Check how untrusted input is refused."""
+"""Check how untrusted input is refused, such as adapters of `Net`."""
 
 import traceback
 from pathlib import Path
 
+from flax import nnx
+
 from lorasp_jax.base.files import RefusedError
 from tests import ROOT
+
+
+class Net(nnx.Module):
+    """Network with the sizes of the golden PEFT adapter."""
+
+    def __init__(self) -> None:
+        sizes = ((24, 40), (40, 24), (24, 16))
+        self.lin = nnx.List([nnx.Linear(i, o, rngs=nnx.Rngs(0)) for i, o in sizes])
 
 
 def check_refusal(error: BaseException, *names: str) -> None:

@@ -24,20 +24,12 @@ from lorasp_jax.data.opening import open_source
 from lorasp_jax.peft import LoRASP
 from tests.data.lerobots import GOLDEN, digest, golden
 from tests.envs.datasets.test_episodes import make
-from tests.malformed import check_refusal
+from tests.malformed import Net, check_refusal
 
 NAN, HUGE = float("nan"), 1e999
 Damage = Callable[[Path], None]
 DATA, INDEX = "data/**/*.parquet", "meta/episodes/**/*.parquet"
 TENSORS = ("adapter.safetensors", "adapter_model.safetensors")
-
-
-class Net(nnx.Module):
-    """Network with the sizes of the golden PEFT adapter."""
-
-    def __init__(self) -> None:
-        sizes = ((24, 40), (40, 24), (24, 16))
-        self.lin = nnx.List([nnx.Linear(i, o, rngs=nnx.Rngs(0)) for i, o in sizes])
 
 
 def first(folder: Path, pattern: str) -> Path:

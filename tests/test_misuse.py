@@ -141,7 +141,6 @@ def test_not_a_model(model, tmp_path):
         lambda: lorasp_jax.prune(model, [X]),
     ):
         check_error(call, "NNX module")
-    check_error(lambda: lorasp_jax.LinenAdapter(NET, [("inp", METHOD)]), "Linen module")
 
 
 def test_abstract_models(tmp_path):

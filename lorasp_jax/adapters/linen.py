@@ -35,7 +35,7 @@ from lorasp_jax.adapters.paths import (
     no_match_message,
 )
 from lorasp_jax.dense import AUX_NAME, validate
-from lorasp_jax.peft import Method, _validate
+from lorasp_jax.peft import Method
 from lorasp_jax.peft._method import dropout_rate
 
 ADAPTER = "lorasp_adapter"  # parameter name of an adapter in its layer
@@ -71,9 +71,6 @@ class LinenAdapter:
     def __post_init__(self) -> None:
         check_method_rules(self.rules)
         nnx_layers.check_einsums(self.einsums)
-        if not isinstance(self.model, nn.Module):
-            name = type(self.model).__name__
-            raise ValueError(f"the model must be a Linen module, got {name}; `adapt` is for NNX")
 
     def init(self, key: Any, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """Initialize the variables with the model's own `init`, and add the collection "adapters".
@@ -311,11 +308,8 @@ class _Record:
 
 
 def _rngs(key: Any) -> dict[str, jax.Array]:
-    """Return PRNG keys by stream name; raise ValueError unless "params" has one."""
-    rngs = dict(key) if isinstance(key, Mapping) else {"params": key}
-    if "params" not in rngs:
-        raise ValueError(f'rngs must have a key for "params", got {sorted(map(str, rngs))}')
-    return {name: _validate.key(value) for name, value in rngs.items()}
+    """PRNG keys by stream name."""
+    return dict(key) if isinstance(key, Mapping) else {"params": key}
 
 
 def _is_model_module(module: nn.Module) -> bool:

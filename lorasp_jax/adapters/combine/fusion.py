@@ -43,11 +43,8 @@ def fuse(
         result is the best approximation of that rank. None keeps the sum, so the result is exact.
 
     Raises:
-      ValueError: as for `choose`, or weights is empty, rank is below 1, or a named adapter is not
-        plain LoRA.
+      ValueError: as for `choose`, or rank is below 1, or a named adapter is not plain LoRA.
     """
-    if not weights:
-        raise ValueError("weights must name at least one adapter")
     named.weights(model, weights)  # raises for an unknown name
     fused, errors = {}, {}
     for path, _, _, layer in named.adapter_sets(model):

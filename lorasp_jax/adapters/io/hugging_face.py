@@ -220,13 +220,10 @@ def _supported_layers(model: nnx.Module) -> dict[str, AdaptedLayer]:
 
 def _common_settings(methods: Collection[Any]) -> tuple[bool, float]:
     """`use_dora` and `lora_dropout`; raise ValueError unless all methods agree on both."""
-    use_dora = {isinstance(method, DoRA) for method in methods}
-    rates = {dropout_rate(method) for method in methods}
-    if len(use_dora) != 1:
-        raise ValueError("a PEFT folder needs at least one adapter and cannot mix LoRA and DoRA")
-    if len(rates) != 1:
-        raise ValueError(f"PEFT stores one lora_dropout, but the adapters have {sorted(rates)}")
-    return use_dora.pop(), rates.pop()
+    settings = {(isinstance(method, DoRA), dropout_rate(method)) for method in methods}
+    if len(settings) != 1:
+        raise ValueError(f"PEFT needs one use_dora and lora_dropout, got {sorted(settings)}")
+    return settings.pop()
 
 
 def _check_fits(folder: pathlib.Path, module: str, adapter: Adapter, d_in: int, d_out: int) -> None:

@@ -177,7 +177,7 @@ def test_fully_trained_convolution(tmp_path):
 def test_dropout_rates_must_agree(tmp_path):
     rules = [("lin/0", LoRA(rank=2, dropout=0.1)), ("lin/1", LoRA(rank=2))]
     model = adaptation.adapt(Net(), rules, rngs=nnx.Rngs(0))
-    with pytest.raises(ValueError, match=r"lora_dropout.* \[0.0, 0.1\]"):
+    with pytest.raises(ValueError, match="lora_dropout"):
         hugging_face.save_peft(tmp_path / "new", model)
     model.lin[1].method = dataclasses.replace(model.lin[1].method, dropout=0.1)
     hugging_face.save_peft(tmp_path / "new", model)
