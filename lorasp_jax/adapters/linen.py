@@ -35,7 +35,7 @@ from lorasp_jax.adapters.paths import (
     no_match_message,
 )
 from lorasp_jax.dense import AUX_NAME, validate
-from lorasp_jax.peft import Method
+from lorasp_jax.peft import Method, _validate
 from lorasp_jax.peft._method import dropout_rate
 
 ADAPTER = "lorasp_adapter"  # parameter name of an adapter in its layer
@@ -309,7 +309,8 @@ class _Record:
 
 def _rngs(key: Any) -> dict[str, jax.Array]:
     """PRNG keys by stream name."""
-    return dict(key) if isinstance(key, Mapping) else {"params": key}
+    rngs = key if isinstance(key, Mapping) else {"params": key}
+    return {name: _validate.key(value) for name, value in rngs.items()}
 
 
 def _is_model_module(module: nn.Module) -> bool:
