@@ -86,12 +86,12 @@ class Env:
 
     @property
     def action_low(self) -> np.ndarray:
-        """Lowest action [A], float32; units as in `envs.actions`."""
+        """Lowest action `[A]`, float32; units as in `envs.actions`."""
         return actions.bounds(self.actions, self.robot, self.control_dt)[0]
 
     @property
     def action_high(self) -> np.ndarray:
-        """Highest action [A], float32."""
+        """Highest action `[A]`, float32."""
         return actions.bounds(self.actions, self.robot, self.control_dt)[1]
 
     @property
@@ -128,7 +128,7 @@ class Env:
 
         Args:
             state: W worlds.
-            action: [W, A], by default J joint targets [rad] and the gripper opening [m]; see
+            action: `[W, A]`, by default J joint targets [rad] and the gripper opening [m]; see
                 `envs.actions` for other modes. Actions are clipped to `action_low`, `action_high`
                 and the robot's speed limits.
 
@@ -148,8 +148,8 @@ class Env:
         """Render and measure what a policy observes.
 
         Returns:
-            `image`: camera name -> uint8 [W, image_size, image_size, 3].
-            `state`: f32 [W, J + 1] measured joint angles [rad] and gripper opening [m].
+            `image`: camera name -> uint8 `[W, image_size, image_size, 3]`.
+            `state`: f32 `[W, J + 1]` measured joint angles [rad] and gripper opening [m].
         """
         with self._calls.first("images", state.info["draw"] is None):
             return self._batched_observe(state)
@@ -171,7 +171,7 @@ class Env:
 
         Args:
             policy: (observation, key) -> action [W, A]. The observation is that of `observe`, plus
-                `instruction`, int32 [W]. Images that the policy does not read are not rendered.
+                `instruction`, int32 `[W]`. Images that the policy does not read are not rendered.
             key: random key.
             ranges: as in `reset`.
 
@@ -204,7 +204,7 @@ class Env:
         return jax.jit(where)(state.done, self.reset(key, ranges), state)
 
     def proprio(self, state: State) -> jax.Array:
-        """Measure joint angles [rad] and gripper opening [m], f32 [W, J + 1]."""
+        """Measure joint angles [rad] and gripper opening [m], f32 `[W, J + 1]`."""
         joints = state.data.qpos[:, : self.num_joints]
         fingers = state.data.qpos[:, self.num_joints : self.num_joints + 2]
         return jnp.concatenate([joints, jnp.sum(fingers, axis=1, keepdims=True)], axis=1)
@@ -227,7 +227,7 @@ class Env:
         return observations.layout(self.model, self.num_joints, self._task_bodies)
 
     def render(self, poses: Poses, *, draw: Draw | None = None) -> dict[str, jax.Array]:
-        """Render N recorded scenes: camera name -> uint8 [N, image_size, image_size, 3].
+        """Render N recorded scenes: camera name -> uint8 `[N, image_size, image_size, 3]`.
 
         Args:
             poses: poses of all geoms and cameras, leading axis N.
@@ -321,7 +321,7 @@ class Env:
         return where(state.done, state, where(finite, after, broken))
 
     def _start(self, draw: Draw | None, layout: Layout, command: jax.Array) -> Data:
-        """Start one world at rest, with the robot at `command` [J + 1]."""
+        """Start one world at rest, with the robot at `command` `[J + 1]`."""
         joints = jnp.concatenate([command[:-1], jnp.full(2, command[-1] / 2)])
         qpos = placing.positions(self.model, layout, joints)
         return self._with_cameras(draw, self.physics.start(self._changes(draw, layout), qpos))
@@ -342,7 +342,7 @@ class Env:
         return sorted(jax.eval_shape(self.task.place, jax.random.key(0)))
 
     def _appearance(self, draw: Draw) -> tuple[Appearance, jax.Array]:
-        """Return appearance and geom sizes [G, 3] of one world."""
+        """Return appearance and geom sizes `[G, 3]` of one world."""
         appearance = randomization.appearance(draw, self.render_model.appearance)
         return appearance, randomization.geom_sizes(draw, self.model, self._objects)
 

@@ -34,10 +34,10 @@ _full_state = fast_cpu.jit(Env._full_state, static_argnums=0)
 class BraxEnv(base.Env):
     """One world of a task behind Brax's interface, for Brax's wrappers to batch and restart.
 
-    Observations are those of `Env.full_state`, float32 [D], without images. To render, call
+    Observations are those of `Env.full_state`, float32 `[D]`, without images. To render, call
     `observe` of the attribute `env` on `state.pipeline_state`, an `envs.State` of one world.
 
-    Actions, [A] in [-1, 1], are rescaled to the range from `env.action_low` to `env.action_high`.
+    Actions, `[A]` in [-1, 1], are rescaled to the range from `env.action_low` to `env.action_high`.
     The sparse reward is 1 once, on success. The dense reward needs `action_repeat=1`, since Brax
     sums the rewards of repeated actions without discounting.
 
@@ -76,7 +76,7 @@ class BraxEnv(base.Env):
 
         Args:
             state: one world.
-            action: [A] in [-1, 1], clipped.
+            action: `[A]` in [-1, 1], clipped.
 
         Raises:
             ValueError: as in `Env.step`.

@@ -34,15 +34,15 @@ except ImportError as error:
 Observation = Literal["pictures", "state", "full_state"]
 OBSERVATIONS: tuple[str, ...] = get_args(Observation)
 """state: dict with `state`, float32 [J + 1], measured joint angles [rad] and gripper opening [m].
-pictures: the same plus `image`, dict from camera name to uint8 [image_size, image_size, 3].
-full_state: the privileged state of `Env.full_state`, float32 [D]."""
+pictures: the same plus `image`, dict from camera name to uint8 `[image_size, image_size, 3]`.
+full_state: the privileged state of `Env.full_state`, float32 `[D]`."""
 
 
 class VectorEnv(gymnasium.vector.VectorEnv):
     """W worlds of a task behind Gymnasium's interface.
 
     Observations are one of `OBSERVATIONS`, with a leading axis W. Actions are as in `Env.step`,
-    float32 [W, A]. Info has `success`, bool [W], and `instruction`, string [W].
+    float32 `[W, A]`. Info has `success`, bool `[W]`, and `instruction`, string `[W]`.
 
     Worlds restart automatically in Gymnasium's next-step mode: the step after a world ends ignores
     its action and returns the first observation of its next episode. That step has reward 0 and is
@@ -110,12 +110,12 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         """Simulate one control step of every world, and restart the worlds that have ended.
 
         Args:
-            actions: [W, A], units and limits as in `Env.step`.
+            actions: `[W, A]`, units and limits as in `Env.step`.
 
         Returns:
             Observation, reward, terminated, truncated and info. The reward, float32 [W], is sparse
-            or dense as chosen in `envs.make`. Worlds terminate on success, bool [W], and are
-            truncated by the time limit or broken physics, bool [W].
+            or dense as chosen in `envs.make`. Worlds terminate on success, bool `[W]`, and are
+            truncated by the time limit or broken physics, bool `[W]`.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first `reset`.
@@ -199,7 +199,7 @@ class SingleEnv(gymnasium.Env):
         """Simulate one control step; see `VectorEnv.step`.
 
         Args:
-            action: [A].
+            action: `[A]`.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first `reset`, and after the end of an episode.
@@ -214,7 +214,7 @@ class SingleEnv(gymnasium.Env):
         return _first(observation), float(reward[0]), *ends, self._info(info)
 
     def render(self) -> np.ndarray:
-        """Render the side camera, uint8 [image_size, image_size, 3].
+        """Render the side camera, uint8 `[image_size, image_size, 3]`.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first `reset`.

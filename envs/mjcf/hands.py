@@ -75,7 +75,7 @@ def _open(model: mujoco.MjModel, data: mujoco.MjData, arm: ArmIds) -> tuple[np.n
     """Open the fingers in `data`.
 
     Returns:
-        The sign [2] of each joint's motion when the hand opens, and the direction [3] from the
+        The sign `[2]` of each joint's motion when the hand opens, and the direction `[3]` from the
         second finger to the first.
     """
     mujoco.mj_kinematics(model, data)
@@ -98,7 +98,7 @@ def _open(model: mujoco.MjModel, data: mujoco.MjData, arm: ArmIds) -> tuple[np.n
 
 
 def _corners(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> np.ndarray:
-    """Return the corners [N, 8, 3] of the bounding boxes of the N colliding geoms of a finger."""
+    """Return the corners `[N, 8, 3]` of the bounding boxes of the N colliding geoms of a finger."""
     finger, corners = model.jnt_bodyid[joint], []
     for geom in np.flatnonzero(model.geom_contype | model.geom_conaffinity):
         body = model.geom_bodyid[geom]
@@ -125,7 +125,7 @@ def _site(model: mujoco.MjModel, tcp: str | None) -> str | None:
 def _axes(
     model: mujoco.MjModel, data: mujoco.MjData, arm: ArmIds, across: np.ndarray, site: str | None
 ) -> np.ndarray:
-    """Compute the axes [3, 3] of the hand in the world, as columns; y is `across`."""
+    """Compute the axes `[3, 3]` of the hand in the world, as columns; y is `across`."""
     last = arm.joints[-1]
     fingers = np.mean([_corners(model, data, f).mean(axis=(0, 1)) for f in arm.fingers], axis=0)
     reach = fingers - data.xanchor[last]
@@ -157,7 +157,7 @@ def _end(corners: np.ndarray) -> np.ndarray:
 def _center(
     data: mujoco.MjData, axes: np.ndarray, left: np.ndarray, right: np.ndarray, site: str | None
 ) -> np.ndarray:
-    """Compute the tcp's coordinates [3] along the hand's axes."""
+    """Compute the tcp's coordinates `[3]` along the hand's axes."""
     x = np.mean([left[:, 0], right[:, 0]])
     if site:
         x = data.site(site).xpos @ axes[:, 0]
@@ -168,7 +168,7 @@ def _center(
 
 
 def _frame(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> np.ndarray:
-    """Return the pose [4, 4] of a hinge in the world, with z along its axis."""
+    """Return the pose `[4, 4]` of a hinge in the world, with z along its axis."""
     z = data.xaxis[joint]
     body = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3)
     x = body[:, np.argmin(np.abs(z @ body))]
@@ -184,7 +184,7 @@ def _pose(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 
 
 def _pad(data: mujoco.MjData, body: int, pose: np.ndarray, box: np.ndarray) -> Pad:
-    """Make a finger's pad from its bounds [2, 3] along the axes of the tcp's pose [4, 4]."""
+    """Make a finger's pad from its bounds `[2, 3]` along the axes of the tcp's pose `[4, 4]`."""
     axes, origin = pose[:3, :3], pose[:3, 3]
     low, high = box - origin @ axes
     side = np.sign(low[1] + high[1])

@@ -92,7 +92,7 @@ def find_arm(model: mujoco.MjModel) -> ArmIds:
 
 
 def find_limits(model: mujoco.MjModel, arm: ArmIds) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest angles [J] allowed by both hinges and servos [rad].
+    """Return the lowest and highest angles `[J]` allowed by both hinges and servos [rad].
 
     Raises:
         ValueError: the two ranges of a joint do not overlap, or all seem to be in the wrong unit.
@@ -117,7 +117,7 @@ def find_limits(model: mujoco.MjModel, arm: ArmIds) -> tuple[np.ndarray, np.ndar
 def find_gripper(model: mujoco.MjModel, arm: ArmIds, signs: np.ndarray) -> Gripper:
     """Combine the fingers' actuators, which may act on one finger, on both, or on a tendon.
 
-    `signs` [2] is 1 for a finger joint whose positive direction opens the hand, else -1.
+    `signs` `[2]` is 1 for a finger joint whose positive direction opens the hand, else -1.
 
     Raises:
         ValueError: the fingers have no actuator, or one that is not a position actuator.

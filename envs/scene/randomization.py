@@ -31,10 +31,10 @@ class Draw:
         size, friction, brightness, latency, table_height: [].
         mass: [bodies].
         gains: [actuators].
-        camera_position, camera_turn: [N, 3].
-        field_of_view: [N].
-        light_turn: [3].
-        colour: [G, 3].
+        camera_position, camera_turn: `[N, 3]`.
+        field_of_view: `[N]`.
+        light_turn: `[3]`.
+        colour: `[G, 3]`.
     """
 
     size: jax.Array
@@ -100,7 +100,7 @@ def in_subtrees(model: mujoco.MjModel, names: Iterable[str]) -> np.ndarray:
 
 
 def geom_sizes(drawn: Draw, model: mujoco.MjModel, objects: np.ndarray) -> jax.Array:
-    """Compute the sizes [G, 3] of all geoms of one world; `objects` masks the objects' bodies."""
+    """Compute the sizes `[G, 3]` of all geoms of one world; `objects` masks the objects' bodies."""
     return model.geom_size * jnp.where(objects[model.geom_bodyid], drawn.size, 1.0)[:, None]
 
 

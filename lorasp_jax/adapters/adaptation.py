@@ -55,24 +55,24 @@ def adapt(
     Adapters apply to every `Dense`, `nnx.Linear` (which becomes a `Dense`), `nnx.LinearGeneral` and
     `nnx.Einsum` whose path matches, for instance "language/gate_proj". LoRA also applies to
     `nnx.Embed` and `nnx.Conv`. Subclasses that override `__call__` are skipped. A stacked kernel
-    [L, I, O] gets stacked adapters. An adapted layer's own weights are frozen.
+    `[L, I, O]` gets stacked adapters. An adapted layer's own weights are frozen.
 
     `FullFineTuning` converts every floating-point parameter under a matching path to an fp32
     `AdapterParam`, including norms, embeddings and biases.
 
     Args:
-      model: not modified; the result shares its frozen arrays.
-      rules: (pattern, method or None) pairs, first match wins.
-      rngs: supplies one key, from which each layer derives its own by its path.
-      einsums: extra layer classes that compute one einsum of their input and a parameter, mapped to
-        a function layer -> (parameter name, equation), as in
-        {gemma.Einsum: lambda layer: ("w", layer.einsum_str)}.
-      statistics: second moments [..., I, I] of layer inputs by path, from
-        `calibration.input_moments`; for data-driven initialization.
+        model: not modified; the result shares its frozen arrays.
+        rules: (pattern, method or None) pairs, first match wins.
+        rngs: supplies one key, from which each layer derives its own by its path.
+        einsums: extra layer classes that compute one einsum of their input and a parameter, mapped
+            to a function layer -> (parameter name, equation), as in {gemma.Einsum: lambda layer:
+            ("w", layer.einsum_str)}.
+        statistics: second moments `[..., I, I]` of layer inputs by path, from
+            `calibration.input_moments`; for data-driven initialization.
 
     Raises:
-      ValueError: a pattern is not a valid regular expression, a rule applies to nothing (the
-        message lists near misses), or a layer is unsupported or already has an adapter.
+        ValueError: a pattern is not a valid regular expression, a rule applies to nothing (the
+            message lists near misses), or a layer is unsupported or already has an adapter.
     """
     paths.check_method_rules(rules)
     nnx_layers.check_einsums(einsums)
@@ -108,8 +108,8 @@ def with_dropout(model: Model, key: jax.Array) -> Model:
     stack use independent masks. A layer called twice with the same input shape reuses its mask.
 
     Args:
-      model: not modified; adapters without dropout are unaffected.
-      key: typed PRNG key.
+        model: not modified; adapters without dropout are unaffected.
+        key: typed PRNG key.
     """
     root, key = _wrapped_copy(model), _validate.key(key)
     for location in paths.unique(paths.locate(root, AdaptedLayer)):
@@ -148,7 +148,7 @@ def merge(model: Model) -> Model:
     code that reads it. A quantized kernel with an adapter is dequantized.
 
     Raises:
-      ValueError: a method's delta depends on the input, or the model has shapes without values.
+        ValueError: a method's delta depends on the input, or the model has shapes without values.
     """
     root = _wrapped_copy(validate.with_values(model))
     paths.replace(paths.locate(root, AdaptedLayer), _merged)
@@ -184,11 +184,11 @@ def attach(
     """Attach a newly initialized adapter to a layer, and freeze the layer's own weights.
 
     The layer is modified in place; leading axes of its kernel index the layers of a scanned stack.
-    `statistics` are the second moments [..., I, I] of its inputs, if the method requires them.
+    `statistics` are the second moments `[..., I, I]` of its inputs, if the method requires them.
 
     Raises:
-      ValueError: the layer does not support the method or already has an adapter, or the method
-        would split a quantized kernel.
+        ValueError: the layer does not support the method or already has an adapter, or the method
+            would split a quantized kernel.
     """
     if layer.adapter is not None and layer.method is not None:
         raise ValueError(f"it already has a {layer.method.name} adapter: merge the model first")
@@ -286,7 +286,7 @@ def init_stack(
     kernel: jax.Array,
     statistics: jax.Array | None = None,
 ) -> tuple[Params, Any]:
-    """Apply a method's `init` to a kernel [..., I, O], with an independent key per matrix.
+    """Apply a method's `init` to a kernel `[..., I, O]`, with an independent key per matrix.
 
     Not jitted as a whole, so that random draws compile once per I, not once per kernel shape.
     """
@@ -303,7 +303,7 @@ def init_stack(
 
 
 def over_stack(function: Callable[..., Any], kernel: jax.Array) -> Callable[..., Any]:
-    """Map a function of one layer's arrays over the leading axes of a kernel [..., I, O]."""
+    """Map a function of one layer's arrays over the leading axes of a kernel `[..., I, O]`."""
     for _ in kernel.shape[:-2]:
         function = jax.vmap(function)
     return function

@@ -58,10 +58,10 @@ class LinenAdapter:
     `collect_aux`, the `variable_axes` of the model's own scan must include "intermediates".
 
     Attributes:
-      model: any Linen module; for a Hugging Face Flax model, its `.module`.
-      rules: (pattern, method or None) pairs, first match wins.
-      einsums: extra layer classes, as for `adapt`. The equation is None if it is an argument of the
-        layer's call, as in {gemma.Einsum: lambda layer: ("w", None)}.
+        model: any Linen module; for a Hugging Face Flax model, its `.module`.
+        rules: (pattern, method or None) pairs, first match wins.
+        einsums: extra layer classes, as for `adapt`. The equation is None if it is an argument of
+            the layer's call, as in {gemma.Einsum: lambda layer: ("w", None)}.
     """
 
     model: nn.Module
@@ -76,12 +76,12 @@ class LinenAdapter:
         """Initialize the variables with the model's own `init`, and add the collection "adapters".
 
         Args:
-          key: typed PRNG key, or a dictionary of keys with one for "params".
-          *args: the model's call arguments.
-          **kwargs: the model's call arguments.
+            key: typed PRNG key, or a dictionary of keys with one for "params".
+            *args: the model's call arguments.
+            **kwargs: the model's call arguments.
 
         Raises:
-          ValueError: as for `attach`.
+            ValueError: as for `attach`.
         """
         return self.attach(key, self.model.init(_rngs(key), *args, **kwargs), *args, **kwargs)
 
@@ -91,14 +91,14 @@ class LinenAdapter:
         """Add the collection "adapters" to existing variables, for instance pretrained ones.
 
         Args:
-          key: as for `init`.
-          variables: variables of the bare model, with "params"; not modified.
-          *args: the model's call arguments.
-          **kwargs: the model's call arguments.
+            key: as for `init`.
+            variables: variables of the bare model, with "params"; not modified.
+            *args: the model's call arguments.
+            **kwargs: the model's call arguments.
 
         Raises:
-          ValueError: a rule applies to nothing (the message lists near misses), a layer is
-            unsupported, or the variables already have adapters.
+            ValueError: a rule applies to nothing (the message lists near misses), a layer is
+                unsupported, or the variables already have adapters.
         """
         if any(ADAPTER in path for path in flatten_dict(validate.variables(variables))):
             raise ValueError("the variables already have adapters: pass those of the bare model")
@@ -119,15 +119,15 @@ class LinenAdapter:
         """Like the model's own `apply`, with the adapters.
 
         Args:
-          variables: from `init` or `attach`, possibly trained.
-          *args: as for the model's `apply`.
-          mutable: as for the model's `apply`, but must not include "params"; include
-            "intermediates" for `collect_aux`.
-          **kwargs: as for the model's `apply`; the adapters' dropout is on if rngs has "dropout".
+            variables: from `init` or `attach`, possibly trained.
+            *args: as for the model's `apply`.
+            mutable: as for the model's `apply`, but must not include "params"; include
+                "intermediates" for `collect_aux`.
+            **kwargs: as for the model's `apply`; the adapters' dropout is on if rngs has "dropout".
 
         Raises:
-          ValueError: the adapters in the variables do not match the rules, "params" is mutable, or
-            a scan or vmap does not split the rngs for dropout.
+            ValueError: the adapters in the variables do not match the rules, "params" is mutable,
+                or a scan or vmap does not split the rngs for dropout.
         """
         if _compat.is_mutable(mutable, "params"):
             raise ValueError("'params' cannot be mutable: it contains the adapters during the call")
@@ -144,12 +144,12 @@ class LinenAdapter:
         logits.
 
         Args:
-          variables: as for `apply`.
-          *args: the model's call arguments; the model is called once to find its layers.
-          **kwargs: the model's call arguments.
+            variables: as for `apply`.
+            *args: the model's call arguments; the model is called once to find its layers.
+            **kwargs: the model's call arguments.
 
         Raises:
-          ValueError: a method's delta depends on the input.
+            ValueError: a method's delta depends on the input.
         """
         params = self._visit_layers(
             self._merge, _with_adapters_in_params(variables), *args, **kwargs
@@ -178,7 +178,7 @@ class LinenAdapter:
     def kernel_shapes(
         self, variables: Mapping[str, Any], *args: Any, **kwargs: Any
     ) -> dict[str, tuple[int, ...]]:
-        """Kernel shapes [..., *batch, I, O] of dense layers and einsums, by path.
+        """Kernel shapes `[..., *batch, I, O]` of dense layers and einsums, by path.
 
         The arguments are those of the bare model, which is called once to find its layers.
         """
@@ -295,10 +295,10 @@ class _Record:
     """Results of `LinenAdapter._attach` over a model's modules.
 
     Attributes:
-      used: indices of the rules used.
-      layers: paths of supported layers.
-      others: class names of other modules with matrices, by path.
-      kernels: paths of kernels that have an adapter.
+        used: indices of the rules used.
+        layers: paths of supported layers.
+        others: class names of other modules with matrices, by path.
+        kernels: paths of kernels that have an adapter.
     """
 
     used: set[int] = dataclasses.field(default_factory=set)

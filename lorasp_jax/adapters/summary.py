@@ -25,11 +25,11 @@ def summary(model: nnx.Module, aux: Mapping[str, Aux] | None = None) -> str:
     modules that are entirely frozen and any unsupported classes.
 
     Args:
-      model: adapted or not.
-      aux: from `collect_aux`.
+        model: adapted or not.
+        aux: from `collect_aux`.
 
     Raises:
-      ValueError: aux has a path that is not a layer of the model.
+        ValueError: aux has a path that is not a layer of the model.
     """
     rows = _rows(validate.module(model))
     if aux is not None:
@@ -109,14 +109,14 @@ def collect_aux(model: nnx.Module | Mapping[str, Any]) -> dict[str, Aux]:
     """Collect the aux that adapted layers stored in the model's last call.
 
     Args:
-      model: an NNX model that was just called (its stored aux is removed), or the variables that a
-        Linen model returned from `apply(..., mutable=["intermediates"])`.
+        model: an NNX model that was just called (its stored aux is removed), or the variables that
+            a Linen model returned from `apply(..., mutable=["intermediates"])`.
 
     Returns:
-      Aux of each layer, by "/"-joined path.
+        Aux of each layer, by "/"-joined path.
 
     Raises:
-      ValueError: no adapted layer stored any aux.
+        ValueError: no adapted layer stored any aux.
     """
     if isinstance(model, nnx.Module):
         stored = nnx.to_flat_state(nnx.pop(model, AdapterAux))

@@ -21,10 +21,10 @@ class FusedAdapters(NamedTuple):
     """A model with one LoRA per layer, and the approximation errors.
 
     Attributes:
-      model: adapted with plain LoRA of scale 1.
-      errors: relative error ‖ΔW − ΔW'‖ / ‖ΔW‖ by path, where ΔW is the weighted sum and ΔW' the
-        delta of the fused LoRA. The Frobenius norm is taken over all layers of a stack. For
-        isotropic inputs, this is also the relative RMS error of x ΔW'.
+        model: adapted with plain LoRA of scale 1.
+        errors: relative error ‖ΔW − ΔW'‖ / ‖ΔW‖ by path, where ΔW is the weighted sum and ΔW' the
+            delta of the fused LoRA. The Frobenius norm is taken over all layers of a stack. For
+            isotropic inputs, this is also the relative RMS error of x ΔW'.
     """
 
     model: nnx.Module
@@ -37,13 +37,14 @@ def fuse(
     """Fuse LoRAs of a combined model into one LoRA that computes their weighted sum.
 
     Args:
-      model: from `combine`; not modified.
-      weights: weight of each LoRA by name; may be negative.
-      rank: maximum rank of the fused LoRA in each layer. If the LoRAs' ranks add up to more, the
-        result is the best approximation of that rank. None keeps the sum, so the result is exact.
+        model: from `combine`; not modified.
+        weights: weight of each LoRA by name; may be negative.
+        rank: maximum rank of the fused LoRA in each layer. If the LoRAs' ranks add up to more, the
+            result is the best approximation of that rank. None keeps the sum, so the result is
+            exact.
 
     Raises:
-      ValueError: as for `choose`, or rank is below 1, or a named adapter is not plain LoRA.
+        ValueError: as for `choose`, or rank is below 1, or a named adapter is not plain LoRA.
     """
     named.weights(model, weights)  # raises for an unknown name
     fused, errors = {}, {}
@@ -69,13 +70,14 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
     Fully fine-tuned weights, such as biases, are taken from the adapted model and are trainable.
 
     Args:
-      merged: from `merge`; not modified.
-      adapted: model with the adapters; its base is not used. For saved adapters that do not split
-        kernels, pass `load_adapters(folder, merged, any_base=True)`.
+        merged: from `merge`; not modified.
+        adapted: model with the adapters; its base is not used. For saved adapters that do not split
+            kernels, pass `load_adapters(folder, merged, any_base=True)`.
 
     Raises:
-      ValueError: the merged model has adapters, lacks a layer or has one of a different class, the
-        adapted model is from `combine`, or a method cannot be merged or is not additive (DoRA).
+        ValueError: the merged model has adapters, lacks a layer or has one of a different class,
+            the adapted model is from `combine`, or a method cannot be merged or is not additive
+            (DoRA).
     """
     validate.with_values(merged)
     if named.adapter_sets(validate.with_values(adapted)):

@@ -49,13 +49,14 @@ def combine(models: Mapping[str, Model], *, rank: int | None = None) -> Model:
     are adapted. The result has no trainable parameters.
 
     Args:
-      models: models by name, adapted from the same base; not modified. The result shares the base.
-        A model without adapters reserves an empty slot for `swap`.
-      rank: LoRA rank to reserve in each layer. None reserves the largest that any model has there.
+        models: models by name, adapted from the same base; not modified. The result shares the
+            base. A model without adapters reserves an empty slot for `swap`.
+        rank: LoRA rank to reserve in each layer. None reserves the largest that any model has
+            there.
 
     Raises:
-      ValueError: there are no models, their bases differ, base weights are trainable, an adapter
-        splits its kernel, or the rank of a LoRA exceeds `rank`.
+        ValueError: there are no models, their bases differ, base weights are trainable, an adapter
+            splits its kernel, or the rank of a LoRA exceeds `rank`.
     """
     if not models:
         raise ValueError("models must have at least one model")
@@ -83,13 +84,13 @@ def choose(model: Model, choice: Selection | Sequence[Selection] | jax.Array | n
     [B * cameras, ...], each example's rows must be contiguous.
 
     Args:
-      model: from `combine`; not modified, the result shares its arrays.
-      choice: a name, weights by name, or None for the base; a sequence of these, one per example of
-        the batch; or an array from `weights`, f32 [A] or [B, A].
+        model: from `combine`; not modified, the result shares its arrays.
+        choice: a name, weights by name, or None for the base; a sequence of these, one per example
+            of the batch; or an array from `weights`, f32 `[A]` or `[B, A]`.
 
     Raises:
-      ValueError: the model has no named adapters, a name is unknown (the message lists near
-        misses), or an array has the wrong shape.
+        ValueError: the model has no named adapters, a name is unknown (the message lists near
+            misses), or an array has the wrong shape.
     """
     chosen = weights(model, choice)
     model = nnx.clone(model)
@@ -103,7 +104,7 @@ def choose(model: Model, choice: Selection | Sequence[Selection] | jax.Array | n
 def weights(
     model: nnx.Module, choice: Selection | Sequence[Selection] | jax.Array | np.ndarray
 ) -> jax.Array:
-    """Convert a choice to an f32 array [A] or [B, A], for jitted functions that call `choose`.
+    """Convert a choice to an f32 array `[A]` or `[B, A]`, for jitted functions that call `choose`.
 
     See `choose` for the arguments and errors.
     """
@@ -124,7 +125,7 @@ def names(model: nnx.Module) -> tuple[str, ...]:
     """Names of a combined model's adapters, in the order of their weights.
 
     Raises:
-      ValueError: the model has no named adapters.
+        ValueError: the model has no named adapters.
     """
     for location in adapter_sets(model):
         return location.child.method.names
@@ -137,12 +138,12 @@ def extract(model: Model, name: str | None) -> Model:
     The result can be trained, saved and merged. A LoRA's alpha becomes scale · rank.
 
     Args:
-      model: from `combine`; not modified.
-      name: the adapter; None returns the base without adapters.
+        model: from `combine`; not modified.
+        name: the adapter; None returns the base without adapters.
 
     Raises:
-      ValueError: the model has no named adapters, or the name is unknown (the message lists near
-        misses).
+        ValueError: the model has no named adapters, or the name is unknown (the message lists near
+            misses).
     """
     adapter_names, result = names(model), strip_adapters(model)
     if name is None:
@@ -163,9 +164,9 @@ def with_adapters(
     """Attach adapters to the base's layers, in place.
 
     Args:
-      base: from `strip_adapters`.
-      adapters: by path, a template layer that supports the adapter, the method (None for no
-        adapter) and the parameters.
+        base: from `strip_adapters`.
+        adapters: by path, a template layer that supports the adapter, the method (None for no
+            adapter) and the parameters.
     """
 
     def make_adapted(location: Location) -> AdaptedLayer | None:
@@ -188,12 +189,12 @@ def swap(model: Model, name: str, other: nnx.Module) -> Model:
     only be replaced by ones with the same method and settings. The current choice is kept.
 
     Args:
-      model: from `combine`; not modified.
-      name: the adapter to replace; the new one takes this name.
-      other: model adapted from the same base.
+        model: from `combine`; not modified.
+        name: the adapter to replace; the new one takes this name.
+        other: model adapted from the same base.
 
     Raises:
-      ValueError: as for `combine`, or the adapter does not fit the slot.
+        ValueError: as for `combine`, or the adapter does not fit the slot.
     """
     validate.with_values(other)
     index, adapters = index_of(names(model), name), adapters_by_path(name, other)
@@ -221,7 +222,7 @@ def strip_adapters(model: Model) -> Model:
     """Copy the model without its adapters, sharing the base; trainable base weights stay trainable.
 
     Raises:
-      ValueError: an adapter split its kernel.
+        ValueError: an adapter split its kernel.
     """
     root = nnx.List([nnx.merge(*adaptation.split(model))])
 
@@ -240,7 +241,7 @@ def adapters_by_path(name: str, model: nnx.Module) -> AdaptedLayers:
     """Adapted layers of the model called `name`, by path.
 
     Raises:
-      ValueError: base weights are trainable, or the model is already combined.
+        ValueError: base weights are trainable, or the model is already combined.
     """
     if adapter_sets(model):
         raise ValueError(f"{name} is already a combined model: extract one adapter first")

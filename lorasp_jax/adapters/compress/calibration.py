@@ -42,14 +42,14 @@ class Layer:
     """The argument of a report function: one layer call with one kernel matrix.
 
     Attributes:
-      method: the layer's method, or None.
-      params: the adapter's parameters, or {}.
-      x: [...tokens, I].
-      kernel: [I, O].
-      y: [...tokens, O], without bias.
-      reference_y: [...tokens, O], output with the reference adapter, or None.
-      aux: the method's aux.
-      valid: bool [...tokens].
+        method: the layer's method, or None.
+        params: the adapter's parameters, or {}.
+        x: `[...tokens, I]`.
+        kernel: `[I, O]`.
+        y: `[...tokens, O]`, without bias.
+        reference_y: `[...tokens, O]`, output with the reference adapter, or None.
+        aux: the method's aux.
+        valid: bool `[...tokens]`.
     """
 
     method: Method | None
@@ -62,7 +62,7 @@ class Layer:
     valid: jax.Array
 
     def rows(self, array: jax.Array) -> jax.Array:
-        """Reshape [...tokens, n] to f32 [T, n], with invalid tokens zeroed."""
+        """Reshape `[...tokens, n]` to f32 `[T, n]`, with invalid tokens zeroed."""
         array = jnp.where(self.valid[..., None], array, 0).astype(jnp.float32)
         return array.reshape(-1, array.shape[-1])
 
@@ -119,19 +119,19 @@ def observe(
     """Sum the reports of the given layers over batches.
 
     Args:
-      model: not modified.
-      batches: inputs of `forward`; use one shape to avoid recompilation.
-      reports: report functions by layer path; see `paths.locate_matmul_layers`.
-      forward: how to call the model.
-      references: reference adapters by layer path, for `Layer.reference_y`.
+        model: not modified.
+        batches: inputs of `forward`; use one shape to avoid recompilation.
+        reports: report functions by layer path; see `paths.locate_matmul_layers`.
+        forward: how to call the model.
+        references: reference adapters by layer path, for `Layer.reference_y`.
 
     Returns:
-      Sums by path, including "tokens", the number of valid tokens. All sums have the leading axes
-      of the layer's kernel matrices: those of a scanned stack and the batch axes of an einsum.
+        Sums by path, including "tokens", the number of valid tokens. All sums have the leading axes
+        of the layer's kernel matrices: those of a scanned stack and the batch axes of an einsum.
 
     Raises:
-      ValueError: there are no batches or no valid tokens, values are not finite, a layer was not
-        called, its aux was not returned by `forward`, or it has a custom matmul or precision.
+        ValueError: there are no batches or no valid tokens, values are not finite, a layer was not
+            called, its aux was not returned by `forward`, or it has a custom matmul or precision.
     """
     step = _make_step(_make_observed(model, reports, references), forward)
     total: dict[str, Sums] = {}
@@ -215,13 +215,13 @@ def _add(total: dict[str, Sums], more: Any) -> None:
 def input_moments(
     model: nnx.Module, batches: Iterable[Any], pattern: str = ".*", forward: Forward = call
 ) -> dict[str, jax.Array]:
-    """Uncentered second moments Σ x xᵀ of layer inputs, f32 [..., I, I] by path.
+    """Uncentered second moments Σ x xᵀ of layer inputs, f32 `[..., I, I]` by path.
 
     LoRA's initialization "eva" requires them in `adapt(..., statistics=...)`. Covers dense layers
     and einsums whose path matches the pattern; third-party einsum layers must already be adapted.
 
     Raises:
-      ValueError: as for `observe`, or the pattern matches no dense layer or einsum.
+        ValueError: as for `observe`, or the pattern matches no dense layer or einsum.
     """
     paths.check_rules([(pattern, None)], lambda _: True, "None")
     layer_paths = [

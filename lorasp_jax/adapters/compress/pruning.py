@@ -42,18 +42,18 @@ def prune(
     of a stack keep as many directions as the one that needs most.
 
     Args:
-      model: not modified; the result shares its frozen arrays and can be trained further.
-      batches: calibration set.
-      tolerance: in [0, 1). With 0, outputs on the calibration set do not change.
-      rank: number of directions to keep in each layer, the most used ones, instead of a tolerance;
-        at least 1. A smaller bank keeps all of its directions.
-      for_kernel: keep more directions, 16, 32, 64, ... in all, as the fused kernel on NVIDIA GPUs
-        needs; without it, a smaller bank can be slower.
-      forward: how to call the model on a batch; see `lorasp_jax.adapters.compress.calibration`.
+        model: not modified; the result shares its frozen arrays and can be trained further.
+        batches: calibration set.
+        tolerance: in [0, 1). With 0, outputs on the calibration set do not change.
+        rank: number of directions to keep in each layer, the most used ones, instead of a
+            tolerance; at least 1. A smaller bank keeps all of its directions.
+        for_kernel: keep more directions, 16, 32, 64, ... in all, as the fused kernel on NVIDIA GPUs
+            needs; without it, a smaller bank can be slower.
+        forward: how to call the model on a batch; see `lorasp_jax.adapters.compress.calibration`.
 
     Raises:
-      ValueError: tolerance is outside [0, 1), rank is not a positive integer or given together
-        with a tolerance, or the model has no LoRA-SP layers.
+        ValueError: tolerance is outside [0, 1), rank is not a positive integer or given together
+            with a tolerance, or the model has no LoRA-SP layers.
     """
     if not 0 <= tolerance < 1 or (rank is not None and (rank < 1 or tolerance)):
         raise ValueError(f"set a tolerance in [0, 1) or a rank > 0, got {tolerance} and {rank}")

@@ -37,10 +37,11 @@ class QuantizationResult(NamedTuple):
     """A model with quantized kernels, and the quantization errors.
 
     Attributes:
-      model: with quantized kernels.
-      errors: relative error ‖W − Ŵ‖ / ‖W‖ of the quantized kernel Ŵ by path, in the Frobenius norm
-        over all layers of a stack. For isotropic inputs, this is also the relative RMS error of the
-        layer's output, without bias. NaN while JAX traces, as inside `nnx.eval_shape`.
+        model: with quantized kernels.
+        errors: relative error ‖W − Ŵ‖ / ‖W‖ of the quantized kernel Ŵ by path, in the Frobenius
+            norm over all layers of a stack. For isotropic inputs, this is also the relative RMS
+            error of the layer's output, without bias. NaN while JAX traces, as inside
+            `nnx.eval_shape`.
     """
 
     model: nnx.Module
@@ -51,14 +52,14 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
     """Quantize the kernels of dense layers and einsums by path rules.
 
     Args:
-      model: not modified; the result shares all other arrays.
-      rules: (pattern, kind) pairs, where kind is "float8", "int8", "nf4" or None. As for `adapt`,
-        the first match wins, and None skips the path. Rules apply to `Dense`, `nnx.Linear`,
-        `nnx.LinearGeneral`, `nnx.Einsum` and adapted layers of other einsum classes.
+        model: not modified; the result shares all other arrays.
+        rules: (pattern, kind) pairs, where kind is "float8", "int8", "nf4" or None. As for `adapt`,
+            the first match wins, and None skips the path. Rules apply to `Dense`, `nnx.Linear`,
+            `nnx.LinearGeneral`, `nnx.Einsum` and adapted layers of other einsum classes.
 
     Raises:
-      ValueError: a rule applies to no layer (the message lists near misses), a kind is unknown, or
-        a kernel is trainable, already quantized or not finite.
+        ValueError: a rule applies to no layer (the message lists near misses), a kind is unknown,
+            or a kernel is trainable, already quantized or not finite.
     """
     kinds = " or ".join(map(repr, (*KINDS, None)))
     paths.check_rules(rules, lambda kind: kind in (*KINDS, None), kinds)

@@ -1,7 +1,7 @@
 """Load and save Hugging Face PEFT adapter folders: LoRA, rsLoRA, DoRA and pruned AdaLoRA.
 
 A folder has adapter_config.json and adapter_model.safetensors, with tensors named
-base_model.model.<module>.lora_A.weight etc., in torch's layout [out, in] (format of PEFT 0.21.2).
+base_model.model.<module>.lora_A.weight etc., in torch's layout `[out, in]` (format of PEFT 0.21.2).
 """
 
 import collections
@@ -39,7 +39,7 @@ def dotted(path: str, index: tuple[int, ...]) -> str:
     """Default module name, for models whose attribute names match torch's.
 
     Raises:
-      ValueError: the layer is in a stack, so its name cannot be guessed.
+        ValueError: the layer is in a stack, so its name cannot be guessed.
     """
     if index:
         raise ValueError(f"{path} is a stack: pass names=, a function (path, index) -> name")
@@ -75,16 +75,16 @@ def load_peft(
     methods' `dropout`, which is active only under `with_dropout`.
 
     Args:
-      folder: local folder with adapter_config.json and adapter_model.safetensors, or a Hub
-        repository hf://owner/name, from which only these two files are downloaded.
-      model: not modified; its adapters on other layers are kept.
-      names: function (path, index) -> module name; index is the position in a scanned stack, or ().
-        By default, "a/0/b" becomes "a.0.b".
-      einsums: as for `adapt`.
+        folder: local folder with adapter_config.json and adapter_model.safetensors, or a Hub
+            repository hf://owner/name, from which only these two files are downloaded.
+        model: not modified; its adapters on other layers are kept.
+        names: function (path, index) -> module name; index is the position in a scanned stack, or
+            (). By default, "a/0/b" becomes "a.0.b".
+        einsums: as for `adapt`.
 
     Raises:
-      ValueError: files are missing or damaged, the adapter type is not supported, the model lacks a
-        module, or an adapter does not fit its layer.
+        ValueError: files are missing or damaged, the adapter type is not supported, the model lacks
+            a module, or an adapter does not fit its layer.
     """
     nnx_layers.check_einsums(einsums)
     root = nnx.List([validate.module(model)])
@@ -114,16 +114,17 @@ def match_folder(
     """Match a PEFT folder against a model's layers and parameters.
 
     Args:
-      folder: as for `load_peft`.
-      shapes: shape [..., I, O] of the kernel matrices of each layer, by path.
-      sizes: shape of each parameter, by path.
-      names: as for `load_peft`.
+        folder: as for `load_peft`.
+        shapes: shape `[..., I, O]` of the kernel matrices of each layer, by path.
+        sizes: shape of each parameter, by path.
+        names: as for `load_peft`.
 
     Returns:
-      Rules for `adapt`, the adapters' parameters by path, and the fully trained parameters by path.
+        Rules for `adapt`, the adapters' parameters by path, and the fully trained parameters by
+        path.
 
     Raises:
-      ValueError: as for `load_peft`.
+        ValueError: as for `load_peft`.
     """
     folder, names = _local_folder(folder), checked_names(names)
     config, modules, full = read_folder(folder)
@@ -172,15 +173,15 @@ def save_peft(
     AdaLoRA is saved as the equivalent LoRA, without pruned directions.
 
     Args:
-      folder: created if absent; an adapter in it is replaced.
-      model: adapted with LoRA, AdaLoRA or both, or with DoRA only. Fully fine-tuned parameters
-        become PEFT's `bias` and `modules_to_save`.
-      names: as for `load_peft`.
-      base: value of base_model_name_or_path.
+        folder: created if absent; an adapter in it is replaced.
+        model: adapted with LoRA, AdaLoRA or both, or with DoRA only. Fully fine-tuned parameters
+            become PEFT's `bias` and `modules_to_save`.
+        names: as for `load_peft`.
+        base: value of base_model_name_or_path.
 
     Raises:
-      ValueError: there are no adapters, PEFT does not support one of them, LoRA and DoRA are mixed,
-        or the dropout rates differ.
+        ValueError: there are no adapters, PEFT does not support one of them, LoRA and DoRA are
+            mixed, or the dropout rates differ.
     """
     folder, names = validate.folder(folder), checked_names(names)
     validate.with_values(model)
@@ -227,7 +228,7 @@ def _common_settings(methods: Collection[Any]) -> tuple[bool, float]:
 
 
 def _check_fits(folder: pathlib.Path, module: str, adapter: Adapter, d_in: int, d_out: int) -> None:
-    """Raise ValueError unless the adapter's shapes match a kernel [I, O]."""
+    """Raise ValueError unless the adapter's shapes match a kernel `[I, O]`."""
     a, b = adapter["lora_a"].shape, adapter["lora_b"].shape
     rank = a[-1]
     magnitude = adapter.get("magnitude", np.empty(d_out)).shape

@@ -22,12 +22,12 @@ def values_of(patterns: Mapping[str, Any], names: Collection[str], default: Any)
     As in Hugging Face PEFT (get_pattern_key of 0.21.2): re.match(rf"(.*\\.)?({pattern})$", name).
 
     Args:
-      patterns: values by pattern.
-      names: module names, as in "a.0.b".
-      default: value of a name without a match.
+        patterns: values by pattern.
+        names: module names, as in "a.0.b".
+        default: value of a name without a match.
 
     Raises:
-      ValueError: a pattern is invalid or not supported, or matching could take too long.
+        ValueError: a pattern is invalid or not supported, or matching could take too long.
     """
     anchored = {rf"(.*\.)?({pattern})$": value for pattern, value in patterns.items()}
     longest, ways = max(map(len, names), default=0), 0
@@ -50,7 +50,7 @@ def _ways(tree: Iterable[tuple[Any, Any]], length: int) -> int:
     """Upper bound on the number of ways to match `length` characters, capped at `MAX_WAYS` + 1.
 
     Raises:
-      ValueError: the pattern has a construct that PEFT's patterns do not need.
+        ValueError: the pattern has a construct that PEFT's patterns do not need.
     """
     ways = 1
     for kind, argument in tree:

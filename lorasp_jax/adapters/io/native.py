@@ -59,15 +59,15 @@ def save_adapters(
     Each file is written atomically.
 
     Args:
-      folder: created if absent; an adapter in it is replaced.
-      model: an adapted model.
-      base: optional name of the base, in addition to the fingerprints of its weights.
-      metadata: any JSON-serializable dict with str keys.
+        folder: created if absent; an adapter in it is replaced.
+        model: an adapted model.
+        base: optional name of the base, in addition to the fingerprints of its weights.
+        metadata: any JSON-serializable dict with str keys.
 
     Raises:
-      ValueError: the model has no trainable parameters, or metadata has a number that is not
-        finite.
-      TypeError: metadata is not JSON-serializable.
+        ValueError: the model has no trainable parameters, or metadata has a number that is not
+            finite.
+        TypeError: metadata is not JSON-serializable.
     """
     folder, adapters = validate.folder(folder), nnx.state(validate.with_values(model), AdapterParam)
     tensors = {name: np.asarray(leaf) for name, leaf in _leaves_by_name(adapters).items()}
@@ -104,17 +104,17 @@ def load_adapters(
     at the same paths.
 
     Args:
-      folder: written by `save_adapters`.
-      model: not modified.
-      base: if given, must equal the name that was saved.
-      any_base: whether to skip the base check. By default, every base array must match the one used
-        in training, up to bf16 rounding. An array is not compared if only one of the two is
-        quantized, or if an adapter split it.
-      einsums: as passed to `adapt`.
+        folder: written by `save_adapters`.
+        model: not modified.
+        base: if given, must equal the name that was saved.
+        any_base: whether to skip the base check. By default, every base array must match the one
+            used in training, up to bf16 rounding. An array is not compared if only one of the two
+            is quantized, or if an adapter split it.
+        einsums: as passed to `adapt`.
 
     Raises:
-      ValueError: files are missing, damaged or do not belong together, the base differs, or the
-        adapters do not fit the model.
+        ValueError: files are missing, damaged or do not belong together, the base differs, or the
+            adapters do not fit the model.
     """
     folder = validate.folder(folder)
     description, tensors = _read(folder)
@@ -219,7 +219,7 @@ def read_tensors(path: pathlib.Path) -> tuple[bytes, dict[str, np.ndarray]]:
     """Read a safetensors file; return its content and its tensors by name.
 
     Raises:
-      ValueError: the file is damaged, or a tensor is not floating-point or not finite.
+        ValueError: the file is damaged, or a tensor is not floating-point or not finite.
     """
     with as_value_error(path, safetensors.SafetensorError):
         check_memory(check_regular(path).stat().st_size, path)
@@ -245,7 +245,7 @@ def read_description(folder: pathlib.Path) -> dict[str, Any]:
     """Read the adapter.json in a folder.
 
     Raises:
-      ValueError: the file is missing, damaged, or of an unsupported format or version.
+        ValueError: the file is missing, damaged, or of an unsupported format or version.
     """
     path = folder / DESCRIPTION
     with as_value_error(path):

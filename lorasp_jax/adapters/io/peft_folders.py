@@ -47,7 +47,7 @@ def read_folder(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter
     """Read the config, the adapters by module in this project's layout, and the `FullTensors`.
 
     Raises:
-      ValueError: files are missing or damaged, or the adapter is not supported.
+        ValueError: files are missing or damaged, or the adapter is not supported.
     """
     with as_value_error(folder / CONFIG):
         config = read_json(folder / CONFIG)
