@@ -40,8 +40,8 @@ def number(name: str, value: Any) -> float:
 
 def action(value: Any, shape: tuple[int, ...]) -> Any:
     """Return an array of actions; raise a ValueError unless it has this shape."""
-    if jnp.shape(value) != shape:
-        raise ValueError(f"action must have shape {shape}, got {jnp.shape(value)}")
+    if np.shape(value) != shape:
+        raise ValueError(f"action must have shape {shape}, got {np.shape(value)}")
     return value
 
 

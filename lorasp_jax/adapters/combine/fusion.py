@@ -46,6 +46,8 @@ def fuse(
     Raises:
         ValueError: as for `choose`, or rank is below 1, or a named adapter is not plain LoRA.
     """
+    if rank is not None:
+        validate.size("rank", rank)
     named.weights(model, weights)  # raises for an unknown name
     fused, errors = {}, {}
     for path, _, _, layer in named.adapter_sets(model):

@@ -61,7 +61,7 @@ def extended(tensors):
     ("change", "message"),
     [
         (renamed, "'lin.7', .* lin"),
-        (halved, "lin.2 .* lora_B"),
+        (halved, "lin.2 .*lora_B"),
         (narrowed, "lin.0 .* 24x40"),
         (extended, "head.weight"),
         (lambda tensors: {}, "no adapters"),
