@@ -1,7 +1,6 @@
 """Make environments from the names of a task and a robot."""
 
 import importlib
-import numbers
 import os
 from collections.abc import Iterator, Sequence
 from typing import Any, Literal, get_args
@@ -12,7 +11,7 @@ import envs.scene.distractors
 from envs import checks, mjcf
 from envs.actions import MODES, TARGET_DT, Mode
 from envs.env import Env
-from envs.names import check, names
+from envs.names import check
 from envs.physics import physics
 from envs.physics.physics import Backend
 from envs.rendering import renderer as render
@@ -114,13 +113,10 @@ def _check_dt(value: float, time_limit: float) -> float:
     """Check the control period [s], and return it as a float."""
     control_dt = checks.number("control_dt", value)
     if control_dt > time_limit:
-        limit = f"the time limit of the task, {time_limit} s"
-        raise ValueError(f"control_dt must be at most {limit}, got {control_dt}")
+        raise ValueError(f"control_dt must be at most {time_limit} s, got {control_dt}")
     targets = control_dt / TARGET_DT
     if round(targets) < 1 or abs(targets - round(targets)) > 1e-6:
-        raise ValueError(
-            f"control_dt must be a positive multiple of {TARGET_DT} s, got {control_dt}"
-        )
+        raise ValueError(f"control_dt must be a multiple of {TARGET_DT} s, got {control_dt}")
     return control_dt
 
 
@@ -138,18 +134,14 @@ def _check_choices(**values: tuple[Any, Sequence[str]]) -> None:
 
 def _check_learning(actions: Mode, reward: Reward, discount: float) -> None:
     _check_choices(actions=(actions, MODES), reward=(reward, REWARDS))
-    real = isinstance(discount, numbers.Real) and not isinstance(discount, bool)
-    if not real or not 0 < discount <= 1:
-        raise ValueError(f"discount must be a number above 0 and at most 1, got {discount!r}")
+    if not 0 < checks.number("discount", discount) <= 1:
+        raise ValueError(f"discount must be above 0 and at most 1, got {discount!r}")
 
 
 def _find_robot(robot: AnyRobot) -> Robot:
     if isinstance(robot, Robot):
         return robot
-    path = os.fspath(robot) if isinstance(robot, str | os.PathLike) else None
-    if not isinstance(path, str):
-        valid = f"one of {', '.join(names('robot'))}, the path of an MJCF file or a Robot"
-        raise TypeError(f"robot must be {valid}, got {checks.short(robot)}")
+    path = os.fspath(robot)
     return mjcf.load(path) if path.endswith(".xml") else _find("robot", path)
 
 

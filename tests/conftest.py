@@ -7,6 +7,7 @@ os.environ["JAX_PLATFORMS"] = "cpu"
 
 import jax
 
+import envs  # noqa: F401  # sets XLA's flag for fast simulation before JAX starts
 from lorasp_jax.base import compilation_cache as cache
 from tests import xla
 

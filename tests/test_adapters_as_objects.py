@@ -43,14 +43,12 @@ def parameters(model):
 def test_removing_the_adapter_restores_the_base(method, model):
     """Outputs are bitwise equal without the adapter, and close if its weight is zero."""
     if method.trains_base:
-        with pytest.raises(
-            ValueError, match=r"own also trains the base weight (blocks|inp)/(bias|kernel)"
-        ):
+        with pytest.raises(ValueError, match=r"own .* (blocks|inp)/(bias|kernel)"):
             lorasp_jax.combine({"own": model})
         return
     if method.splits_kernel:
         for operation in (strip_adapters, lambda model: lorasp_jax.combine({"own": model})):
-            with pytest.raises(ValueError, match="split the kernel"):
+            with pytest.raises(ValueError, match="split"):
                 operation(model)
         return
     assert np.abs(call(model, X) - call(NET, X)).max() > 1e-3
@@ -95,7 +93,7 @@ def test_saved_adapters_round_trip(tmp_path, method, model):
     again = load_adapters(tmp_path / "out", NET)
     for ours, theirs in zip(parameters(again), parameters(model), strict=True):
         np.testing.assert_array_equal(ours, theirs)
-    with pytest.raises(ValueError, match="for a combined model, extract one first"):
+    with pytest.raises(ValueError, match="combined model"):
         save_adapters(tmp_path / "none", pair)
 
 

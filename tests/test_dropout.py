@@ -207,7 +207,7 @@ def test_linen_scan_without_split_rngs():
     adapter = lorasp_jax.LinenAdapter(Linen(streams=("params",)), [("blocks", WITH_DROPOUT)])
     variables = adapter.init(jax.random.key(0), LINEN_IDS)
     adapter.apply(variables, LINEN_IDS)
-    with pytest.raises(ValueError, match=r"blocks/dense has no rngs .* 'dropout' to split_rngs"):
+    with pytest.raises(ValueError, match=r"blocks/dense .* split_rngs"):
         adapter.apply(variables, LINEN_IDS, rngs={"dropout": KEY})
 
 

@@ -10,12 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from flax import nnx
 from rich.console import Console
 
 from envs import mjcf
 from envs.datasets import rlds
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.io.hugging_face import load_peft
+from lorasp_jax.adapters.io.native import load_adapters, save_adapters
 from lorasp_jax.data import cache, inspection
 from lorasp_jax.data.opening import open_source
+from lorasp_jax.peft import LoRASP
 from lorasp_jax.policies import statistics_files, tokenizer
 from lorasp_jax.report.callback import final_table
 from lorasp_jax.report.html import write_report
@@ -23,7 +28,7 @@ from tests import fuzzing
 from tests.data.lerobots import GOLDEN, golden
 from tests.envs.datasets.test_episodes import make
 from tests.envs.user_arm import write
-from tests.malformed import check_refusal
+from tests.malformed import Net, check_refusal
 from tests.runs import finish
 
 SEEDS, SLOW_SEEDS = 12, 200
@@ -31,7 +36,7 @@ TOKENIZERS = {
     "tokenizer.json": "smolvlm_like_tokenizer.json",
     "tokenizer.model": "paligemma_like.model",
 }
-COST = {"mjcf": 4}  # relative run time of a kind
+COST = {"mjcf": 4, "adapter": 2}  # relative run time of a kind
 
 
 def read(folder: Path) -> None:
@@ -69,6 +74,8 @@ KINDS: dict[str, tuple[Callable[[Path], Any], list[fuzzing.Change]]] = {
     "tokenizer.json": (tokenize, [*FILES, *[fuzzing.change_json] * 2]),
     "tokenizer.model": (tokenize, [fuzzing.replace_file, *[fuzzing.change_bytes] * 4]),
     "run": (show, [*FILES, *[fuzzing.change_json] * 6]),
+    "adapter": (lambda folder: load_adapters(folder, Net()), [*FILES, *[fuzzing.change_json] * 4]),
+    "peft": (lambda folder: load_peft(folder, Net()), [*FILES, *[fuzzing.change_json] * 4]),
     "mjcf": (lambda folder: mjcf.load(folder / "arm.xml"), [*FILES, *[fuzzing.change_mjcf] * 4]),
 }
 
@@ -87,6 +94,9 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     for name, file in TOKENIZERS.items():
         (at / name).mkdir()
         folders[name] = shutil.copy(GOLDEN / "tokenizers" / file, at / name / name).parent
+    model = adaptation.adapt(Net(), [(".*", LoRASP(rank=8, hidden_width=4))], rngs=nnx.Rngs(0))
+    save_adapters(at / "adapter", model)
+    folders |= {"adapter": at / "adapter", "peft": GOLDEN / "adapter_lora"}
     folders |= {"rlds, resumed": at / "rlds", "statistics": golden("v21") / "meta"}
     return folders | {f"lerobot {version}": golden(version) for version in ("v21", "v3")}
 

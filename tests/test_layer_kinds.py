@@ -95,7 +95,7 @@ def test_moments_equal_a_direct_computation():
 
 
 def test_moments_of_embeddings_raise():
-    with pytest.raises(ValueError, match="'embed' matches no dense layer or einsum; available: "):
+    with pytest.raises(ValueError, match="'embed'"):
         calibration.input_moments(NET, IDS, "embed")
 
 

@@ -139,7 +139,5 @@ def test_shared_kernel_is_quantized_once_per_layout():
 
 
 def test_embeddings_and_convolutions_are_not_quantized():
-    with pytest.raises(
-        ValueError, match=r"rule 'embed' applies to nothing; available dense layers and einsums"
-    ):
+    with pytest.raises(ValueError, match="rule 'embed'"):
         lorasp_jax.quantize(NET, [("embed", "nf4")])

@@ -8,7 +8,7 @@ import numbers
 import os
 import re
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -116,109 +116,89 @@ class Episodes:
             control_dt: required control period [s]; None: any.
 
         Raises:
-            FileNotFoundError: the file does not exist.
-            ValueError: the file is damaged, or has another format or control period.
+            ValueError: the file is missing or damaged, or has another format or control period.
         """
-        arrays = _read(Path(path))
-        try:
-            metadata = {"actions": "joint"}  # for files older than this field
-            metadata |= json.loads(arrays.pop("header").tobytes())
-            if metadata.pop("format") != _FORMAT:
-                raise KeyError("format")
-        except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
-            raise ValueError(f"{path} is an .npz file without a valid {_FORMAT} header") from error
-        missing = {*_ARRAYS} - arrays.keys() | {*_METADATA} - metadata.keys()
-        if missing:
-            raise ValueError(f"{path} lacks {', '.join(sorted(missing))}")
-        image: Any = {k.removeprefix(_IMAGE): v for k, v in arrays.items() if k.startswith(_IMAGE)}
-        fields: dict[str, Any] = {name: arrays[name] for name in _ARRAYS}
-        try:
+        with as_value_error(path := Path(path)):
+            arrays: dict[str, Any] = _read(path)
+            metadata = json.loads(arrays.pop("header").tobytes())
+            if metadata["format"] != _FORMAT:
+                raise ValueError(f"its format is not {_FORMAT}")
             metadata["instructions"] = tuple(metadata["instructions"])
-            episodes = cls(image=image, **fields, **{name: metadata[name] for name in _METADATA})
+            image = {k.removeprefix(_IMAGE): arrays[k] for k in arrays if k.startswith(_IMAGE)}
+            fields = {name: arrays[name] for name in _ARRAYS}
+            fields |= {name: metadata[name] for name in _METADATA}
+            episodes = cls(image=image, **fields)
             episodes.validate()
-        except (ValueError, TypeError) as error:
-            raise ValueError(f"{path} is invalid: {error}") from error
-        if control_dt is not None and abs(episodes.control_dt - control_dt) > 1e-9:
-            raise ValueError(
-                f"{path} must have control_dt {control_dt} s, got {episodes.control_dt} s"
-            )
+            if control_dt is not None and abs(episodes.control_dt - control_dt) > 1e-9:
+                raise ValueError(f"its control_dt is {episodes.control_dt}, not {control_dt} s")
         return episodes
 
     def validate(self) -> None:
         """Raise a ValueError if the arrays are inconsistent or a value is not finite."""
         self.validate_numbers()
-        steps = self.state.shape[:2]
-        if not self.image:
-            raise ValueError("image must have at least one camera")
-        for name, images in self.image.items():
+        for name in self.image:
             check_camera(name)
-            if images.shape[:2] != steps or images.shape[4:] != (3,) or images.dtype != np.uint8:
-                raise ValueError(
-                    f"image {name!r} must be uint8 [{steps[0]}, {steps[1]}, H, W, 3], "
-                    f"got {images.dtype} {list(images.shape)}"
-                )
+        _check(self._image_rules())
 
     def validate_numbers(self) -> None:
         """Run the checks of `validate`, except those of images."""
-        self._validate_metadata()
-        if self.state.ndim != 3 or not self.state.size:
-            raise ValueError(f"state must have shape [E, T, J + 1], got {self.state.shape}")
+        _check(self._rules())
+
+    def _image_rules(self) -> Iterator[tuple[bool, str]]:
         steps = self.state.shape[:2]
-        self._validate_action()
+        yield bool(self.image), "image must have at least one camera"
+        for name, images in self.image.items():
+            is_image = images.shape[4:] == (3,) and images.dtype == np.uint8
+            got = _dtype_and_shape(images)
+            yield (
+                is_image and images.shape[:2] == steps,
+                (f"image {name!r} must be uint8 {[*steps]} + [H, W, 3], got {got}"),
+            )
+
+    def _rules(self) -> Iterator[tuple[bool, str]]:
+        """Yield what must hold, each after what it depends on."""
+        yield self.actions in MODES, f"actions must be one of {', '.join(MODES)}"
+        texts = {"task": self.task, "robot": self.robot, "instructions": "".join(self.instructions)}
+        for name, text in texts.items():
+            yield isinstance(text, str), f"{name} must be text, got {text!r}"
+        for name in ("control_dt", "physics_dt"):
+            time = getattr(self, name)
+            valid = isinstance(time, numbers.Real) and 0 <= float(time) < math.inf
+            yield (
+                valid and (time > 0 or name == "physics_dt"),
+                f"{name} is {time!r}, not a time in s",
+            )
+        yield self.state.ndim == 3 and self.state.size > 0, "state must have shape [E, T, J + 1]"
+        episodes, steps, width = self.state.shape
+        shape = (episodes, steps, 7 if self.actions == "end_effector" else width)
+        yield self.action.shape == shape, f"action must have shape {shape}, got {self.action.shape}"
+        for name in ("state", "action"):
+            values = np.asarray(getattr(self, name))
+            yield values.dtype == np.float32, f"{name} must be float32, got {values.dtype}"
+            wrong = np.argwhere(~np.isfinite(values))
+            at = "episode {}, step {}, dimension {}".format(*wrong[0]) if len(wrong) else ""
+            yield not at, f"{name} is not finite at {at}"
         for name, low, high in (
-            ("length", 1, steps[1]),
+            ("length", 1, steps),
             ("instruction", 0, len(self.instructions) - 1),
         ):
             values = np.asarray(getattr(self, name))
-            if values.shape != steps[:1] or not np.issubdtype(values.dtype, np.integer):
-                raise ValueError(
-                    f"{name} must be integers of shape {steps[:1]}, got {values.dtype} of shape "
-                    f"{values.shape}"
-                )
-            if values.min() < low or values.max() > high:
-                raise ValueError(
-                    f"{name} must be {low} to {high}, got {values.min()} to {values.max()}"
-                )
+            integers = values.shape == (episodes,) and np.issubdtype(values.dtype, np.integer)
+            in_range = integers and values.min() >= low and values.max() <= high
+            yield in_range, f"{name} must be {episodes} integers from {low} to {high}, got {values}"
 
-    def _validate_metadata(self) -> None:
-        texts = {"task": self.task, "robot": self.robot, "actions": self.actions}
-        texts |= {f"instruction {i}": text for i, text in enumerate(self.instructions)}
-        for name, text in texts.items():
-            if not isinstance(text, str):
-                raise ValueError(f"{name} must be a string, got {text!r}")
-        for name in ("control_dt", "physics_dt"):
-            time = getattr(self, name)
-            if not isinstance(time, numbers.Real) or not 0 <= float(time) < math.inf:
-                raise ValueError(f"{name} must be a finite time in s, at least 0, got {time!r}")
-        if not self.control_dt:
-            raise ValueError("control_dt must be above 0 s")
 
-    def _validate_action(self) -> None:
-        if self.actions not in MODES:
-            raise ValueError(f"actions must be one of {', '.join(MODES)}, got {self.actions!r}")
-        expected = (
-            (*self.state.shape[:2], 7) if self.actions == "end_effector" else self.state.shape
-        )
-        if self.action.shape != expected:
-            raise ValueError(f"action must have shape {expected}, got {self.action.shape}")
-        for name in ("state", "action"):
-            if getattr(self, name).dtype != np.float32:
-                raise ValueError(f"{name} must be float32, got {getattr(self, name).dtype}")
-            wrong = np.argwhere(~np.isfinite(np.asarray(getattr(self, name))))
-            if len(wrong):
-                episode, step, dimension = map(int, wrong[0])
-                raise ValueError(
-                    f"{name} is not finite in dimension {dimension} at step {step} of episode "
-                    f"{episode}"
-                )
+def _check(rules: Iterable[tuple[bool, str]]) -> None:
+    """Raise a ValueError for the first rule that does not hold."""
+    for holds, rule in rules:
+        if not holds:
+            raise ValueError(rule)
 
 
 def check_camera(name: str) -> None:
     """Raise a ValueError if a camera's name cannot be part of a file name."""
     if not _CAMERA.fullmatch(name):
-        raise ValueError(
-            f"invalid camera name {name[:80]!r}: use letters, digits, - _ . and spaces"
-        )
+        raise ValueError(f"camera name {name[:80]!r} must have letters, digits, - _ . and spaces")
 
 
 def concatenate(parts: Sequence[Episodes]) -> Episodes:
@@ -227,23 +207,20 @@ def concatenate(parts: Sequence[Episodes]) -> Episodes:
     Raises:
         ValueError: `parts` is empty, or its episodes differ in image shapes or a field of `SHARED`.
     """
-    if not parts:
-        raise ValueError("there is nothing to concatenate: parts is empty")
-    for name in SHARED:
-        values = {getattr(part, name) for part in parts}
-        if len(values) > 1:
+    same = {name: {getattr(part, name) for part in parts} for name in SHARED}
+    same["image shapes"] = {
+        tuple(sorted((k, v.shape[2:]) for k, v in part.image.items())) for part in parts
+    }
+    for name, values in same.items():
+        if len(values) != 1:
             raise ValueError(f"all parts must have the same {name}, got {sorted(values)}")
-    shapes = {tuple(sorted((k, v.shape[2:]) for k, v in part.image.items())) for part in parts}
-    if len(shapes) > 1:
-        raise ValueError(f"all parts must have the same image shapes, got {sorted(shapes)}")
     steps = max(part.state.shape[1] for part in parts)
 
     def join(*arrays: Array) -> np.ndarray:
         return np.concatenate([_pad(x, steps) for x in arrays])
 
     attempted = sum(part.attempted for part in parts)
-    same = [dataclasses.replace(part, attempted=attempted) for part in parts]
-    return jax.tree.map(join, *same)
+    return jax.tree.map(join, *(dataclasses.replace(part, attempted=attempted) for part in parts))
 
 
 def _dtype_and_shape(array: Any) -> str:
@@ -259,8 +236,7 @@ def _pad(array: Array, steps: int) -> Array:
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    check_regular(path)
-    with as_value_error(path), zipfile.ZipFile(path) as archive:
+    with zipfile.ZipFile(check_regular(path)) as archive:
         members = archive.infolist()
         check_memory(sum(member.file_size for member in members), path)
         return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
@@ -269,10 +245,8 @@ def _read(path: Path) -> dict[str, np.ndarray]:
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
     """Read one array after checking its size, since NumPy trusts the size in its header."""
     with archive.open(member) as file:
-        if (version := np.lib.format.read_magic(file)) not in _HEADERS:
-            raise ValueError(f"{member.filename} has unsupported .npy version {version}")
-        shape, _, dtype = _HEADERS[version](file)
+        shape, _, dtype = _HEADERS[np.lib.format.read_magic(file)](file)
         if math.prod(shape) * dtype.itemsize != member.file_size - file.tell():
-            raise ValueError(f"the size of {member.filename} does not match {dtype} {list(shape)}")
+            raise ValueError(f"the size of {member.filename} does not match its header")
     with archive.open(member) as file:
         return np.lib.format.read_array(file, allow_pickle=False)

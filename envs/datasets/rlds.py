@@ -198,10 +198,8 @@ def _check_same(folder: Path, old: Mapping[str, Any], new: Mapping[str, Any]) ->
     """Raise a ValueError that names the first difference, if there is one."""
     for name in sorted(old.keys() | new.keys()):
         if old.get(name) != new.get(name):
-            raise ValueError(
-                f"{folder} was started with {name} {old.get(name)!r}, not {new.get(name)!r}: "
-                "continue with the same value, or delete the folder to start over"
-            )
+            was, now = old.get(name), new.get(name)
+            raise ValueError(f"{folder} has {name} {was!r}, not {now!r}: delete it to start over")
 
 
 def _write_records(file: Path, records: Iterable[bytes]) -> None:

@@ -14,18 +14,21 @@ from google.protobuf.json_format import ParseError
 
 from envs.datasets import rlds_schema
 from envs.datasets.episodes import SHARED, Episodes, concatenate
-from lorasp_jax.base import files
-from lorasp_jax.base.files import RefusedError, as_int, check_regular, read_json
+from lorasp_jax.base import files, json_values
+from lorasp_jax.base.files import check_regular, read_json
 
 FORMAT, SPLIT = "envs-rlds-1", "train"
 METADATA = "metadata.json"
 """Metadata file in a dataset's folder; tfds reads it, too."""
 THREADS = ThreadPoolExecutor(8)
 """Shared by all open datasets: more threads would only wait for the GIL."""
-# Types of metadata fields: those of every dataset, then those that appear with the first shard.
-_TYPES: dict[str, Any] = {"options": dict, "parts": list, "steps": int, "attempted": int}
-_SHARD_TYPES: dict[str, Any] = {"task": str, "robot": str, "actions": str, "instructions": list}
-_SHARD_TYPES |= {"cameras": dict, "control_dt": int | float, "physics_dt": int | float}
+_TYPES: dict[str, Any] = {"options": {}, "parts": [int], "steps": int, "attempted": int}
+"""Schema of the metadata of every dataset, see `json_values.check`."""
+_SHARD_TYPES: dict[str, Any] = {
+    **{"task": str, "robot": str, "actions": str, "instructions": [str]},
+    **{"cameras": {str: (int, int)}, "control_dt": float, "physics_dt": float},
+}
+"""Schema of the fields that appear with the first shard."""
 
 
 def read(path: str | os.PathLike[str]) -> Episodes:
@@ -34,8 +37,7 @@ def read(path: str | os.PathLike[str]) -> Episodes:
     Episodes are padded with zeros to the longest one.
 
     Raises:
-        FileNotFoundError: the folder does not exist.
-        ValueError: it is damaged or not a dataset of this format.
+        ValueError: the folder is missing, damaged or not a dataset of this format.
     """
     reader = Reader(path)
     parts = list(THREADS.map(reader.episode, range(len(reader))))
@@ -47,23 +49,13 @@ def metadata(path: Path) -> dict[str, Any]:
     """Read the metadata of a dataset (see `ShardWriter`).
 
     Raises:
-        FileNotFoundError, ValueError: as in `read`.
+        ValueError: as in `read`.
     """
-    if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist")
-    try:
+    with as_value_error(path):
         content = read_json(path / METADATA, path)
         if content["format"] != FORMAT:
-            raise KeyError("format")
-        types = _TYPES | (_SHARD_TYPES if content["parts"] else {})
-        wrong = [name for name, kind in types.items() if not isinstance(content.get(name), kind)]
-    except RefusedError:
-        raise
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} is not a folder of {FORMAT} episodes") from error
-    if wrong:
-        value = repr(content.get(wrong[0]))[:80]
-        raise ValueError(f"{path} is damaged ({METADATA} has an invalid {wrong[0]}, {value})")
+            raise ValueError(f"its format is not {FORMAT}")
+        json_values.check(content, _TYPES | (_SHARD_TYPES if content["parts"] else {}))
     return content
 
 
@@ -85,7 +77,7 @@ class Reader:
         """Open a dataset.
 
         Raises:
-            FileNotFoundError, ValueError: as in `read`.
+            ValueError: as in `read`.
         """
         self.path: Path = Path(path)
         self.metadata: dict[str, Any] = metadata(self.path)
@@ -93,7 +85,7 @@ class Reader:
             cameras = self.metadata["cameras"]
             self.cameras: dict[str, str] = {n: rlds_schema.image_feature(n) for n in cameras}
             self.control_dt: float = float(self.metadata["control_dt"])
-            self.num_steps: int = as_int(self.metadata["steps"])
+            self.num_steps: int = self.metadata["steps"]
             self._shared: dict[str, Any] = {name: self.metadata[name] for name in SHARED}
             self._shared |= {"instructions": tuple(self.metadata["instructions"]), "attempted": 1}
             builder = _builder(self.path, self.metadata["parts"])
@@ -130,10 +122,9 @@ def _builder(folder: Path, parts: Sequence[int]) -> Any:
     rlds_schema.check_description(folder, rlds_schema.FEATURES, rlds_schema.INFO)
     builder: Any = tfds.builder_from_directory(folder)
     split = builder.info.splits[SPLIT]
-    if builder.info.file_format != tfds.core.FileFormat.ARRAY_RECORD:
-        raise ValueError(f"its file format is {builder.info.file_format}, expected ARRAY_RECORD")
-    if list(split.shard_lengths) != list(parts):
-        raise ValueError(f"it lists {sum(split.shard_lengths)} episodes, expected {sum(parts)}")
+    is_array_record = builder.info.file_format == tfds.core.FileFormat.ARRAY_RECORD
+    if not is_array_record or list(split.shard_lengths) != list(parts):
+        raise ValueError(f"{rlds_schema.INFO} does not match {METADATA}")
     for file, episodes in zip(split.filepaths, parts, strict=True):
         path = check_regular(files.join_inside(folder, os.path.relpath(file, folder)), folder)
         reader = array_record_module.ArrayRecordReader(str(path))

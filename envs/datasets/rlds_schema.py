@@ -134,11 +134,8 @@ def check_description(folder: Path, *names: str) -> None:
         )
         for field, value in _values(description, fields):
             if value not in fields[field]:
-                allowed = " or ".join(fields[field])
-                raise RefusedError(
-                    f"{path} has {field} {str(value)[:80]!r}, which "
-                    + (f"must be {allowed}" if allowed else "is not allowed")
-                )
+                allowed = " or ".join(fields[field]) or "absent"
+                raise RefusedError(f"{path} has {field} {str(value)[:80]!r}; it must be {allowed}")
 
 
 def _values(value: Any, fields: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
@@ -252,5 +249,5 @@ def _decode(file: bytes, size: Any) -> np.ndarray:
     """Decode an image to uint8 `[H, W, 3]`; raise ValueError if its size is not `size`."""
     with Image.open(io.BytesIO(file), formats=("PNG",)) as image:
         if [image.height, image.width] != list(size):  # checked before decoding
-            raise ValueError(f"an image has {image.height} x {image.width} pixels, expected {size}")
+            raise ValueError(f"an image has {image.height} x {image.width} pixels, not {size}")
         return np.asarray(image)

@@ -31,7 +31,7 @@ _MAX_EPISODES = 10**9  # our choice; catches typos
 Record = Callable[
     [Env, jax.Array, float | jax.Array, Randomization | None], tuple[dict[str, Any], jax.Array]
 ]
-"""Attempt an episode in every world; return the arrays of `Episodes`, and success [W]."""
+"""Attempt an episode in every world; return the arrays of `Episodes`, and success `[W]`."""
 
 
 @jax.tree_util.register_dataclass
@@ -41,11 +41,11 @@ class Demonstrations:
 
     Attributes:
         state: f32 [T, W, J + 1] measured joints [rad] and gripper opening [m] before each action.
-        action: f32 [T, W, A] the expert's actions, without noise.
-        poses: poses of geoms and cameras before each action, leading axes [T, W].
-        length: int32 [W] control steps until the world was done.
-        success: bool [W].
-        instruction: int32 [W] index into the task's instructions.
+        action: f32 `[T, W, A]` the expert's actions, without noise.
+        poses: poses of geoms and cameras before each action, leading axes `[T, W]`.
+        length: int32 `[W]` control steps until the world was done.
+        success: bool `[W]`.
+        instruction: int32 `[W]` index into the task's instructions.
         draw: randomized values of the worlds, or None.
     """
 
@@ -149,11 +149,10 @@ def expert_success(
     """Return whether the expert solves each of `num_episodes` random layouts, bool [num_episodes].
 
     Arguments are as in `collect`, except `attempt`. It runs an episode in every world and returns
-    success, bool [W]; default: the expert in simulation.
+    success, bool `[W]`; default: the expert in simulation.
     """
     env = make_repeatable(task, robot, num_envs=worlds(num_episodes, num_envs), **options)
     ranges = prepare(ranges, env.control_dt)
-    checks.key(key)
     calls = -(-num_episodes // env.num_envs)
     attempt = attempt or attempt_expert
     results = [attempt(env, chunk_key, ranges) for chunk_key in jax.random.split(key, calls)]
@@ -191,7 +190,6 @@ def gather(
     """
     record = record or record_expert
     ranges = prepare(ranges, env.control_dt)
-    checks.key(key)
     if checks.number("action_noise", action_noise) < 0:
         raise ValueError(f"action_noise must be at least 0, got {action_noise}")
     for _ in range(attempted // env.num_envs):
@@ -274,7 +272,7 @@ def record_expert(
 
 @traced.cached
 def attempt_expert(env: Env, key: jax.Array, ranges: Randomization | None) -> jax.Array:
-    """Return whether the expert succeeds in each world, bool [W]."""
+    """Return whether the expert succeeds in each world, bool `[W]`."""
     return rollout(env, key, ranges=ranges).success
 
 

@@ -34,10 +34,10 @@ _full_state = fast_cpu.jit(Env._full_state, static_argnums=0)
 class BraxEnv(base.Env):
     """One world of a task behind Brax's interface, for Brax's wrappers to batch and restart.
 
-    Observations are those of `Env.full_state`, float32 [D], without images. To render, call
+    Observations are those of `Env.full_state`, float32 `[D]`, without images. To render, call
     `observe` of the attribute `env` on `state.pipeline_state`, an `envs.State` of one world.
 
-    Actions, [A] in [-1, 1], are rescaled to the range from `env.action_low` to `env.action_high`.
+    Actions, `[A]` in [-1, 1], are rescaled to the range from `env.action_low` to `env.action_high`.
     The sparse reward is 1 once, on success. The dense reward needs `action_repeat=1`, since Brax
     sums the rewards of repeated actions without discounting.
 
@@ -58,23 +58,17 @@ class BraxEnv(base.Env):
             ranges: domain randomization of every episode, as in `Env.reset`.
 
         Raises:
-            TypeError: `env` is not an environment.
             ValueError: a range is invalid.
         """
-        checks.instance("env", env, Env, "an environment from envs.make")
         self.env: Env = dataclasses.replace(env, num_envs=1)
         prepare(ranges, env.control_dt)
         self.ranges = ranges
 
     def reset(self, rng: jax.Array) -> base.State:
-        """Start one world; `rng` is the key for all randomness.
-
-        Raises:
-            TypeError: `rng` is not a key.
-        """
+        """Start one world; `rng` is the key for all randomness."""
         ranges = prepare(self.ranges, self.env.control_dt)
         with self.env._calls.first("reset", ranges is None):
-            world = _reset(self.env, ranges, checks.key(rng))
+            world = _reset(self.env, ranges, rng)
         return base.State(reward=world.reward, metrics=world.metrics, **self._fields(world))
 
     def step(self, state: base.State, action: jax.Array) -> base.State:
@@ -82,13 +76,12 @@ class BraxEnv(base.Env):
 
         Args:
             state: one world.
-            action: [A] in [-1, 1], clipped.
+            action: `[A]` in [-1, 1], clipped.
 
         Raises:
-            TypeError, ValueError: as in `Env.step`.
+            ValueError: as in `Env.step`.
         """
         pipeline: Any = state.pipeline_state
-        checks.instance("state.pipeline_state", pipeline, State, "a state from reset or step")
         before = jax.tree.map(lambda x: x[0], pipeline)
         low, high = jnp.asarray(self.env.action_low), jnp.asarray(self.env.action_high)
         action = checks.action(action, low.shape)

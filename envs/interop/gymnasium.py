@@ -28,23 +28,21 @@ try:
     from gymnasium.vector import AutoresetMode
     from gymnasium.vector.utils import batch_space
 except ImportError as error:
-    raise ImportError(
-        'envs.interop.gymnasium needs Gymnasium: pip install -e ".[gymnasium]"'
-    ) from error
+    raise ImportError('this needs Gymnasium: pip install -e ".[gymnasium]"') from error
 
 
 Observation = Literal["pictures", "state", "full_state"]
 OBSERVATIONS: tuple[str, ...] = get_args(Observation)
 """state: dict with `state`, float32 [J + 1], measured joint angles [rad] and gripper opening [m].
-pictures: the same plus `image`, dict from camera name to uint8 [image_size, image_size, 3].
-full_state: the privileged state of `Env.full_state`, float32 [D]."""
+pictures: the same plus `image`, dict from camera name to uint8 `[image_size, image_size, 3]`.
+full_state: the privileged state of `Env.full_state`, float32 `[D]`."""
 
 
 class VectorEnv(gymnasium.vector.VectorEnv):
     """W worlds of a task behind Gymnasium's interface.
 
     Observations are one of `OBSERVATIONS`, with a leading axis W. Actions are as in `Env.step`,
-    float32 [W, A]. Info has `success`, bool [W], and `instruction`, string [W].
+    float32 `[W, A]`. Info has `success`, bool `[W]`, and `instruction`, string `[W]`.
 
     Worlds restart automatically in Gymnasium's next-step mode: the step after a world ends ignores
     its action and returns the first observation of its next episode. That step has reward 0 and is
@@ -73,10 +71,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             ranges: domain randomization of every episode, as in `Env.reset`.
 
         Raises:
-            TypeError: `env` is not an environment.
             ValueError: the observation is unknown, or a range is invalid.
         """
-        checks.instance("env", env, Env, "an environment from envs.make")
         self.env = env
         self.observation = observation
         prepare(ranges, env.control_dt)
@@ -114,16 +110,16 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         """Simulate one control step of every world, and restart the worlds that have ended.
 
         Args:
-            actions: [W, A], units and limits as in `Env.step`.
+            actions: `[W, A]`, units and limits as in `Env.step`.
 
         Returns:
             Observation, reward, terminated, truncated and info. The reward, float32 [W], is sparse
-            or dense as chosen in `envs.make`. Worlds terminate on success, bool [W], and are
-            truncated by the time limit or broken physics, bool [W].
+            or dense as chosen in `envs.make`. Worlds terminate on success, bool `[W]`, and are
+            truncated by the time limit or broken physics, bool `[W]`.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first `reset`.
-            TypeError, ValueError: the actions are not numbers, or their shape is wrong.
+            ValueError: the shape of the actions is wrong.
         """
         if self.state is None:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
@@ -184,7 +180,6 @@ class SingleEnv(gymnasium.Env):
         """
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
-        checks.instance("env", env, Env, "an environment from envs.make")
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": round(1 / env.control_dt)}
         self.vector: VectorEnv = VectorEnv(dataclasses.replace(env, num_envs=1), **options)
@@ -204,11 +199,11 @@ class SingleEnv(gymnasium.Env):
         """Simulate one control step; see `VectorEnv.step`.
 
         Args:
-            action: [A].
+            action: `[A]`.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first `reset`, and after the end of an episode.
-            TypeError, ValueError: as in `VectorEnv.step`.
+            ValueError: as in `VectorEnv.step`.
         """
         state = self.vector.state
         if state is not None and bool(state.done[0]):
@@ -219,7 +214,7 @@ class SingleEnv(gymnasium.Env):
         return _first(observation), float(reward[0]), *ends, self._info(info)
 
     def render(self) -> np.ndarray:
-        """Render the side camera, uint8 [image_size, image_size, 3].
+        """Render the side camera, uint8 `[image_size, image_size, 3]`.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first `reset`.
@@ -263,9 +258,7 @@ def make(
 def _space(env: Env, observation: str) -> spaces.Space[Any]:
     """Return one world's observation space; joints can exceed limits, so states are unbounded."""
     if observation not in OBSERVATIONS:
-        raise ValueError(
-            f"unknown observation {observation!r}: choose from {', '.join(OBSERVATIONS)}"
-        )
+        raise ValueError(f"observation must be {' or '.join(OBSERVATIONS)}, got {observation!r}")
     if observation == "full_state":
         length = max(part.stop for part in env.full_state_layout.values())
         return spaces.Box(-np.inf, np.inf, (length,))

@@ -53,8 +53,7 @@ def find(model: mujoco.MjModel, arm: ArmIds, tcp: str | None) -> Hand:
     left, right = (_end(_corners(model, data, joint) @ axes) for joint in arm.fingers)
     gap = left[0, 1] - right[1, 1]
     if gap < 2 * TIP_RADIUS:
-        least = f"{2000 * TIP_RADIUS:.0f} mm"
-        raise ValueError(f"the fingers must open to at least {least}, got {1000 * gap:.0f} mm")
+        raise ValueError(f"the fingers open by only {1000 * gap:.0f} mm")
     pose = _pose(axes @ _center(data, axes, left, right, site), axes)
     carrier = model.body_parentid[model.jnt_bodyid[arm.fingers[0]]]
     frames = [np.eye(4), *(_frame(model, data, joint) for joint in arm.joints)]
@@ -76,15 +75,14 @@ def _open(model: mujoco.MjModel, data: mujoco.MjData, arm: ArmIds) -> tuple[np.n
     """Open the fingers in `data`.
 
     Returns:
-        The sign [2] of each joint's motion when the hand opens, and the direction [3] from the
+        The sign `[2]` of each joint's motion when the hand opens, and the direction `[3]` from the
         second finger to the first.
     """
     mujoco.mj_kinematics(model, data)
     line = data.xaxis[arm.fingers[0]]
     along = data.xaxis[arm.fingers] @ line
     if abs(along[1]) < _PARALLEL:
-        angle = _degrees(along[1])
-        raise ValueError(f"the fingers must slide along one line, got axes {angle} deg apart")
+        raise ValueError(f"the fingers' axes are {_degrees(along[1])} deg apart, not on one line")
     address = model.jnt_qposadr[arm.fingers]
     centers = [_corners(model, data, joint).mean(axis=(0, 1)) @ line for joint in arm.fingers]
 
@@ -100,7 +98,7 @@ def _open(model: mujoco.MjModel, data: mujoco.MjData, arm: ArmIds) -> tuple[np.n
 
 
 def _corners(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> np.ndarray:
-    """Return the corners [N, 8, 3] of the bounding boxes of the N colliding geoms of a finger."""
+    """Return the corners `[N, 8, 3]` of the bounding boxes of the N colliding geoms of a finger."""
     finger, corners = model.jnt_bodyid[joint], []
     for geom in np.flatnonzero(model.geom_contype | model.geom_conaffinity):
         body = model.geom_bodyid[geom]
@@ -111,10 +109,7 @@ def _corners(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> np.ndarr
             rotation = data.geom_xmat[geom].reshape(3, 3)
             corners.append(data.geom_xpos[geom] + (center + half * _CORNERS) @ rotation.T)
     if not corners:
-        raise ValueError(
-            f"finger {model.joint(joint).name} needs a geom that collides; its body "
-            f"{model.body(finger).name} has none with contype or conaffinity"
-        )
+        raise ValueError(f"finger {model.joint(joint).name} needs a geom with contype, conaffinity")
     return np.stack(corners)
 
 
@@ -130,25 +125,22 @@ def _site(model: mujoco.MjModel, tcp: str | None) -> str | None:
 def _axes(
     model: mujoco.MjModel, data: mujoco.MjData, arm: ArmIds, across: np.ndarray, site: str | None
 ) -> np.ndarray:
-    """Compute the axes [3, 3] of the hand in the world, as columns; y is `across`."""
+    """Compute the axes `[3, 3]` of the hand in the world, as columns; y is `across`."""
     last = arm.joints[-1]
     fingers = np.mean([_corners(model, data, f).mean(axis=(0, 1)) for f in arm.fingers], axis=0)
     reach = fingers - data.xanchor[last]
     if site:
         _, y, z = data.site(site).xmat.reshape(3, 3).T
         if abs(y @ across) < _PARALLEL:
-            raise ValueError(
-                f"the y axis of site {site} is {_degrees(y @ across)} deg off the line "
-                "along which the fingers open"
-            )
+            raise ValueError(f"the y axis of site {site} is not along the fingers' motion")
         if z @ reach < 0:
             raise ValueError(f"the z axis of site {site} must point out of the hand, not into it")
     else:
         z = data.xaxis[last] * (1 if data.xaxis[last] @ reach > 0 else -1)
         if abs(z @ across) > 1 - _PARALLEL:
             raise ValueError(
-                "the last joint's axis is not perpendicular to the fingers' motion: add a site tcp "
-                "whose z axis points out of the hand and along whose y axis the fingers open"
+                "the last joint's axis is along the fingers' motion: add a site tcp whose z axis "
+                "points out of the hand and whose y axis is along the fingers' motion"
             )
     z = z - (z @ across) * across
     z /= np.linalg.norm(z)
@@ -165,7 +157,7 @@ def _end(corners: np.ndarray) -> np.ndarray:
 def _center(
     data: mujoco.MjData, axes: np.ndarray, left: np.ndarray, right: np.ndarray, site: str | None
 ) -> np.ndarray:
-    """Compute the tcp's coordinates [3] along the hand's axes."""
+    """Compute the tcp's coordinates `[3]` along the hand's axes."""
     x = np.mean([left[:, 0], right[:, 0]])
     if site:
         x = data.site(site).xpos @ axes[:, 0]
@@ -176,7 +168,7 @@ def _center(
 
 
 def _frame(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> np.ndarray:
-    """Return the pose [4, 4] of a hinge in the world, with z along its axis."""
+    """Return the pose `[4, 4]` of a hinge in the world, with z along its axis."""
     z = data.xaxis[joint]
     body = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3)
     x = body[:, np.argmin(np.abs(z @ body))]
@@ -192,7 +184,7 @@ def _pose(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 
 
 def _pad(data: mujoco.MjData, body: int, pose: np.ndarray, box: np.ndarray) -> Pad:
-    """Make a finger's pad from its bounds [2, 3] along the axes of the tcp's pose [4, 4]."""
+    """Make a finger's pad from its bounds `[2, 3]` along the axes of the tcp's pose `[4, 4]`."""
     axes, origin = pose[:3, :3], pose[:3, 3]
     low, high = box - origin @ axes
     side = np.sign(low[1] + high[1])

@@ -10,6 +10,7 @@ import numpy as np
 
 from envs.mjcf import sources
 from envs.scene import scene
+from lorasp_jax.base.files import as_value_error
 
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _KINDS = ("free", "ball", "slide", "hinge")
@@ -48,21 +49,14 @@ def read(
             `folder`, or something in it is too large.
     """
     path = Path(path).absolute()
-    if not os.path.isfile(path):  # Path.is_file raises if a name is too long
-        raise ValueError("no such file")
-    try:
+    with as_value_error(path):
         sources.check(path, Path(folder or path.parent))
-    except (SyntaxError, RecursionError, OSError) as error:  # XML errors are SyntaxErrors
-        raise ValueError(f"MuJoCo cannot read it: {error}") from error
-    try:
-        with scene.as_python_warnings():
-            spec = mujoco.MjSpec.from_file(str(path))
-            spec.memory = -1  # automatic, whatever the file asks for
-            # Merge no bodies and drop no geoms: both would change the ids in the model.
-            spec.compiler.fusestatic = spec.compiler.discardvisual = False
-            return spec, spec.compile()
-    except ValueError as error:
-        raise ValueError(f"MuJoCo cannot read it: {error}") from error
+    with scene.as_python_warnings():
+        spec = mujoco.MjSpec.from_file(str(path))
+        spec.memory = -1  # automatic, whatever the file asks for
+        # Merge no bodies and drop no geoms: both would change the ids in the model.
+        spec.compiler.fusestatic = spec.compiler.discardvisual = False
+        return spec, spec.compile()
 
 
 def find_arm(model: mujoco.MjModel) -> ArmIds:
@@ -98,7 +92,7 @@ def find_arm(model: mujoco.MjModel) -> ArmIds:
 
 
 def find_limits(model: mujoco.MjModel, arm: ArmIds) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest angles [J] allowed by both hinges and servos [rad].
+    """Return the lowest and highest angles `[J]` allowed by both hinges and servos [rad].
 
     Raises:
         ValueError: the two ranges of a joint do not overlap, or all seem to be in the wrong unit.
@@ -111,13 +105,11 @@ def find_limits(model: mujoco.MjModel, arm: ArmIds) -> tuple[np.ndarray, np.ndar
     )
     lower, upper = np.maximum(lower, control[:, 0]), np.minimum(upper, control[:, 1])
     if empty := [joint for joint, span in zip(arm.joints, upper - lower, strict=True) if span <= 0]:
-        raise ValueError(
-            f"{_names(model, empty)}: range and the actuator's ctrlrange do not overlap"
-        )
+        raise ValueError(f"{_names(model, empty)}: range and ctrlrange do not overlap")
     if (upper - lower).max() < _RADIANS_AS_DEGREES:
         raise ValueError(
-            "no hinge turns by more than 13 deg; if the file gives angles in radians, add "
-            '<compiler angle="radian"/>, since MuJoCo reads degrees by default'
+            "no hinge turns by more than 13 deg; if the file's angles are in radians, add "
+            '<compiler angle="radian"/>'
         )
     return lower, upper
 
@@ -125,7 +117,7 @@ def find_limits(model: mujoco.MjModel, arm: ArmIds) -> tuple[np.ndarray, np.ndar
 def find_gripper(model: mujoco.MjModel, arm: ArmIds, signs: np.ndarray) -> Gripper:
     """Combine the fingers' actuators, which may act on one finger, on both, or on a tendon.
 
-    `signs` [2] is 1 for a finger joint whose positive direction opens the hand, else -1.
+    `signs` `[2]` is 1 for a finger joint whose positive direction opens the hand, else -1.
 
     Raises:
         ValueError: the fingers have no actuator, or one that is not a position actuator.
@@ -153,10 +145,8 @@ def _servo(model: mujoco.MjModel, joint: int) -> tuple[int, float]:
         # At control = angle, the force must be 0: gain * control and bias * rate * angle cancel.
         if _is_servo(model, i) and np.isclose(gain, -model.actuator_biasprm[i, 1] * rates[i]):
             return i, float(rates[i])
-    raise ValueError(
-        f"joint {_names(model, [joint])} needs a position actuator of its own, whose control "
-        f"is the joint angle; {_actuators(model)}"
-    )
+    name = _names(model, [joint])
+    raise ValueError(f"joint {name} needs a position actuator of its own; {_actuators(model)}")
 
 
 def _rates(model: mujoco.MjModel, joint: int) -> np.ndarray:

@@ -83,10 +83,7 @@ def _check_growth(descriptions: dict[Path, ElementTree.Element], main: Path) -> 
             inner = max((sizes.get(file, 0.0) for file in included[path]), default=0.0)
             sizes[path] = _elements(descriptions[path], 1, inner)
             if sizes[path] > _MAX_ELEMENTS:
-                raise ValueError(
-                    f"{path} expands to {sizes[path]:g} elements; "
-                    f"at most {_MAX_ELEMENTS} are allowed"
-                )
+                raise ValueError(f"{path} expands to more than {_MAX_ELEMENTS} elements")
 
 
 def _elements(element: ElementTree.Element, copies: float, inner: float) -> float:
@@ -133,16 +130,14 @@ def _check_sizes(element: ElementTree.Element, copies: float) -> None:
     if element.tag == "numeric":
         counted = {"size"}
     entries = max(itertools.chain(*(_numbers(element, name) for name in counted)), default=0)
-    if entries > _MAX_ENTRIES:
-        raise ValueError(
-            f"its {element.tag} asks for {entries:g} entries; at most {_MAX_ENTRIES} are allowed"
-        )
-    if max(_numbers(element, "params"), default=0) > _MAX_RINGS:
-        raise ValueError(f"its {element.tag} has more than {_MAX_RINGS} rings of vertices")
-    if copies > _MAX_COPIES:
-        raise ValueError(
-            f"{element.tag} makes {copies:g} copies; at most {_MAX_COPIES} are allowed"
-        )
+    rings = max(_numbers(element, "params"), default=0)
+    for what, number, limit in (
+        ("entries", entries, _MAX_ENTRIES),
+        ("rings", rings, _MAX_RINGS),
+        ("copies", copies, _MAX_COPIES),
+    ):
+        if number > limit:
+            raise ValueError(f"its {element.tag} has {number:g} {what}, more than {limit}")
     check_memory(int(min(_PIXEL_BYTES * max(grid, image), 1e30)), f"its {element.tag}")
     for child in element:
         _check_sizes(child, copies)

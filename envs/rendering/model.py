@@ -88,12 +88,9 @@ def build(mj_model: mujoco.MjModel, camera_names: Sequence[str]) -> RenderModel:
     If the model has primitives in `STAND_IN_GROUP`, they are drawn in place of all meshes.
 
     Raises:
-        ValueError: a camera does not exist, a visible geom is not a primitive, or no geom is
-            visible.
+        ValueError: a visible geom is not a primitive, or no geom is visible.
     """
     cameras = {mj_model.camera(i).name: i for i in range(mj_model.ncam)}
-    if unknown := set(camera_names) - set(cameras):
-        raise ValueError(f"unknown cameras {sorted(unknown)}: choose from {sorted(cameras)}")
     drawn, stand_ins = is_visible(mj_model), mj_model.geom_group == STAND_IN_GROUP
     if stand_ins.any():
         drawn = drawn & (mj_model.geom_type != mujoco.mjtGeom.mjGEOM_MESH) | stand_ins
@@ -103,10 +100,8 @@ def build(mj_model: mujoco.MjModel, camera_names: Sequence[str]) -> RenderModel:
     types = mj_model.geom_type.tolist()
     for i in visible:
         if types[i] not in _SHAPES:
-            raise ValueError(
-                f"cannot draw geom {mj_model.geom(i).name or i}: only planes, spheres, ellipsoids, "
-                "capsules, cylinders and boxes are supported; group 3 hides a geom"
-            )
+            name = mj_model.geom(i).name or i
+            raise ValueError(f"geom {name} is not a primitive, so rays cannot draw it: hide it")
     geoms = sorted(visible, key=lambda i: _SHAPES[types[i]][0])
     return RenderModel(
         appearance=_default_appearance(mj_model),

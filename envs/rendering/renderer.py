@@ -198,7 +198,6 @@ def in_camera_frames(
 ) -> tuple[Geom, RayCamera]:
     """Compute the `Geom` of all cameras and geoms, leaves `[K, V]`, and the views, leaves `[K]`."""
     geom_xpos, geom_xmat, cam_xpos, cam_xmat = poses
-    _check_shapes(appearance, geom_xpos=geom_xpos, cam_xpos=cam_xpos, size=size)
     visible, cameras = np.array(model.geoms), np.array(model.cameras)
     scale, half = unit_shapes(model, size)
     to_unit = _rows(jnp.swapaxes(geom_xmat[visible], -1, -2) / scale[:, :, None])
@@ -239,13 +238,6 @@ def _camera(
         square=jnp.asarray(appearance.checker[0]),
         contrast=jnp.asarray(appearance.checker[1]),
     )
-
-
-def _check_shapes(appearance: Appearance, **arrays: jax.Array | np.ndarray) -> None:
-    for name, array in arrays.items():
-        count = (appearance.fovy if name == "cam_xpos" else appearance.rgba).shape[0]
-        if array.shape != (count, 3):
-            raise ValueError(f"{name} must have shape {(count, 3)}, got {array.shape}")
 
 
 def _vec(vectors: jax.Array) -> Vec:

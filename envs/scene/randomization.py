@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs import checks
 from envs.rendering.renderer import Appearance
 from envs.robots import BASE, multiply, turn
 from envs.scene.ranges import Randomization
@@ -32,10 +31,10 @@ class Draw:
         size, friction, brightness, latency, table_height: [].
         mass: [bodies].
         gains: [actuators].
-        camera_position, camera_turn: [N, 3].
-        field_of_view: [N].
-        light_turn: [3].
-        colour: [G, 3].
+        camera_position, camera_turn: `[N, 3]`.
+        field_of_view: `[N]`.
+        light_turn: `[3]`.
+        colour: `[G, 3]`.
     """
 
     size: jax.Array
@@ -55,8 +54,6 @@ class Draw:
 def prepare(ranges: Randomization | None, control_dt: float) -> Randomization | None:
     """Check ranges, unless they are traced, and convert them to strongly typed arrays."""
     leaves = jax.tree.leaves(ranges)
-    if ranges is not None:
-        checks.instance("ranges", ranges, Randomization, "an envs.Randomization or None")
     if ranges and not any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
         ranges.check(control_dt)
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), ranges)
@@ -103,7 +100,7 @@ def in_subtrees(model: mujoco.MjModel, names: Iterable[str]) -> np.ndarray:
 
 
 def geom_sizes(drawn: Draw, model: mujoco.MjModel, objects: np.ndarray) -> jax.Array:
-    """Compute the sizes [G, 3] of all geoms of one world; `objects` masks the objects' bodies."""
+    """Compute the sizes `[G, 3]` of all geoms of one world; `objects` masks the objects' bodies."""
     return model.geom_size * jnp.where(objects[model.geom_bodyid], drawn.size, 1.0)[:, None]
 
 

@@ -80,19 +80,18 @@ class Randomization:
 
     def check(self, control_dt: float) -> None:
         """Raise a ValueError if a range is invalid; latency must not exceed `control_dt` [s]."""
-        for name, value in vars(self).items():
+        limits = dict.fromkeys(vars(self), (-np.inf, np.inf)) | {
+            "size": (1 / MAX_GROWTH, MAX_GROWTH),
+            "field_of_view": (-_MAX_FOV_CHANGE, _MAX_FOV_CHANGE),
+            "latency": (0.0, control_dt),
+        }
+        for name, (low, high) in limits.items():
+            value = getattr(self, name)
             if not _is_range(value):
                 raise ValueError(f"{name} must be two finite numbers (low, high), got {value}")
-            if name in _POSITIVE and value[0] <= 0:
-                raise ValueError(f"{name} is a factor and must be above 0, got {value}")
-        if self.size[0] < 1 / MAX_GROWTH or self.size[1] > MAX_GROWTH:
-            limits = f"[{1 / MAX_GROWTH}, {MAX_GROWTH}]"
-            raise ValueError(f"size must lie in {limits}, got {self.size}")
-        if max(map(abs, self.field_of_view)) > _MAX_FOV_CHANGE:
-            limit = f"[-{_MAX_FOV_CHANGE}, {_MAX_FOV_CHANGE}] degrees"
-            raise ValueError(f"field_of_view must lie in {limit}, got {self.field_of_view}")
-        if self.latency[0] < 0 or self.latency[1] > control_dt:
-            raise ValueError(f"latency must lie in [0, {control_dt}] s, got {self.latency}")
+            if value[0] < low or value[1] > high or (name in _POSITIVE and value[0] <= 0):
+                kind = "above 0 and " * (name in _POSITIVE)
+                raise ValueError(f"{name} must be {kind}in [{low}, {high}], got {value}")
 
 
 def _is_range(value: Any) -> bool:

@@ -30,7 +30,7 @@ from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdaptedLayer, AdapterAux, AdapterParam, DropoutKey, validate
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import FullFineTuning, Method
-from lorasp_jax.peft.fields import checked_key, short
+from lorasp_jax.peft.fields import checked_key
 from lorasp_jax.peft.method import Params, dropout_rate
 
 Model = TypeVar("Model", bound=nnx.Module)
@@ -56,28 +56,27 @@ def adapt(
     Adapters apply to every `Dense`, `nnx.Linear` (which becomes a `Dense`), `nnx.LinearGeneral` and
     `nnx.Einsum` whose path matches, for instance "language/gate_proj". LoRA also applies to
     `nnx.Embed` and `nnx.Conv`. Subclasses that override `__call__` are skipped. A stacked kernel
-    [L, I, O] gets stacked adapters. An adapted layer's own weights are frozen.
+    `[L, I, O]` gets stacked adapters. An adapted layer's own weights are frozen.
 
     `FullFineTuning` converts every floating-point parameter under a matching path to an fp32
     `AdapterParam`, including norms, embeddings and biases.
 
     Args:
-      model: not modified; the result shares its frozen arrays.
-      rules: (pattern, method or None) pairs, first match wins.
-      rngs: supplies one key, from which each layer derives its own by its path.
-      einsums: extra layer classes that compute one einsum of their input and a parameter, mapped to
-        a function layer -> (parameter name, equation), as in
-        {gemma.Einsum: lambda layer: ("w", layer.einsum_str)}.
-      statistics: second moments [..., I, I] of layer inputs by path, from
-        `calibration.input_moments`; for data-driven initialization.
+        model: not modified; the result shares its frozen arrays.
+        rules: (pattern, method or None) pairs, first match wins.
+        rngs: supplies one key, from which each layer derives its own by its path.
+        einsums: extra layer classes that compute one einsum of their input and a parameter, mapped
+            to a function layer -> (parameter name, equation), as in {gemma.Einsum: lambda layer:
+            ("w", layer.einsum_str)}.
+        statistics: second moments `[..., I, I]` of layer inputs by path, from
+            `calibration.input_moments`; for data-driven initialization.
 
     Raises:
-      ValueError: a pattern is not a valid regular expression, a rule applies to nothing (the
-        message lists near misses), or a layer is unsupported or already has an adapter.
+        ValueError: a pattern is not a valid regular expression, a rule applies to nothing (the
+            message lists near misses), or a layer is unsupported or already has an adapter.
     """
     paths.check_method_rules(rules)
     nnx_layers.check_einsums(einsums)
-    _check_statistics(statistics)
     root, key = _wrapped_copy(model), validate.rngs(rngs).params()
     used = _attach_all(root, rules, key, einsums, statistics) | unfreeze(root, rules)
     for i, (pattern, _) in enumerate(rules):
@@ -110,8 +109,8 @@ def with_dropout(model: Model, key: jax.Array) -> Model:
     stack use independent masks. A layer called twice with the same input shape reuses its mask.
 
     Args:
-      model: not modified; adapters without dropout are unaffected.
-      key: typed PRNG key.
+        model: not modified; adapters without dropout are unaffected.
+        key: typed PRNG key.
     """
     root, key = _wrapped_copy(model), checked_key(key)
     for location in paths.unique(paths.locate(root, AdaptedLayer)):
@@ -150,7 +149,7 @@ def merge(model: Model) -> Model:
     code that reads it. A quantized kernel with an adapter is dequantized.
 
     Raises:
-      ValueError: a method's delta depends on the input, or the model has shapes without values.
+        ValueError: a method's delta depends on the input, or the model has shapes without values.
     """
     root = _wrapped_copy(validate.with_values(model))
     paths.replace(paths.locate(root, AdaptedLayer), _merged)
@@ -162,11 +161,9 @@ def _merged(location: paths.Location) -> nnx.Module:
     """Fold the adapter into the kernel; return the layer without an adapter."""
     layer = location.child
     if layer.adapter is not None:
-        try:
+        with paths.naming("merge", location.path):
             kernel = layer.kernel_matrices()
             kernel = over_stack(layer.method.merge, kernel)(layer.adapter.get_value(), kernel)
-        except ValueError as error:
-            raise ValueError(f"cannot merge {location.path}: {error}") from error
         layer.set_kernel_matrices(kernel)
     return layer.without_adapter()
 
@@ -188,17 +185,14 @@ def attach(
     """Attach a newly initialized adapter to a layer, and freeze the layer's own weights.
 
     The layer is modified in place; leading axes of its kernel index the layers of a scanned stack.
-    `statistics` are the second moments [..., I, I] of its inputs, if the method requires them.
+    `statistics` are the second moments `[..., I, I]` of its inputs, if the method requires them.
 
     Raises:
-      ValueError: the layer does not support the method or already has an adapter, or the method
-        would split a quantized kernel.
+        ValueError: the layer does not support the method or already has an adapter, or the method
+            would split a quantized kernel.
     """
     if layer.adapter is not None and layer.method is not None:
-        raise ValueError(
-            f"the layer already has a {layer.method.name} adapter: adapt the base instead, merge "
-            "the model first, or exclude this layer with a leading (pattern, None) rule"
-        )
+        raise ValueError(f"it already has a {layer.method.name} adapter: merge the model first")
     if method.splits_kernel and isinstance(layer.kernel_matrices(), QuantizedKernel):
         raise ValueError("a quantized kernel cannot be split: adapt first, then quantize")
     _convert_variables(
@@ -210,21 +204,6 @@ def attach(
     if method.splits_kernel:
         layer.set_kernel_matrices(kernel)
     layer.adapter = AdapterParam(params)
-
-
-def _check_statistics(statistics: Any) -> None:
-    """Raise ValueError unless `statistics` maps paths to finite square matrices."""
-    if not isinstance(statistics, Mapping):
-        raise ValueError(
-            f"statistics must be a mapping from calibration.input_moments, got {short(statistics)}"
-        )
-    for path, value in statistics.items():
-        shape = getattr(value, "shape", (0, 1))
-        traced = isinstance(value, jax.core.Tracer)
-        if shape[-2:] != shape[-1:] * 2 or not (traced or jnp.isfinite(value).all()):
-            raise ValueError(
-                f"statistics of {path} must be finite, of shape [..., I, I], got {short(value)}"
-            )
 
 
 def _wrapped_copy(model: nnx.Module) -> nnx.List[Any]:
@@ -258,11 +237,9 @@ def _attach_all(
             return None
         method = cast(Method, rules[used[location.path]][1])
         layer_key = jax.random.fold_in(key, zlib.crc32(location.path.encode()))
-        try:
+        with paths.naming("adapt", location.path):
             layer = nnx_layers.make_adaptable(location.child, einsums)
             attach(layer, method, layer_key, statistics.get(location.path))
-        except ValueError as error:
-            raise ValueError(f"cannot adapt {location.path or 'the model'}: {error}") from error
         return layer
 
     paths.replace(layers, attach_to)
@@ -285,15 +262,9 @@ def unfreeze(root: nnx.List[Any], rules: paths.Rules) -> set[int]:
             if layer and layer.adapter is None:
                 layer.method = method
             elif layer and location.name == layer.kernel_name:
-                raise ValueError(
-                    f"{location.path} cannot be fully fine-tuned: its layer has an adapter"
-                )
+                raise ValueError(f"{location.path} has an adapter and cannot be fully fine-tuned")
             if jnp.issubdtype(location.child.get_value().dtype, jnp.floating):
                 unfrozen.append(location)
-    if shapes := [p for p in unfrozen if isinstance(p.child.get_value(), jax.ShapeDtypeStruct)]:
-        raise ValueError(
-            f"{shapes[0].path} has a shape but no value: call this inside nnx.eval_shape"
-        )
     _convert_variables(unfrozen, AdapterParam)
     return used
 
@@ -316,15 +287,14 @@ def init_stack(
     kernel: jax.Array,
     statistics: jax.Array | None = None,
 ) -> tuple[Params, Any]:
-    """Apply a method's `init` to a kernel [..., I, O], with an independent key per matrix.
+    """Apply a method's `init` to a kernel `[..., I, O]`, with an independent key per matrix.
 
     Not jitted as a whole, so that random draws compile once per I, not once per kernel shape.
     """
-    if len(getattr(kernel, "shape", ())) < 2:
-        raise ValueError(f"an adapter needs a kernel [..., I, O], got {short(kernel)}")
-    *leading, d_in, d_out = kernel.shape
+    leading = getattr(kernel, "shape", ())[:-2]
     if not leading:
         return init(key, kernel, statistics=statistics)
+    d_in, d_out = kernel.shape[-2:]
     if statistics is not None:
         statistics = statistics.reshape(-1, d_in, d_in)
     keys = jax.random.split(key, math.prod(leading))
@@ -334,7 +304,7 @@ def init_stack(
 
 
 def over_stack(function: Callable[..., Any], kernel: jax.Array) -> Callable[..., Any]:
-    """Map a function of one layer's arrays over the leading axes of a kernel [..., I, O]."""
+    """Map a function of one layer's arrays over the leading axes of a kernel `[..., I, O]`."""
     for _ in kernel.shape[:-2]:
         function = jax.vmap(function)
     return function

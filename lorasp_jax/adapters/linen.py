@@ -27,7 +27,13 @@ from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.adapters.layers.einsum import to_matrices
 from lorasp_jax.adapters.layers.linen_layers import layer_call, supported_class, with_lora
 from lorasp_jax.adapters.layers.nnx_layers import Einsums
-from lorasp_jax.adapters.paths import Rules, check_method_rules, find_rule, no_match_message
+from lorasp_jax.adapters.paths import (
+    Rules,
+    check_method_rules,
+    find_rule,
+    naming,
+    no_match_message,
+)
 from lorasp_jax.dense import AUX_NAME, validate
 from lorasp_jax.peft import Method
 from lorasp_jax.peft.fields import checked_key
@@ -53,10 +59,10 @@ class LinenAdapter:
     `collect_aux`, the `variable_axes` of the model's own scan must include "intermediates".
 
     Attributes:
-      model: any Linen module; for a Hugging Face Flax model, its `.module`.
-      rules: (pattern, method or None) pairs, first match wins.
-      einsums: extra layer classes, as for `adapt`. The equation is None if it is an argument of the
-        layer's call, as in {gemma.Einsum: lambda layer: ("w", None)}.
+        model: any Linen module; for a Hugging Face Flax model, its `.module`.
+        rules: (pattern, method or None) pairs, first match wins.
+        einsums: extra layer classes, as for `adapt`. The equation is None if it is an argument of
+            the layer's call, as in {gemma.Einsum: lambda layer: ("w", None)}.
     """
 
     model: nn.Module
@@ -66,22 +72,17 @@ class LinenAdapter:
     def __post_init__(self) -> None:
         check_method_rules(self.rules)
         nnx_layers.check_einsums(self.einsums)
-        if not isinstance(self.model, nn.Module):
-            raise ValueError(
-                f"the model must be a Linen module, got {type(self.model).__name__}; for NNX "
-                "modules use `adapt`"
-            )
 
     def init(self, key: Any, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """Initialize the variables with the model's own `init`, and add the collection "adapters".
 
         Args:
-          key: typed PRNG key, or a dictionary of keys with one for "params".
-          *args: the model's call arguments.
-          **kwargs: the model's call arguments.
+            key: typed PRNG key, or a dictionary of keys with one for "params".
+            *args: the model's call arguments.
+            **kwargs: the model's call arguments.
 
         Raises:
-          ValueError: as for `attach`.
+            ValueError: as for `attach`.
         """
         return self.attach(key, self.model.init(_rngs(key), *args, **kwargs), *args, **kwargs)
 
@@ -91,18 +92,16 @@ class LinenAdapter:
         """Add the collection "adapters" to existing variables, for instance pretrained ones.
 
         Args:
-          key: as for `init`.
-          variables: variables of the bare model, with "params"; not modified.
-          *args: the model's call arguments.
-          **kwargs: the model's call arguments.
+            key: as for `init`.
+            variables: variables of the bare model, with "params"; not modified.
+            *args: the model's call arguments.
+            **kwargs: the model's call arguments.
 
         Raises:
-          ValueError: a rule applies to nothing (the message lists near misses), a layer is
-            unsupported, or the variables already have adapters.
+            ValueError: a rule applies to nothing (the message lists near misses), a layer is
+                unsupported, or the variables already have adapters.
         """
-        if ADAPTER in {
-            name for path in flatten_dict(validate.variables(variables)) for name in path
-        }:
+        if any(ADAPTER in path for path in flatten_dict(validate.variables(variables))):
             raise ValueError("the variables already have adapters: pass those of the bare model")
         rngs = _rngs(key)
         record = _Record()
@@ -121,15 +120,15 @@ class LinenAdapter:
         """Like the model's own `apply`, with the adapters.
 
         Args:
-          variables: from `init` or `attach`, possibly trained.
-          *args: as for the model's `apply`.
-          mutable: as for the model's `apply`, but must not include "params"; include
-            "intermediates" for `collect_aux`.
-          **kwargs: as for the model's `apply`; the adapters' dropout is on if rngs has "dropout".
+            variables: from `init` or `attach`, possibly trained.
+            *args: as for the model's `apply`.
+            mutable: as for the model's `apply`, but must not include "params"; include
+                "intermediates" for `collect_aux`.
+            **kwargs: as for the model's `apply`; the adapters' dropout is on if rngs has "dropout".
 
         Raises:
-          ValueError: the adapters in the variables do not match the rules, "params" is mutable, or
-            a scan or vmap does not split the rngs for dropout.
+            ValueError: the adapters in the variables do not match the rules, "params" is mutable,
+                or a scan or vmap does not split the rngs for dropout.
         """
         if _compat.is_mutable(mutable, "params"):
             raise ValueError("'params' cannot be mutable: it contains the adapters during the call")
@@ -146,12 +145,12 @@ class LinenAdapter:
         logits.
 
         Args:
-          variables: as for `apply`.
-          *args: the model's call arguments; the model is called once to find its layers.
-          **kwargs: the model's call arguments.
+            variables: as for `apply`.
+            *args: the model's call arguments; the model is called once to find its layers.
+            **kwargs: the model's call arguments.
 
         Raises:
-          ValueError: a method's delta depends on the input.
+            ValueError: a method's delta depends on the input.
         """
         params = self._visit_layers(
             self._merge, _with_adapters_in_params(variables), *args, **kwargs
@@ -180,7 +179,7 @@ class LinenAdapter:
     def kernel_shapes(
         self, variables: Mapping[str, Any], *args: Any, **kwargs: Any
     ) -> dict[str, tuple[int, ...]]:
-        """Kernel shapes [..., *batch, I, O] of dense layers and einsums, by path.
+        """Kernel shapes `[..., *batch, I, O]` of dense layers and einsums, by path.
 
         The arguments are those of the bare model, which is called once to find its layers.
         """
@@ -224,12 +223,10 @@ class LinenAdapter:
         if rule is None or module.has_variable("params", ADAPTER):
             return
         i, method = rule
-        try:
+        with naming("adapt", path):
             layer = layer_call(module, self.einsums, args, kwargs)
             init, key = layer.adapter_init(method), module.make_rng("params")
             params, rest = init_stack(key, init, layer.matrices())
-        except ValueError as error:
-            raise ValueError(f"cannot adapt {path or 'the model'}: {error}") from error
         if method.splits_kernel:
             layer.set_matrices(rest)
         module.put_variable("params", ADAPTER, params)
@@ -243,10 +240,8 @@ class LinenAdapter:
             return
         layer = layer_call(module, self.einsums, args, kwargs)
         matrices = layer.matrices()
-        try:
+        with naming("merge", "/".join(module.path)):
             merged = over_stack(rule[1].merge, matrices)(flax.core.unfreeze(params), matrices)
-        except ValueError as error:
-            raise ValueError(f"cannot merge {'/'.join(module.path)}: {error}") from error
         layer.set_matrices(merged)
         module.put_variable("params", ADAPTER, None)  # a layer called twice is merged once
 
@@ -262,9 +257,7 @@ class LinenAdapter:
                 record.used.add(i)
             full = method is not None and method.trains_base
             if full and path in record.kernels:
-                raise ValueError(
-                    f"{'/'.join(path)} cannot be fully fine-tuned: its layer has an adapter"
-                )
+                raise ValueError(f"{'/'.join(path)} has an adapter and cannot be fully fine-tuned")
             if full:
                 # A copy, since the train step may donate trainable arrays.
                 value = jax.tree.map(lambda v: jnp.array(v, jnp.float32, copy=True), value)
@@ -278,11 +271,8 @@ class LinenAdapter:
             return next_fun(*args, **kwargs)
         params, rule = module.get_variable("params", ADAPTER), self._rule(module)
         if (params is None) != (rule is None):
-            has = "no adapter" if params is None else "an adapter"
-            raise ValueError(
-                f"{'/'.join(module.path)} has {has}, which does not match the rules: create the "
-                "variables using `init` or `attach` with the same rules"
-            )
+            path, has = "/".join(module.path), "no" if params is None else "an"
+            raise ValueError(f"{path} has {has} adapter: `attach` it with the same rules")
         if rule is None:
             return next_fun(*args, **kwargs)
         params, method = flax.core.unfreeze(params), cast(Any, rule[1])
@@ -306,10 +296,10 @@ class _Record:
     """Results of `LinenAdapter._attach` over a model's modules.
 
     Attributes:
-      used: indices of the rules used.
-      layers: paths of supported layers.
-      others: class names of other modules with matrices, by path.
-      kernels: paths of kernels that have an adapter.
+        used: indices of the rules used.
+        layers: paths of supported layers.
+        others: class names of other modules with matrices, by path.
+        kernels: paths of kernels that have an adapter.
     """
 
     used: set[int] = dataclasses.field(default_factory=set)
@@ -319,10 +309,8 @@ class _Record:
 
 
 def _rngs(key: Any) -> dict[str, jax.Array]:
-    """Return PRNG keys by stream name; raise ValueError unless "params" has one."""
-    rngs = dict(key) if isinstance(key, Mapping) else {"params": key}
-    if "params" not in rngs:
-        raise ValueError(f'rngs must have a key for "params", got {sorted(map(str, rngs))}')
+    """PRNG keys by stream name."""
+    rngs = key if isinstance(key, Mapping) else {"params": key}
     return {name: checked_key(value) for name, value in rngs.items()}
 
 
@@ -337,10 +325,8 @@ def _dropout_key(module: nn.Module, method: Method) -> jax.Array | None:
     if not dropout_rate(method) or not module.scope.has_flag(DROPOUT_FLAG):
         return None
     if not module.has_rng("dropout"):
-        raise ValueError(
-            f"{'/'.join(module.path)} has no rngs for its adapter's dropout: add 'dropout' to "
-            "split_rngs of the enclosing scan or vmap"
-        )
+        path = "/".join(module.path)
+        raise ValueError(f"{path} needs 'dropout' in split_rngs of the enclosing scan or vmap")
     return module.make_rng("dropout")
 
 

@@ -1,5 +1,6 @@
 """Locate modules and parameters in a model by path, and match path rules against them."""
 
+import contextlib
 import difflib
 import re
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
@@ -38,6 +39,15 @@ def locate(root: nnx.List[Any], kind: type | tuple[type, ...]) -> list[Location]
                     yield Location("/".join(map(str, (*path, name)[1:])), module, name, child)
 
     return list(walk())
+
+
+@contextlib.contextmanager
+def naming(doing: str, where: object) -> Iterator[None]:
+    """Say in a ValueError what was done and where, such as "adapt" and a layer's path."""
+    try:
+        yield
+    except (ValueError, TypeError, OverflowError) as error:
+        raise ValueError(f"cannot {doing} {where or 'the model'}: {error}") from error
 
 
 def unique(locations: list[Location]) -> list[Location]:
@@ -96,30 +106,17 @@ def check_rules(rules: Any, valid: Callable[[Any], bool], what: str) -> None:
 
     `valid` checks one value; `what` describes valid values in the error message.
     """
-    pairs = f"rules must be a list of (pattern, {what}) pairs"
-    if isinstance(rules, Mapping):
-        raise ValueError(f"{pairs}, got a {type(rules).__name__}: pass list(rules.items())")
-    if not isinstance(rules, Sequence) or isinstance(rules, str) or not rules:
-        shown = "an empty list" if isinstance(rules, list | tuple) else short(rules)
-        raise ValueError(f"{pairs}, got {shown}")
-    if isinstance(rules[0], str):
-        raise ValueError(f"{pairs}, got {short(rules)}: write [(pattern, ...)] for a single rule")
+    expected = f"rules must be a non-empty list of (pattern, {what}) pairs"
+    if not isinstance(rules, list | tuple) or not rules:
+        raise ValueError(f"{expected}, got {short(rules)}")
     for rule in rules:
-        if not isinstance(rule, tuple | list) or len(rule) != 2 or not isinstance(rule[0], str):
-            raise ValueError(f"{pairs}, got the item {short(rule)}")
-        pattern, value = rule
-        if isinstance(value, type):
-            name = value.__name__
-            raise ValueError(f"rule {short(pattern)} has the class {name}: write {name}()")
-        if not valid(value):
-            raise ValueError(f"rule {short(pattern)} must have {what}, got {short(value)}")
+        is_pair = isinstance(rule, tuple | list) and len(rule) == 2 and isinstance(rule[0], str)
+        if not is_pair or not valid(rule[1]):
+            raise ValueError(f"{expected}, got {short(rule)}")
         try:
-            re.compile(pattern)
-        except (re.error, OverflowError, RecursionError) as error:
-            raise ValueError(
-                f"rule {short(pattern)} is not a valid regular expression: "
-                f"{short(str(error))[1:-1]}"
-            ) from error
+            re.compile(rule[0])
+        except re.error as error:
+            raise ValueError(f"{short(rule[0])} is not a regular expression: {error}") from error
 
 
 def check_method_rules(rules: Any) -> None:

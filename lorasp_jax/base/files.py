@@ -20,12 +20,15 @@ from typing import Any
 TEXT_BYTES = 2**30
 """Size limit of files that are read whole; the text for a million episodes takes a tenth of it."""
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
-_FAILURES = (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, ArithmeticError)
-_FAILURES += (RuntimeError,)  # includes RecursionError
-_FAILURES += (ImportError,)  # raised by tfds without TensorFlow
-_FAILURES += (SyntaxError, tokenize.TokenError)  # raised by NumPy when it parses a header
-_FAILURES += (zipfile.BadZipFile, zlib.error, struct.error)
-_KINDS = ((stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a pipe"), (stat.S_ISSOCK, "a socket"))
+_FAILURES = (
+    *(OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, ArithmeticError),
+    *(RuntimeError, zipfile.BadZipFile, zlib.error, struct.error),
+    *(
+        ImportError,
+        SyntaxError,
+        tokenize.TokenError,
+    ),  # of tfds without TensorFlow, of NumPy headers
+)
 
 
 class RefusedError(ValueError):
@@ -38,12 +41,9 @@ def join_inside(folder: Path, name: object) -> Path:
     Raises:
         RefusedError: the name is not a relative path that stays in the folder.
     """
-    if not isinstance(name, str) or not name or "\0" in name:
-        raise RefusedError(f"{folder} refers to {name!r}, which is not a valid file name")
-    if _URL.match(name) or os.path.isabs(name) or ".." in re.split(r"[/\\]", name):
-        raise RefusedError(
-            f"{folder} refers to {name!r}: file names must be relative and stay in the folder"
-        )
+    valid = isinstance(name, str) and name and "\0" not in name and not _URL.match(name)
+    if not valid or os.path.isabs(name) or ".." in re.split(r"[/\\]", name):
+        raise RefusedError(f"{folder} refers to {name!r}: names must stay in the folder")
     return folder / name
 
 
@@ -65,28 +65,12 @@ def check_regular(path: Path, folder: Path | None = None) -> Path:
         RefusedError: it is not a regular file, or is outside of the folder.
         OSError: it is missing or unreadable.
     """
-    real = Path(os.path.realpath(path, strict=True))
-    mode = real.stat().st_mode
-    if not stat.S_ISREG(mode):
-        kind = next((name for test, name in _KINDS if test(mode)), "a device")
-        raise RefusedError(f"{path} must be a file, but is {kind}")
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise RefusedError(f"{path} must be a regular file")
     _check_contained(path, folder)
-    if not os.access(real, os.R_OK):
+    if not os.access(path, os.R_OK):
         raise PermissionError(13, os.strerror(13), str(path))
     return path
-
-
-def path_beside(file: Path, name: object) -> Path:
-    """Return the path of the file `name` in the same folder as `file`; it may be missing.
-
-    Raises:
-        RefusedError: the name leads elsewhere, or to something that is not a regular file.
-        OSError: it is unreadable.
-    """
-    if not isinstance(name, str) or Path(name).name != name or name in ("", "..") or "\0" in name:
-        raise RefusedError(f"{file} refers to {name!r}, which is not a file beside it")
-    path = file.parent / name
-    return check_regular(path) if path.exists() else path
 
 
 def check_only_files(folder: Path, home: Path | None = None) -> None:
@@ -108,24 +92,14 @@ def check_only_files(folder: Path, home: Path | None = None) -> None:
 
 
 def read_bytes(path: Path, folder: Path | None = None) -> bytes:
-    """Read a file after the checks of `check_regular`.
-
-    Raises:
-        RefusedError: as in `check_regular`, or it is larger than `TEXT_BYTES`.
-        OSError: as in `check_regular`.
-    """
+    """Read a file of at most `TEXT_BYTES` after the checks of `check_regular`."""
     if (size := check_regular(path, folder).stat().st_size) > TEXT_BYTES:
         raise RefusedError(f"{path} has {size} bytes; at most {TEXT_BYTES} are allowed")
     return path.read_bytes()
 
 
 def read_text(path: Path, folder: Path | None = None) -> str:
-    """Read a UTF-8 file (see `read_bytes`).
-
-    Raises:
-        RefusedError, OSError: as in `read_bytes`.
-        ValueError: it is not UTF-8.
-    """
+    """Read a UTF-8 file (see `read_bytes`); raise ValueError if it has another encoding."""
     return read_bytes(path, folder).decode()
 
 
@@ -133,14 +107,11 @@ def read_json(path: Path, folder: Path | None = None) -> Any:
     """Read a JSON file (see `read_bytes`).
 
     Raises:
-        RefusedError, OSError: as in `read_bytes`.
-        ValueError: it is not JSON, is nested too deeply, or has a string with a lone surrogate.
+        ValueError: it is not JSON, or has a string with a lone surrogate.
+        RecursionError: it is nested too deeply.
     """
-    try:
-        value = json.loads(read_text(path, folder))
-        json.dumps(value, ensure_ascii=False).encode()  # raises for lone surrogates
-    except RecursionError as error:
-        raise ValueError("its JSON is nested too deeply") from error
+    value = json.loads(read_text(path, folder))
+    json.dumps(value, ensure_ascii=False).encode()  # raises for lone surrogates
     return value
 
 
@@ -175,10 +146,8 @@ def check_memory(size: int, what: object) -> None:
     """Raise RefusedError if `size` bytes exceed the total memory of this machine."""
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if size > memory:
-        raise RefusedError(
-            f"{what} would take {size / 2**30:.3g} GiB of memory, but this machine has "
-            f"{memory / 2**30:.3g} GiB"
-        )
+        gib, total = size / 2**30, memory / 2**30
+        raise RefusedError(f"{what} would take {gib:.3g} GiB of memory; there are {total:.3g} GiB")
 
 
 def as_int(number: Any) -> int:
@@ -197,9 +166,7 @@ def _check_contained(path: Path, folder: Path | None) -> None:
     """Raise RefusedError if a path is outside of a folder once links are resolved."""
     real = Path(os.path.realpath(path))
     if folder is not None and not any(real.is_relative_to(f) for f in _allowed_folders(folder)):
-        raise RefusedError(
-            f"{path} links to {real}, outside of {folder}: copy the file into the folder instead"
-        )
+        raise RefusedError(f"{path} links to {real}, outside of {folder}")
 
 
 def _allowed_folders(folder: Path) -> list[Path]:

@@ -40,13 +40,10 @@ class Keys:
 
     def __post_init__(self) -> None:
         fields.check_fields(self)
-        if not isinstance(self.cameras, Mapping):
-            raise ValueError(f"cameras must be a mapping, name -> feature, got {self.cameras!r}")
-        for name, feature in self.cameras.items():
-            if not isinstance(name, str) or not isinstance(feature, str):
-                raise ValueError(f"cameras must be str -> str, got {name!r} -> {feature!r}")
+        texts = (
+            [*self.cameras, *self.cameras.values()] if isinstance(self.cameras, Mapping) else [0]
+        )
+        if not all(isinstance(text, str) for text in texts):
+            raise ValueError(f"cameras must map names to features, got {self.cameras!r}")
         if self.every < 1 or self.image_size < 0:
-            raise ValueError(
-                f"every must be at least 1 and image_size at least 0, "
-                f"got {self.every} and {self.image_size}"
-            )
+            raise ValueError("every must be at least 1 and image_size at least 0")

@@ -6,7 +6,6 @@
 Source: LeRobot, src/lerobot/datasets/utils.py, at 0.3.3 (2.1) and at 0.6.1 (3.0).
 """
 
-import collections
 import contextlib
 import json
 import math
@@ -18,6 +17,7 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+from PIL import Image
 
 from lorasp_jax.base import files
 from lorasp_jax.base.files import (
@@ -85,19 +85,14 @@ def read_index(folder: Path) -> Index:
         ValueError: the dataset is damaged, or not a LeRobot dataset of a supported version.
     """
     path = folder / "meta" / "info.json"
-    if not path.is_file():
-        raise ValueError(f"{folder} is not a LeRobot dataset: it has no meta/info.json")
     with as_value_error(path):
         info = read_json(path, folder)
         version, fps, features = info["codebase_version"], float(info["fps"]), info["features"]
         videos = [name for name, feature in features.items() if feature["dtype"] == "video"]
         robot = str(info.get("robot_type") or "unknown")
-    if version not in VERSIONS:
-        raise ValueError(
-            f"{path} has version {version!r}; supported versions are {', '.join(VERSIONS)}"
-        )
-    if not 0 < fps < float("inf"):
-        raise ValueError(f"{path}: fps must be positive and finite, got {fps:g}")
+        if version not in VERSIONS or not 0 < fps < math.inf:
+            valid = f"{', '.join(VERSIONS)} and a positive number of"
+            raise ValueError(f"it must have version {valid} fps, got {version} and {fps}")
     read = _read_3 if version == "v3.0" else _read_2
     tasks, episodes = read(folder, info, videos)
     _check(folder, info, episodes)
@@ -161,10 +156,7 @@ def _video_3(
     at = {name: as_int(row[f"videos/{key}/{name}"]) for name in ("chunk_index", "file_index")}
     start = float(row[f"videos/{key}/from_timestamp"])
     if not 0 <= start < math.inf:
-        raise ValueError(
-            f"episode {row['episode_index']} must start at a finite time >= 0 in its {key} video, "
-            f"got {start} s"
-        )
+        raise ValueError(f"episode {row['episode_index']} starts at {start} s in its {key} video")
     return join_inside(folder, _format(info["video_path"], video_key=key, **at)), start
 
 
@@ -183,19 +175,15 @@ def read_table(
     Args:
         path: the file.
         folder: the dataset's folder.
-        columns: columns to read, or None for all.
+        columns: columns to read, without those that are missing, or None for all.
         without: prefix of columns to skip.
 
     Raises:
-        KeyError: a column is missing.
         Exception: any error that `as_value_error` converts.
     """
     with pq.ParquetFile(check_regular(path, folder)) as file:
-        available = file.schema_arrow.names
-        for name in columns or ():
-            if name not in available:
-                raise KeyError(name)
-        selected = [name for name in columns or available if not name.startswith(without)]
+        available = columns or file.schema_arrow.names
+        selected = [name for name in available if not name.startswith(without)]
         check_memory(_size(file.metadata, set(selected)), path)
         return file.read(columns=selected)
 
@@ -213,21 +201,12 @@ def _size(metadata: pq.FileMetaData, columns: set[str]) -> int:
 
 def _check(folder: Path, info: Mapping[str, Any], episodes: Sequence[EpisodeEntry]) -> None:
     """Raise ValueError if episodes are missing, listed twice or empty."""
-    if not episodes:
-        raise ValueError(f"{folder} has no episodes")
-    numbers = collections.Counter(entry.number for entry in episodes)
-    number, times = numbers.most_common(1)[0]
-    if times > 1:
-        raise ValueError(f"{folder} lists episode {number} twice")
-    empty = [entry.number for entry in episodes if entry.length < 1]
-    if empty:
-        raise ValueError(f"episode {empty[0]} of {folder} is empty")
-    frames = sum(entry.length for entry in episodes)
-    for name, listed in (("total_episodes", len(episodes)), ("total_frames", frames)):
-        if info.get(name, listed) != listed:
-            raise ValueError(
-                f"{folder}/meta/info.json has {name} {info[name]}, but the dataset lists {listed}"
-            )
+    lengths = {entry.number: entry.length for entry in episodes}
+    if len(lengths) < max(1, len(episodes)) or min(lengths.values()) < 1:
+        raise ValueError(f"{folder} has no episodes, an empty one, or lists one twice")
+    listed = {"total_episodes": len(lengths), "total_frames": sum(lengths.values())}
+    if any(info.get(name, count) != count for name, count in listed.items()):
+        raise ValueError(f"{folder}/meta/info.json does not match the episodes: {listed}")
 
 
 def _json_lines(path: Path, folder: Path) -> Iterator[dict[str, Any]]:
@@ -235,5 +214,5 @@ def _json_lines(path: Path, folder: Path) -> Iterator[dict[str, Any]]:
 
 
 def as_value_error(path: Path) -> contextlib.AbstractContextManager[None]:
-    """Convert errors like `files.as_value_error`, and those of pyarrow."""
-    return files.as_value_error(path, pa.ArrowException)
+    """Convert errors like `files.as_value_error`, and those of pyarrow and Pillow."""
+    return files.as_value_error(path, pa.ArrowException, Image.DecompressionBombError)

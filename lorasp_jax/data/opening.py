@@ -30,10 +30,7 @@ def open_source(where: str | os.PathLike[str], keys: Keys | None = None) -> Sour
     if is_lerobot(path):
         return LeRobot(path, keys, name=Path(where).name)
     if keys and dataclasses.replace(keys, image_size=0) != Keys():
-        raise ValueError(
-            f"{where} is not a LeRobot dataset: options such as --state, --angles and --every do "
-            "not apply"
-        )
+        raise ValueError(f"{where} is not a LeRobot dataset: --state, --angles etc. do not apply")
     if (path / HEADER).is_file():
         return Cache(path)
     if (path / rlds.METADATA).is_file():

@@ -46,15 +46,11 @@ class Stream:
                 batch.
 
         Raises:
-            ValueError: an argument is out of range, or `batch_size` is not a multiple of the number
-                of processes.
+            ValueError: `batch_size` is not a multiple of the number of processes.
         """
         index, count = process
-        if batch_size < 1 or chunk < 1 or start < 0 or batch_size % count:
-            raise ValueError(
-                f"batch_size must be a positive multiple of {count}, the number of processes, "
-                f"chunk at least 1 and start at least 0; got {batch_size}, {chunk} and {start}"
-            )
+        if batch_size % count:
+            raise ValueError(f"batch_size {batch_size} is no multiple of {count} processes")
         self.position: int = start
 
         share = batch_size // count

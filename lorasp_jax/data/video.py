@@ -12,7 +12,7 @@ import numpy as np
 from av.video.reformatter import VideoReformatter
 from PIL import Image
 
-from lorasp_jax.base.files import check_memory, first_line
+from lorasp_jax.base.files import as_value_error, check_memory
 
 # Allowed containers: FFmpeg would also read playlists, which refer to other files and URLs.
 _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
@@ -37,11 +37,9 @@ class VideoReader:
             ValueError: the file is missing or damaged.
         """
         self.path = path
-        try:
+        with as_value_error(path, av.error.FFmpegError):
             self._container: Any = av.open(f"file:{path}", container_options=_OPTIONS)
             self._stream = self._container.streams.video[0]
-        except (av.error.FFmpegError, OSError, ValueError, IndexError) as error:
-            raise ValueError(f"{path} cannot be read as a video ({first_line(error)})") from error
         self._stream.thread_type = "AUTO"
         self._frames: Iterator[Any] = self._container.decode(self._stream)
         # Shared by all frames: creating a reformatter takes as long as converting a frame.
@@ -73,10 +71,7 @@ class VideoReader:
             frame = self._next(start - tolerance, number, length)
             expected = start + number / fps
             if abs(frame.time - expected) > tolerance:
-                raise ValueError(
-                    f"{self.path} has a frame at {frame.time:.3f} s instead of {expected:.3f} s, "
-                    f"which does not match the dataset's {fps:g} fps"
-                )
+                raise ValueError(f"{self.path} does not have {fps:g} fps at {expected:.3f} s")
             if number % every == 0:
                 rgb = self._reformatter.reformat(frame, format="rgb24", threads=1)
                 image = downscale(rgb.to_ndarray(), image_size)
@@ -90,26 +85,18 @@ class VideoReader:
 
     def _seek(self, start: float) -> None:
         """Seek to the last key frame at or before a time [s]."""
-        try:
+        with as_value_error(self.path, av.error.FFmpegError):
             self._container.seek(round(start / self._stream.time_base), stream=self._stream)
-        except (av.error.FFmpegError, OSError, OverflowError) as error:
-            raise ValueError(
-                f"{self.path} has no frame at {start:g} s ({first_line(error)})"
-            ) from error
         self._frames = self._container.decode(self._stream)
 
     def _next(self, earliest: float, number: int, length: int) -> Any:
         """Decode the next frame at or after a time [s]."""
         self._end = float("nan")  # until `read` succeeds
-        try:
-            return next(frame for frame in self._frames if frame.time >= earliest)
-        except StopIteration:
-            cause = "end of file"
-        except (av.error.FFmpegError, OSError) as error:
-            cause = first_line(error)
-        raise ValueError(
-            f"{self.path} has only {number} of {length} frames of an episode ({cause})"
-        )
+        with as_value_error(self.path, av.error.FFmpegError):
+            for frame in self._frames:
+                if frame.time >= earliest:
+                    return frame
+            raise EOFError(f"it has only {number} of {length} frames of an episode")
 
     def close(self) -> None:
         """Close the file."""
@@ -120,18 +107,13 @@ def decode_image(file: bytes, image_size: int = 0) -> np.ndarray:
     """Decode a PNG or JPEG image to uint8 `[H, W, 3]`, downscaled by `downscale`.
 
     Raises:
-        ValueError: the image is damaged, or larger than Pillow's limit.
+        OSError, SyntaxError, ValueError, DecompressionBombError: the image is damaged, or larger
+            than Pillow's limit.
     """
-    try:
-        with Image.open(io.BytesIO(file), formats=_FORMATS) as image:
-            pixels = image.width * image.height
-            if pixels <= (Image.MAX_IMAGE_PIXELS or math.inf):
-                return downscale(np.asarray(image.convert("RGB")), image_size)
-    except Image.DecompressionBombError as error:
-        raise ValueError(first_line(error)) from error
-    except (OSError, SyntaxError, ValueError) as error:
-        raise ValueError(f"an image is damaged ({first_line(error)})") from error
-    raise ValueError(f"an image must have at most {Image.MAX_IMAGE_PIXELS} pixels, got {pixels}")
+    with Image.open(io.BytesIO(file), formats=_FORMATS) as image:
+        if image.width * image.height > (Image.MAX_IMAGE_PIXELS or math.inf):
+            raise ValueError(f"an image has more than {Image.MAX_IMAGE_PIXELS} pixels")
+        return downscale(np.asarray(image.convert("RGB")), image_size)
 
 
 def downscale(image: np.ndarray, image_size: int) -> np.ndarray:

@@ -131,9 +131,7 @@ class Backbone(nnx.Module):
         for name in cameras:
             if name not in obs.images or obs.images[name].shape[1:] != (size, size, 3):
                 shapes = {camera: image.shape[1:] for camera, image in obs.images.items()}
-                raise ValueError(
-                    f"images of cameras {cameras} must have shape {(size, size, 3)}, got {shapes}"
-                )
+                raise ValueError(f"images of {cameras} must be {(size, size, 3)}, got {shapes}")
         images = jnp.stack([obs.images[name] for name in cameras], axis=1)
         present = jnp.stack([obs.image_masks[name] for name in cameras], axis=1)
         features, aux = self.vision(images.reshape(-1, size, size, 3), present.reshape(-1))

@@ -113,36 +113,24 @@ class BackboneConfig:
 
     def __post_init__(self) -> None:
         _check_sizes(self)
-        language, action = self.language, self.action
-        for name in ("depth", "heads", "kv_heads", "head_dim"):
-            a, b = getattr(language, name), getattr(action, name)
-            if a != b:
-                raise ValueError(
-                    f"{name} of both experts must be equal, because they share attention; "
-                    f"got {a} and {b}"
-                )
-        vision = self.vision
-        side = vision.patch * vision.shuffle
-        if self.image_size % side:
-            raise ValueError(
-                "image_size must be a multiple of vision.patch * vision.shuffle = "
-                f"{side}, got {self.image_size}"
-            )
-        if vision.width % vision.heads:
-            raise ValueError(
-                "vision.width must be a multiple of vision.heads, "
-                f"got {vision.width} and {vision.heads}"
-            )
-        if language.heads % language.kv_heads:
-            raise ValueError(
-                "heads must be a multiple of kv_heads, "
-                f"got {language.heads} and {language.kv_heads}"
-            )
-        if language.head_dim % 2 or action.width % 2:
-            raise ValueError(
-                "head_dim and action.width must be even, "
-                f"got {language.head_dim} and {action.width}"
-            )
+        vision, language, action = self.vision, self.language, self.action
+        shared = [(e.depth, e.heads, e.kv_heads, e.head_dim) for e in (language, action)]
+        rules = {
+            "depth, heads, kv_heads and head_dim of both experts must be equal": (
+                shared[0] == shared[1]
+            ),
+            "image_size must be a multiple of vision.patch * vision.shuffle": (
+                self.image_size % (vision.patch * vision.shuffle) == 0
+            ),
+            "vision.width must be a multiple of vision.heads": vision.width % vision.heads == 0,
+            "heads must be a multiple of kv_heads": language.heads % language.kv_heads == 0,
+            "head_dim and action.width must be even": (
+                language.head_dim % 2 == action.width % 2 == 0
+            ),
+        }
+        for rule, holds in rules.items():
+            if not holds:
+                raise ValueError(rule)
 
     @classmethod
     def miniature(
@@ -193,9 +181,7 @@ class BackboneConfig:
             TypeError, KeyError: missing or unknown fields, or an unknown dtype.
             ValueError: a value of the wrong type, or inconsistent sizes.
         """
-        inputs = fields.get("inputs", {}) if isinstance(fields, dict) else None
-        if not isinstance(inputs, dict):
-            raise TypeError("a config and its inputs must be dicts")
+        inputs = fields.get("inputs", {})
         nested = {
             "vision": VisionConfig(**fields["vision"]),
             "language": ExpertConfig(**fields["language"]),

@@ -8,7 +8,6 @@ A preset is a list of regular expressions over layer paths, as in `lorasp_jax.ad
 stays frozen.
 """
 
-import difflib
 import re
 from collections.abc import Sequence
 
@@ -35,7 +34,6 @@ PRESETS: dict[str, tuple[str, ...]] = {
 """Preset name -> regular expressions over layer paths."""
 
 _PRESET_NAME = re.compile(r"[a-z]+(-[a-z]+)+")  # layer paths contain no hyphens
-_WORD = re.compile(r"[A-Za-z_ -]+")
 
 
 def patterns(targets: str | Sequence[str]) -> list[str]:
@@ -45,24 +43,13 @@ def patterns(targets: str | Sequence[str]) -> list[str]:
         targets: preset names and regular expressions over layer paths, in any combination.
 
     Raises:
-        ValueError: a misspelled or unknown preset name.
+        ValueError: an unknown preset name with a hyphen, which no path contains.
     """
     targets = [targets] if isinstance(targets, str) else targets
     for target in targets:
-        suggestion = _suggestion(target)
-        if target not in PRESETS and (suggestion or _PRESET_NAME.fullmatch(target)):
-            hint = f" (did you mean {suggestion!r}?)" if suggestion else ""
-            raise ValueError(f"unknown preset {target!r}{hint}: choose one of {', '.join(PRESETS)}")
+        if target not in PRESETS and _PRESET_NAME.fullmatch(target):
+            raise ValueError(f"unknown preset {target!r}: choose one of {', '.join(PRESETS)}")
     return [pattern for target in targets for pattern in PRESETS.get(target, (target,))]
-
-
-def _suggestion(target: str) -> str | None:
-    """Find the preset that a target misspells; None for substrings of preset names or patterns."""
-    texts = (text for name, patterns in PRESETS.items() for text in (name, *patterns))
-    if not _WORD.fullmatch(target) or any(target in text for text in texts):
-        return None
-    matches = difflib.get_close_matches(target.lower(), PRESETS, n=1, cutoff=0.8)
-    return matches[0] if matches else None
 
 
 def rules(targets: str | Sequence[str], method: Method | None) -> Rules:

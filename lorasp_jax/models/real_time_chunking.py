@@ -53,10 +53,7 @@ def sample(
     """
     (batch, chunk, dim), size = noise.shape, prefix.shape[1]
     if prefix.shape != (batch, size, dim) or not 1 <= size <= chunk:
-        raise ValueError(
-            f"the prefix must have shape ({batch}, P, {dim}) with P from 1 to {chunk}, "
-            f"got {prefix.shape}"
-        )
+        raise ValueError(f"prefix must be ({batch}, 1 to {chunk}, {dim}), got {prefix.shape}")
     previous = jnp.pad(prefix.astype(jnp.float32), ((0, 0), (0, chunk - size), (0, 0)))
     options = {"num_steps": num_steps, "slots": slots}
     if guidance is not None:

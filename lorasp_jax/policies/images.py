@@ -11,10 +11,8 @@ def to_unit(name: str, image: jax.Array) -> jax.Array:
         ValueError: wrong dtype or shape; the message names the camera.
     """
     if image.dtype != jnp.uint8 or image.ndim != 4 or image.shape[-1] != 3:
-        raise ValueError(
-            f"the image of camera {name!r} must be uint8 [B, H, W, 3], "
-            f"got {image.dtype} {image.shape}"
-        )
+        got = f"{image.dtype} {image.shape}"
+        raise ValueError(f"images of {name!r} must be uint8 [B, H, W, 3], got {got}")
     return image.astype(jnp.float32) / 127.5 - 1
 
 

@@ -77,12 +77,8 @@ def unnormalize(
 
 def _affine_map(stats: Mapping[str, jax.Array], mode: Mode, convention: Convention) -> _AffineMap:
     needed = BOUNDS.get(mode, ("mean", "std"))
-    missing = [name for name in needed if name not in stats]
-    if missing:
-        raise ValueError(
-            f"normalization {mode!r} requires the statistics {', '.join(needed)}, "
-            f"got {', '.join(stats) or 'none'}"
-        )
+    if not stats.keys() >= {*needed}:
+        raise ValueError(f"{mode!r} needs the statistics {needed}, got {[*stats]}")
     first, second = (stats[name] for name in needed)
     spread = second if mode == "mean_std" else second - first
     if convention == "openpi":

@@ -83,10 +83,7 @@ def encode(texts: Sequence[str], max_tokens: int) -> tuple[np.ndarray, np.ndarra
         if not 0 < len(tokens) <= max_tokens:
             raise ValueError(f"{text!r} must have 1 to {max_tokens} tokens, got {len(tokens)}")
         if VOCABULARY["[UNK]"] in tokens:
-            raise ValueError(
-                f"cannot encode {text!r}: the offline tokenizer supports only ASCII characters and "
-                "words of up to 100 characters"
-            )
+            raise ValueError(f"cannot encode {text!r}: only ASCII words up to 100 characters")
         ids[row, : len(tokens)] = tokens
         valid[row, : len(tokens)] = True
     return ids, valid

@@ -54,10 +54,7 @@ def camera_slots(
     """
     unknown = sorted(robot.keys() - set(cameras))
     if unknown or not robot:
-        raise ValueError(
-            f"the keys of cameras must be one or more of the backbone's cameras "
-            f"({', '.join(cameras)}), got {', '.join(unknown) or 'none'}"
-        )
+        raise ValueError(f"cameras must map some of {cameras} to the robot's, got {robot}")
     return tuple((name, robot.get(name)) for name in cameras)
 
 
@@ -81,10 +78,7 @@ def to_absolute(actions: jax.Array, state: jax.Array, mask: Sequence[bool]) -> j
 def check_delta(mask: Sequence[bool], num_joints: int) -> None:
     """Raise ValueError if a delta mask is longer than the robot's action vector."""
     if len(mask) > num_joints + 1:
-        raise ValueError(
-            f"the delta mask has {len(mask)} entries, but the robot's actions have "
-            f"{num_joints + 1}: the weights belong to a different robot"
-        )
+        raise ValueError(f"delta mask has {len(mask)} entries, the actions {num_joints + 1}")
 
 
 def _offset(actions: jax.Array, state: jax.Array, mask: Sequence[bool]) -> jax.Array:
@@ -191,10 +185,7 @@ class Processor:
         sources = dict(self.cameras) or {name: name for name in raw["image"]}
         missing = sorted({name for name in sources.values() if name} - set(raw["image"]))
         if missing:
-            raise ValueError(
-                f"the observation must contain camera {', '.join(missing)}, "
-                f"got {', '.join(raw['image']) or 'none'}"
-            )
+            raise ValueError(f"the observation lacks camera {missing[0]}, got {[*raw['image']]}")
         prompt = self.prompts.encode(instruction, state[:, np.array(self.robot_slots)])
         black = jnp.full((len(state), self.image_size, self.image_size, 3), -1.0)
         return Observation(

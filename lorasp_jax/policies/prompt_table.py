@@ -55,7 +55,7 @@ class PromptTable:
     @classmethod
     def of(
         cls,
-        words: Tokenizer,
+        tokenizer: Tokenizer,
         instructions: Sequence[str],
         config: BackboneConfig,
         *,
@@ -64,7 +64,7 @@ class PromptTable:
         """Tokenize the instructions for a backbone.
 
         Args:
-            words: the tokenizer that belongs to the backbone's weights.
+            tokenizer: the tokenizer that belongs to the backbone's weights.
             instructions: P strings.
             config: the backbone's config; if `inputs.prompt_state`, prompts contain the state.
             num_joints: J, the robot's number of joints.
@@ -74,14 +74,13 @@ class PromptTable:
                 vocabulary, or merges state values with their neighbors.
         """
         if config.inputs.prompt_state:
-            table = _with_state(words, instructions, config.max_tokens, num_joints + 1)
+            table = _with_state(tokenizer, instructions, config.max_tokens, num_joints + 1)
         else:
-            table = cls(_ids(*words.encode(instructions, config.max_tokens)))
+            table = cls(_ids(*tokenizer.encode(instructions, config.max_tokens)))
         max_id = max(int(leaf.max()) for leaf in jax.tree.leaves(table))
         if max_id >= config.vocabulary:
             raise ValueError(
-                f"token {max_id} is beyond the backbone's vocabulary of {config.vocabulary}: "
-                "the tokenizer belongs to a different model"
+                f"the tokenizer has token {max_id}, the backbone's vocabulary {config.vocabulary}"
             )
         return dataclasses.replace(table, instructions=tuple(instructions))
 
@@ -115,11 +114,11 @@ class PromptTable:
         start = Ids(*(jnp.asarray(array)[rows] for array in self.start))
         return dataclasses.replace(self, start=start, instructions=())
 
-    def with_instructions(self, words: Tokenizer, instructions: Sequence[str]) -> "PromptTable":
+    def with_instructions(self, tokenizer: Tokenizer, instructions: Sequence[str]) -> "PromptTable":
         """Return a table of other instructions, as long as these.
 
         Args:
-            words: the tokenizer that the table was made with.
+            tokenizer: the tokenizer that the table was made with.
             instructions: P strings.
 
         Raises:
@@ -127,10 +126,10 @@ class PromptTable:
         """
         max_tokens = self.start.ids.shape[1]
         if self.numbers is None:
-            start = words.encode(instructions, max_tokens)
+            start = tokenizer.encode(instructions, max_tokens)
         else:
             starts = [prompts.pi05_start(text) for text in instructions]
-            ids, mask = _encode_complete(words, starts, max_tokens)
+            ids, mask = _encode_complete(tokenizer, starts, max_tokens)
             start = ids[:, :max_tokens], mask[:, :max_tokens]
         return dataclasses.replace(self, start=_ids(*start), instructions=tuple(instructions))
 
@@ -189,10 +188,7 @@ def _check_merges(
     table = PromptTable(start, numbers, last)
     actual = table.encode(jnp.asarray(instruction), jnp.asarray(state))
     if not all(np.array_equal(a, b) for a, b in zip(actual, expected, strict=True)):
-        raise ValueError(
-            "cannot tabulate prompts that contain the state: the tokenizer merges state values "
-            "with their neighbors; use the backbone's own tokenizer"
-        )
+        raise ValueError("the tokenizer merges state values: use the backbone's own tokenizer")
 
 
 def _bin_centers(bins: np.ndarray) -> np.ndarray:

@@ -3,12 +3,14 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from lorasp_jax.base.digest import DIGEST, verify_digest, with_digest
+from lorasp_jax.base.files import as_value_error
 from lorasp_jax.policies.normalization import MIN_SPREAD
 
 NAMES = ("mean", "std", "min", "max", "q01", "q99", "q10", "q90")
@@ -80,9 +82,7 @@ class Statistics:
         """
         check_slots(slots, dim, len(slots))
         if self.dim < len(slots):
-            raise ValueError(
-                f"statistics must have {len(slots)} or more dimensions, got {self.dim}"
-            )
+            raise ValueError(f"statistics need {len(slots)} dimensions, got {self.dim}")
 
         def move(stats: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
             moved = {name: np.full(dim, _UNUSED[name], np.float32) for name in stats}
@@ -111,19 +111,11 @@ class Statistics:
             ValueError: invalid content, or the digest does not match.
         """
         both: dict[str, dict[str, np.ndarray]] = {"state": {}, "action": {}}
-        try:
+        with as_value_error(Path("this JSON of statistics")), np.errstate(over="ignore"):
             content = json.loads(text)
             for key, values in (verify_digest(content) if DIGEST in content else content).items():
                 kind, _, name = key.partition("_")
-                with np.errstate(over="ignore"):  # overflows to inf, which is rejected below
-                    both[kind][name] = np.asarray(values, np.float32)
-        except (
-            AttributeError, KeyError, TypeError, ValueError, OverflowError, RecursionError
-        ) as error:  # fmt: skip
-            raise ValueError(
-                f"statistics must be lists of numbers named state_NAME and action_NAME, got "
-                f"{text[:80]!r} ({error})"
-            ) from error
+                both[kind][name] = np.asarray(values, np.float32)  # `validate` refuses overflows
         return validate(both, "this JSON")
 
 
@@ -135,20 +127,14 @@ def validate(both: Mapping[str, Mapping[str, np.ndarray]], source: str) -> Stati
             finite, or a negative standard deviation; the message names `source`.
     """
     arrays = [array for stats in both.values() for array in stats.values()]
-    unknown = sorted({name for stats in both.values() for name in stats} - set(NAMES))
-    inconsistent = any(array.ndim != 1 or array.shape != arrays[0].shape for array in arrays)
-    if unknown or inconsistent or not all(both.values()):
-        problem = (
-            f"has {unknown[0]!r}" if unknown else "lacks a list or has lists of unequal length"
-        )
-        raise ValueError(
-            f"statistics must be lists of equal length for state and for action, named "
-            f"{', '.join(NAMES)}; {source} {problem}"
-        )
-    if not all(np.isfinite(array).all() for array in arrays):
-        raise ValueError(f"statistics in {source} must be finite; they may never have been set")
-    if any((stats.get("std", np.zeros(1)) < 0).any() for stats in both.values()):
-        raise ValueError(f"statistics in {source} have a negative standard deviation")
+    names = {name for stats in both.values() for name in stats}
+    if not (all(both.values()) and names <= set(NAMES)):
+        raise ValueError(f"{source} must have state and action statistics among {', '.join(NAMES)}")
+    if any(array.ndim != 1 or array.shape != arrays[0].shape for array in arrays):
+        raise ValueError(f"statistics in {source} must be lists of equal length")
+    negative = any((stats.get("std", np.zeros(1)) < 0).any() for stats in both.values())
+    if negative or not all(np.isfinite(array).all() for array in arrays):
+        raise ValueError(f"statistics in {source} must be finite, and no std negative")
     state, action = (
         {name: jnp.asarray(array, jnp.float32) for name, array in both[kind].items()}
         for kind in ("state", "action")
@@ -159,9 +145,7 @@ def validate(both: Mapping[str, Mapping[str, np.ndarray]], source: str) -> Stati
 def check_slots(slots: Sequence[int], dim: int, length: int) -> None:
     """Raise ValueError unless `slots` are `length` distinct slots below `dim`."""
     if len(slots) != length or len(set(slots)) != length or not all(0 <= s < dim for s in slots):
-        raise ValueError(
-            f"slots must be {length} distinct integers from 0 to {dim - 1}, got {tuple(slots)}"
-        )
+        raise ValueError(f"slots must be {length} distinct integers below {dim}, got {slots}")
 
 
 def _measure(rows: np.ndarray) -> dict[str, jax.Array]:

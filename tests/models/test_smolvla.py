@@ -91,9 +91,9 @@ def test_base_has_the_published_tensors(base):
 
 def test_inconsistent_sizes_raise():
     language, action = (dataclasses.replace(e, depth=3) for e in (CONFIG.language, CONFIG.action))
-    with pytest.raises(ValueError, match=r"depth must be even, .* got 3"):
+    with pytest.raises(ValueError, match="depth"):
         dataclasses.replace(CONFIG, language=language, action=action)
-    with pytest.raises(ValueError, match=r"image_size must be a multiple of .* = 16, got"):
+    with pytest.raises(ValueError, match="image_size"):
         dataclasses.replace(CONFIG, image_size=40)
 
 

@@ -121,7 +121,7 @@ def test_save_and_load_with_the_original_base(name, tmp_path):
 @SPLIT
 def test_replacing_a_split_adapter_requires_merging(name):
     adapted = adaptation.adapt(model(), [("layer", lora(name))], rngs=nnx.Rngs(0))
-    with pytest.raises(ValueError, match=r"the layer already has a lora adapter: .* merge"):
+    with pytest.raises(ValueError, match="already has a lora adapter: merge"):
         adaptation.adapt(adapted, [("layer", LoRA(rank=2))], rngs=nnx.Rngs(0))
     adaptation.adapt(adaptation.merge(adapted), [("layer", LoRA(rank=2))], rngs=nnx.Rngs(0))
 

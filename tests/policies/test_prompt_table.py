@@ -37,15 +37,15 @@ def test_select_reorders_instructions():
     assert table.rows(TEXTS[::-1]).tolist() == [2, 1]
     jax.tree.map(np.testing.assert_array_equal, table.select(TEXTS[::-1]), subset)
     assert (subset.encode(rows, state).ids != table.encode(rows, state).ids).any()
-    with pytest.raises(ValueError, match="the policy has no prompt for 'close the lid'"):
+    with pytest.raises(ValueError, match="'close the lid'"):
         table.select([TEXTS[0], "close the lid"])
 
 
-@pytest.mark.parametrize("words", ["paligemma_like.model", SMOLVLM.name, ""])
+@pytest.mark.parametrize("file", ["paligemma_like.model", SMOLVLM.name, ""])
 @pytest.mark.parametrize("numbers", [1, 7])
-def test_prompts_with_state_equal_the_tokenizers(words, numbers):
+def test_prompts_with_state_equal_the_tokenizers(file, numbers):
     """States include the bin edges and values outside [-1, 1]."""
-    words = tokenizer.load_tokenizer(words and GOLDEN / words)
+    words = tokenizer.load_tokenizer(file and GOLDEN / file)
     config = dataclasses.replace(PI05, max_tokens=100, vocabulary=words.vocabulary)
     table = PromptTable.of(words, TEXTS, config, num_joints=numbers - 1)
     rng = np.random.default_rng(1)
@@ -70,7 +70,7 @@ def test_long_prompts_are_truncated_like_the_tokenizer():
     actual = table.encode(jnp.array([0]), jnp.asarray(state[None]))
     assert actual.mask.all()
     np.testing.assert_array_equal(actual.ids, expected[0])
-    with pytest.raises(ValueError, match="must have 1 to 35 tokens"):
+    with pytest.raises(ValueError, match="35 tokens"):
         PromptTable.of(tokenizer.Offline(), TEXTS, config, num_joints=6)
 
 
@@ -81,12 +81,12 @@ def test_tokenizers_that_merge_numbers_are_rejected(merged, tmp_path):
     fields["added_tokens"].append({"id": 400, "content": merged, **flags})
     (tmp_path / "tokenizer.json").write_text(json.dumps(fields))
     config = dataclasses.replace(PI05, max_tokens=100, vocabulary=401)
-    with pytest.raises(ValueError, match="merges state values with their neighbors"):
+    with pytest.raises(ValueError, match="merges"):
         PromptTable.of(tokenizer.load_tokenizer(tmp_path), TEXTS, config, num_joints=6)
 
 
 @pytest.mark.parametrize("config", [Pi0Config.nano(), dataclasses.replace(PI05, max_tokens=100)])
 def test_tokenizer_of_a_different_model(config):
     words = tokenizer.load_tokenizer(SMOLVLM)
-    with pytest.raises(ValueError, match=r"token \d+ is beyond the backbone's vocabulary of 320"):
+    with pytest.raises(ValueError, match="vocabulary 320"):
         PromptTable.of(words, ["press the red button"], config, num_joints=6)

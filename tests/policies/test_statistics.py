@@ -39,9 +39,9 @@ def test_measure_ignores_padding(slots):
     unused = np.setdiff1d(np.arange(DIM), slots)
     assert (measured.state["std"][unused] == 1).all()
     assert (measured.state["q01"][unused] == -1).all()
-    with pytest.raises(ValueError, match="at least one valid step"):
+    with pytest.raises(ValueError, match="valid step"):
         Statistics.measure(state, state, valid & False, slots=slots, dim=DIM)
-    with pytest.raises(ValueError, match=r"slots must be [78] distinct integers from 0 to 7"):
+    with pytest.raises(ValueError, match="slots"):
         Statistics.measure(state, state, valid, slots=slots[:-1], dim=DIM)
 
 
@@ -66,7 +66,7 @@ def test_json_may_have_only_moments():
 )
 def test_invalid_json_raises(change):
     content = {f"{k}_{n}": [0.0, 1.0] for k in ("state", "action") for n in NAMES[:2]}
-    with pytest.raises(ValueError, match="statistics must be lists of"):
+    with pytest.raises(ValueError, match="statistics"):
         Statistics.from_json(json.dumps({**content, **change} if change else {}))
 
 
@@ -76,5 +76,5 @@ def test_to_slots_reorders_and_drops_padding():
     statistics = long.to_slots(PIPER, DIM)
     assert statistics.state["min"].tolist() == [0, 1, 2, 3, 4, 5, -1, 6]
     assert statistics.state["mean"].tolist() == [4.5, 5.5, 6.5, 7.5, 8.5, 9.5, 0, 10.5]
-    with pytest.raises(ValueError, match="must have 10 or more dimensions, got 9"):
+    with pytest.raises(ValueError, match="10 dimensions, got 9"):
         long.to_slots(range(10), 32)

@@ -131,7 +131,7 @@ def test_the_error_for_a_missing_base_suggests_a_remedy(tmp_path, monkeypatch):
         export.load_policy("run")
     assert export.load_policy("run", base="moved").model
     models.save("moved", random_backbone(Pi0Config.dummy(), seed=1))
-    with pytest.raises(ValueError, match="was trained on a different base"):
+    with pytest.raises(ValueError, match="another base"):
         export.load_policy("run", base="moved")
     assert export.load_policy("run", base="moved", any_base=True).model
 

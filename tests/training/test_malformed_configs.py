@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from lorasp_jax.training.overrides import parse
-from tests.malformed import ROOT, check_refusal
+from tests import ROOT
+from tests.malformed import check_refusal
 
 OPTIONS = {
     "optim.steps": [

@@ -87,7 +87,7 @@ def test_an_incompatible_tokenizer_is_rejected_before_collection(config, tmp_pat
     with pytest.raises(ValueError, match="demonstrations with different instructions"):
         setup._collect(Run(config, tmp_path, console, "", 0), ["press the red button"], collect)
     fail = lambda *_: pytest.fail("it collects")  # noqa: E731
-    with pytest.raises(ValueError, match="beyond the backbone's vocabulary of 320: "):
+    with pytest.raises(ValueError, match="vocabulary 320"):
         prepare(other, tmp_path, collect=fail)
 
 

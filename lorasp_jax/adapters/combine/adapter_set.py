@@ -24,7 +24,7 @@ from lorasp_jax.peft.method import Params
 
 
 class AdapterChoice(nnx.Variable[Any]):
-    """Weights of a layer's A adapters: f32 [..., A], or [..., B, A] for B examples."""
+    """Weights of a layer's A adapters: f32 `[..., A]`, or `[..., B, A]` for B examples."""
 
 
 class AdapterSetParam(nnx.Param[Any]):
@@ -37,8 +37,8 @@ class NamedAdapters(nnx.Module):
     In stacked layers, all arrays have the leading axes of the stack.
 
     Attributes:
-      choice: the weights.
-      params: all other parameters.
+        choice: the weights.
+        params: all other parameters.
     """
 
     def __init__(self, params: Params, choice: jax.Array) -> None:
@@ -55,11 +55,11 @@ class AdapterSet(Method):
     """Weighted sum of A adapters.
 
     Parameters:
-      choice: w, f32 [A], or [B, A] with a row per example. Inputs then have k B rows, with k
-        contiguous rows per example.
-      bank: K LoRAs padded to one rank R: lora_a [I, K, R], lora_b [K, R, O], scale f32 [K] and rank
-        int32 [K]. The rank is 0 for an adapter that the layer does not have.
-      others: parameters of the other adapters, by name.
+        choice: w, f32 `[A]`, or `[B, A]` with a row per example. Inputs then have k B rows, with k
+            contiguous rows per example.
+        bank: K LoRAs padded to one rank R: lora_a [I, K, R], lora_b [K, R, O], scale f32 [K] and
+            rank int32 `[K]`. The rank is 0 for an adapter that the layer does not have.
+        others: parameters of the other adapters, by name.
     """
 
     names: tuple[str, ...]
@@ -85,7 +85,7 @@ class AdapterSet(Method):
         return any(method.down_in_fp32 for method in self.others.values())
 
     def down(self, params: Params) -> jax.Array:
-        """Down-projections [I, ...] of the bank and the other additive adapters, concatenated."""
+        """Down-projections `[I, ...]` of the bank and the other additive adapters, concatenated."""
         bank = params["bank"]["lora_a"]
         return jnp.concatenate(
             [bank.reshape(len(bank), -1), *self._other_matrices(params, "down")], axis=1
@@ -114,7 +114,7 @@ class AdapterSet(Method):
         return jnp.concatenate(z, axis=-1), Aux(jnp.broadcast_to(rank, rows.shape[:-1]))
 
     def up(self, params: Params) -> jax.Array:
-        """Up-projections [..., O] of the bank and the other additive adapters, concatenated."""
+        """Up-projections `[..., O]` of the bank and the other additive adapters, concatenated."""
         bank = params["bank"]["lora_b"]
         return jnp.concatenate(
             [bank.reshape(-1, bank.shape[-1]), *self._other_matrices(params, "up")]
@@ -128,7 +128,7 @@ class AdapterSet(Method):
         *,
         token_mask: jax.Array | None = None,
     ) -> tuple[jax.Array, Aux]:
-        """Compute x @ kernel + Σ_i w_i Δ_i(x), [...tokens, O]; arguments as for `Method.apply`.
+        """Compute x @ kernel + Σ_i w_i Δ_i(x), `[...tokens, O]`; arguments as for `Method.apply`.
 
         The active rank is the sum over adapters with non-zero weight.
         """
@@ -159,12 +159,10 @@ class AdapterSet(Method):
         """Compute W + Σ_i w_i ΔW_i in fp32.
 
         Raises:
-          ValueError: the weights are per example, or a delta depends on the input.
+            ValueError: the weights are per example, or a delta depends on the input.
         """
         if params["choice"].ndim > 1:
-            raise ValueError(
-                "cannot merge adapters chosen per example: choose one for the whole batch first"
-            )
+            raise ValueError("adapters are chosen per example: choose one for the batch first")
         base, bank = kernel.astype(jnp.float32), params["bank"]
         weights = dict(zip(self.names, params["choice"], strict=True))
         scale = bank["scale"] * _stack([weights[name] for name in self.bank_names])
@@ -178,16 +176,14 @@ class AdapterSet(Method):
         if choice.ndim > 1:
             examples, rows = len(choice), x.shape[0] if x.ndim > 1 else 1
             if rows % examples:
-                raise ValueError(
-                    f"adapters were chosen for {examples} examples, but a layer got {rows} rows"
-                )
+                raise ValueError(f"adapters for {examples} examples do not fit {rows} rows")
             choice = jnp.repeat(choice, rows // examples, axis=0)
             choice = choice.reshape(rows, *(1 for _ in x.shape[1:-1]), -1)
         return {name: choice[..., i] for i, name in enumerate(self.names)}
 
 
 def empty_bank(size: int, rank: int, shape: tuple[int, ...]) -> Params:
-    """Create a bank with `size` empty slots for LoRAs up to `rank`, for kernels [..., I, O]."""
+    """Create a bank with `size` empty slots for LoRAs up to `rank`, for kernels `[..., I, O]`."""
     *leading, d_in, d_out = shape
     return {
         "lora_a": jnp.zeros((*leading, d_in, size, rank)),
@@ -201,14 +197,12 @@ def set_slot(bank: Params, slot: int, method: LoRA | None, params: Params) -> Pa
     """Store a LoRA in a slot of the bank, or clear the slot if method is None.
 
     Raises:
-      ValueError: the LoRA's rank exceeds the bank's.
+        ValueError: the LoRA's rank exceeds the bank's.
     """
     bank, rank = dict(bank), 0 if method is None else method.rank
     capacity = bank["lora_a"].shape[-1]
     if rank > capacity:
-        raise ValueError(
-            f"LoRA rank {rank} exceeds the maximum rank {capacity}: combine with a larger rank"
-        )
+        raise ValueError(f"LoRA rank {rank} exceeds {capacity}: combine with a larger rank")
     a, b = bank["lora_a"].at[..., slot, :].set(0), bank["lora_b"].at[..., slot, :, :].set(0)
     if method is not None:
         a = a.at[..., slot, :rank].set(params["lora_a"])
@@ -237,5 +231,5 @@ def _active_rank(weight: jax.Array, aux: Aux) -> jax.Array:
 
 
 def _stack(values: list[jax.Array]) -> jax.Array:
-    """Stack weights [..., K]; K may be 0."""
+    """Stack weights `[..., K]`; K may be 0."""
     return jnp.stack(values, axis=-1) if values else jnp.zeros(0)

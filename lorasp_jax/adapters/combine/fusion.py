@@ -14,7 +14,6 @@ from lorasp_jax.adapters.combine import named
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdaptedLayer, AdapterParam, validate
 from lorasp_jax.peft import FullFineTuning, LoRA
-from lorasp_jax.peft.fields import short
 from lorasp_jax.peft.method import Params
 
 
@@ -22,10 +21,10 @@ class FusedAdapters(NamedTuple):
     """A model with one LoRA per layer, and the approximation errors.
 
     Attributes:
-      model: adapted with plain LoRA of scale 1.
-      errors: relative error ‖ΔW − ΔW'‖ / ‖ΔW‖ by path, where ΔW is the weighted sum and ΔW' the
-        delta of the fused LoRA. The Frobenius norm is taken over all layers of a stack. For
-        isotropic inputs, this is also the relative RMS error of x ΔW'.
+        model: adapted with plain LoRA of scale 1.
+        errors: relative error ‖ΔW − ΔW'‖ / ‖ΔW‖ by path, where ΔW is the weighted sum and ΔW' the
+            delta of the fused LoRA. The Frobenius norm is taken over all layers of a stack. For
+            isotropic inputs, this is also the relative RMS error of x ΔW'.
     """
 
     model: nnx.Module
@@ -38,22 +37,18 @@ def fuse(
     """Fuse LoRAs of a combined model into one LoRA that computes their weighted sum.
 
     Args:
-      model: from `combine`; not modified.
-      weights: weight of each LoRA by name; may be negative.
-      rank: maximum rank of the fused LoRA in each layer. If the LoRAs' ranks add up to more, the
-        result is the best approximation of that rank. None keeps the sum, so the result is exact.
+        model: from `combine`; not modified.
+        weights: weight of each LoRA by name; may be negative.
+        rank: maximum rank of the fused LoRA in each layer. If the LoRAs' ranks add up to more, the
+            result is the best approximation of that rank. None keeps the sum, so the result is
+            exact.
 
     Raises:
-      ValueError: as for `choose`, or weights is empty, rank is below 1, or a named adapter is not
-        plain LoRA.
+        ValueError: as for `choose`, or rank is below 1, or a named adapter is not plain LoRA.
     """
     if rank is not None:
         validate.size("rank", rank)
-    if not isinstance(weights, Mapping) or not weights:
-        raise ValueError(
-            f"weights must be a non-empty mapping from name to weight, got {short(weights)}"
-        )
-    named.weights(model, weights)  # raises for an unknown name or an invalid weight
+    named.weights(model, weights)  # raises for an unknown name
     fused, errors = {}, {}
     for path, _, _, layer in named.adapter_sets(model):
         factors = []
@@ -77,13 +72,14 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
     Fully fine-tuned weights, such as biases, are taken from the adapted model and are trainable.
 
     Args:
-      merged: from `merge`; not modified.
-      adapted: model with the adapters; its base is not used. For saved adapters that do not split
-        kernels, pass `load_adapters(folder, merged, any_base=True)`.
+        merged: from `merge`; not modified.
+        adapted: model with the adapters; its base is not used. For saved adapters that do not split
+            kernels, pass `load_adapters(folder, merged, any_base=True)`.
 
     Raises:
-      ValueError: the merged model has adapters, lacks a layer or has one of a different class, the
-        adapted model is from `combine`, or a method cannot be merged or is not additive (DoRA).
+        ValueError: the merged model has adapters, lacks a layer or has one of a different class,
+            the adapted model is from `combine`, or a method cannot be merged or is not additive
+            (DoRA).
     """
     validate.with_values(merged)
     if named.adapter_sets(validate.with_values(adapted)):
@@ -98,10 +94,8 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
     def unmerge_layer(location: paths.Location) -> AdaptedLayer | None:
         if location.path not in adapters:
             return None
-        try:
+        with paths.naming("unmerge", location.path):
             return _unmerged_layer(location.child, adapters[location.path])
-        except (ValueError, TypeError) as error:
-            raise ValueError(f"cannot unmerge {location.path}: {error}") from error
 
     modules = paths.locate(root, nnx.Module)
     paths.replace(modules, unmerge_layer)

@@ -12,8 +12,6 @@ an argument. The only exception is the first change between a shared and a per-e
 `swap(model, "pour", other)` replaces it. For the math, see `combine.adapter_set`.
 """
 
-import math
-import numbers
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias, TypeGuard
 
@@ -37,7 +35,7 @@ from lorasp_jax.adapters.paths import Location
 from lorasp_jax.dense import AdaptedLayer, AdapterParam, validate
 from lorasp_jax.peft import LoRA, Method
 from lorasp_jax.peft.fields import short
-from lorasp_jax.peft.method import MAX_SIZE, Params
+from lorasp_jax.peft.method import Params
 
 Selection: TypeAlias = str | Mapping[str, float] | None
 AdaptedLayers: TypeAlias = dict[str, AdaptedLayer]
@@ -51,22 +49,17 @@ def combine(models: Mapping[str, Model], *, rank: int | None = None) -> Model:
     are adapted. The result has no trainable parameters.
 
     Args:
-      models: models by name, adapted from the same base; not modified. The result shares the base.
-        A model without adapters reserves an empty slot for `swap`.
-      rank: LoRA rank to reserve in each layer. None reserves the largest that any model has there.
+        models: models by name, adapted from the same base; not modified. The result shares the
+            base. A model without adapters reserves an empty slot for `swap`.
+        rank: LoRA rank to reserve in each layer. None reserves the largest that any model has
+            there.
 
     Raises:
-      ValueError: there are no models, their bases differ, base weights are trainable, an adapter
-        splits its kernel, or the rank of a LoRA exceeds `rank`.
+        ValueError: there are no models, their bases differ, base weights are trainable, an adapter
+            splits its kernel, or the rank of a LoRA exceeds `rank`.
     """
-    if not isinstance(models, Mapping) or not models or not all(map(_is_text, models)):
-        raise ValueError("models must be a non-empty mapping from name (str) to model")
-    for model in models.values():
-        validate.with_values(model)
-    if rank is not None and not (type(rank) is int and 0 <= rank <= MAX_SIZE):
-        raise ValueError(
-            f"rank must be an integer from 0 to {MAX_SIZE}, or None, got {short(rank)}"
-        )
+    if not models:
+        raise ValueError("models must have at least one model")
     adapter_names = tuple(models)
     bases = {name: strip_adapters(model) for name, model in models.items()}
     adapters = {name: adapters_by_path(name, model) for name, model in models.items()}
@@ -91,13 +84,13 @@ def choose(model: Model, choice: Selection | Sequence[Selection] | jax.Array | n
     [B * cameras, ...], each example's rows must be contiguous.
 
     Args:
-      model: from `combine`; not modified, the result shares its arrays.
-      choice: a name, weights by name, or None for the base; a sequence of these, one per example of
-        the batch; or an array from `weights`, f32 [A] or [B, A].
+        model: from `combine`; not modified, the result shares its arrays.
+        choice: a name, weights by name, or None for the base; a sequence of these, one per example
+            of the batch; or an array from `weights`, f32 `[A]` or `[B, A]`.
 
     Raises:
-      ValueError: the model has no named adapters, a name is unknown (the message lists near
-        misses), or an array has the wrong shape.
+        ValueError: the model has no named adapters, a name is unknown (the message lists near
+            misses), or an array has the wrong shape.
     """
     chosen = weights(model, choice)
     model = nnx.clone(model)
@@ -111,7 +104,7 @@ def choose(model: Model, choice: Selection | Sequence[Selection] | jax.Array | n
 def weights(
     model: nnx.Module, choice: Selection | Sequence[Selection] | jax.Array | np.ndarray
 ) -> jax.Array:
-    """Convert a choice to an f32 array [A] or [B, A], for jitted functions that call `choose`.
+    """Convert a choice to an f32 array `[A]` or `[B, A]`, for jitted functions that call `choose`.
 
     See `choose` for the arguments and errors.
     """
@@ -120,26 +113,11 @@ def weights(
         array = choice
     elif choice is None or isinstance(choice, str | Mapping):
         array = np.array(_weight_row(adapter_names, choice))
-    elif isinstance(choice, Sequence) and all(
-        selection is None or isinstance(selection, str | Mapping) for selection in choice
-    ):
-        array = np.array([_weight_row(adapter_names, selection) for selection in choice])
     else:
-        raise ValueError(
-            "choice must be a name, a mapping from names to weights, None, or a list of these, got "
-            f"{short(choice)}"
-        )
+        array = np.array([_weight_row(adapter_names, selection) for selection in choice])
     size = len(adapter_names)
-    if (
-        array.ndim not in (1, 2)
-        or array.shape[-1] != size
-        or not len(array)
-        or array.dtype.kind != "f"
-    ):
-        raise ValueError(
-            f"weights must be a floating-point array [{size}] or [B, {size}], got "
-            f"{array.dtype} {array.shape}"
-        )
+    if array.ndim not in (1, 2) or array.shape[-1] != size or not len(array):
+        raise ValueError(f"weights must be [{size}] or [B, {size}], got {array.shape}")
     return jnp.asarray(array, jnp.float32)
 
 
@@ -147,7 +125,7 @@ def names(model: nnx.Module) -> tuple[str, ...]:
     """Names of a combined model's adapters, in the order of their weights.
 
     Raises:
-      ValueError: the model has no named adapters.
+        ValueError: the model has no named adapters.
     """
     for location in adapter_sets(model):
         return location.child.method.names
@@ -160,12 +138,12 @@ def extract(model: Model, name: str | None) -> Model:
     The result can be trained, saved and merged. A LoRA's alpha becomes scale · rank.
 
     Args:
-      model: from `combine`; not modified.
-      name: the adapter; None returns the base without adapters.
+        model: from `combine`; not modified.
+        name: the adapter; None returns the base without adapters.
 
     Raises:
-      ValueError: the model has no named adapters, or the name is unknown (the message lists near
-        misses).
+        ValueError: the model has no named adapters, or the name is unknown (the message lists near
+            misses).
     """
     adapter_names, result = names(model), strip_adapters(model)
     if name is None:
@@ -186,9 +164,9 @@ def with_adapters(
     """Attach adapters to the base's layers, in place.
 
     Args:
-      base: from `strip_adapters`.
-      adapters: by path, a template layer that supports the adapter, the method (None for no
-        adapter) and the parameters.
+        base: from `strip_adapters`.
+        adapters: by path, a template layer that supports the adapter, the method (None for no
+            adapter) and the parameters.
     """
 
     def make_adapted(location: Location) -> AdaptedLayer | None:
@@ -211,12 +189,12 @@ def swap(model: Model, name: str, other: nnx.Module) -> Model:
     only be replaced by ones with the same method and settings. The current choice is kept.
 
     Args:
-      model: from `combine`; not modified.
-      name: the adapter to replace; the new one takes this name.
-      other: model adapted from the same base.
+        model: from `combine`; not modified.
+        name: the adapter to replace; the new one takes this name.
+        other: model adapted from the same base.
 
     Raises:
-      ValueError: as for `combine`, or the adapter does not fit the slot.
+        ValueError: as for `combine`, or the adapter does not fit the slot.
     """
     validate.with_values(other)
     index, adapters = index_of(names(model), name), adapters_by_path(name, other)
@@ -244,7 +222,7 @@ def strip_adapters(model: Model) -> Model:
     """Copy the model without its adapters, sharing the base; trainable base weights stay trainable.
 
     Raises:
-      ValueError: an adapter split its kernel.
+        ValueError: an adapter split its kernel.
     """
     root = nnx.List([nnx.merge(*adaptation.split(model))])
 
@@ -252,10 +230,7 @@ def strip_adapters(model: Model) -> Model:
         if location.child.adapter is None:
             return None
         if location.child.method.splits_kernel:
-            raise ValueError(
-                f"the adapter of {location.path} split the kernel, so the original base is not "
-                "available: merge the adapter first"
-            )
+            raise ValueError(f"the adapter of {location.path} split the kernel: merge it first")
         return location.child.without_adapter()
 
     paths.replace(paths.locate(root, AdaptedLayer), strip)
@@ -266,15 +241,13 @@ def adapters_by_path(name: str, model: nnx.Module) -> AdaptedLayers:
     """Adapted layers of the model called `name`, by path.
 
     Raises:
-      ValueError: base weights are trainable, or the model is already combined.
+        ValueError: base weights are trainable, or the model is already combined.
     """
     if adapter_sets(model):
         raise ValueError(f"{name} is already a combined model: extract one adapter first")
     layers = single_adapters(model)
     if extra := sorted(adaptation.methods(model).keys() - layers.keys()):
-        raise ValueError(
-            f"{name} also trains the base weight {extra[0]}; only adapters can be combined"
-        )
+        raise ValueError(f"{name} also trains {extra[0]}; only adapters can be combined")
     return layers
 
 
@@ -325,10 +298,6 @@ def _combined_layer(
     return layer
 
 
-def _is_text(name: Any) -> bool:
-    return isinstance(name, str)
-
-
 def _fits_bank(method: Method | None) -> TypeGuard[LoRA | None]:
     """Whether the adapter belongs in the bank of LoRAs: plain LoRA, or no adapter."""
     return method is None or type(method) is LoRA
@@ -353,10 +322,6 @@ def _weight_row(adapter_names: tuple[str, ...], selection: Selection) -> list[fl
     row = [0.0] * len(adapter_names)
     chosen = {selection: 1.0} if isinstance(selection, str) else selection or {}
     for name, weight in chosen.items():
-        if not isinstance(weight, numbers.Real) or not math.isfinite(weight):
-            raise ValueError(
-                f"the weight of {short(name)} must be a finite number, got {short(weight)}"
-            )
         row[index_of(adapter_names, name)] = float(weight)
     return row
 

@@ -23,7 +23,6 @@ from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdapterAux, AdapterParam, validate
 from lorasp_jax.kernels.frozen_matmul import frozen_matmul
-from lorasp_jax.peft.fields import short
 from lorasp_jax.peft.method import Aux, Method, Params
 
 Forward = Callable[[Any, Any], Any]
@@ -43,14 +42,14 @@ class Layer:
     """The argument of a report function: one layer call with one kernel matrix.
 
     Attributes:
-      method: the layer's method, or None.
-      params: the adapter's parameters, or {}.
-      x: [...tokens, I].
-      kernel: [I, O].
-      y: [...tokens, O], without bias.
-      reference_y: [...tokens, O], output with the reference adapter, or None.
-      aux: the method's aux.
-      valid: bool [...tokens].
+        method: the layer's method, or None.
+        params: the adapter's parameters, or {}.
+        x: `[...tokens, I]`.
+        kernel: `[I, O]`.
+        y: `[...tokens, O]`, without bias.
+        reference_y: `[...tokens, O]`, output with the reference adapter, or None.
+        aux: the method's aux.
+        valid: bool `[...tokens]`.
     """
 
     method: Method | None
@@ -63,7 +62,7 @@ class Layer:
     valid: jax.Array
 
     def rows(self, array: jax.Array) -> jax.Array:
-        """Reshape [...tokens, n] to f32 [T, n], with invalid tokens zeroed."""
+        """Reshape `[...tokens, n]` to f32 `[T, n]`, with invalid tokens zeroed."""
         array = jnp.where(self.valid[..., None], array, 0).astype(jnp.float32)
         return array.reshape(-1, array.shape[-1])
 
@@ -122,36 +121,26 @@ def observe(
     """Sum the reports of the given layers over batches.
 
     Args:
-      model: not modified.
-      batches: inputs of `forward`; use one shape to avoid recompilation.
-      reports: report functions by layer path; see `paths.locate_matmul_layers`.
-      forward: how to call the model.
-      references: reference adapters by layer path, for `Layer.reference_y`.
+        model: not modified.
+        batches: inputs of `forward`; use one shape to avoid recompilation.
+        reports: report functions by layer path; see `paths.locate_matmul_layers`.
+        forward: how to call the model.
+        references: reference adapters by layer path, for `Layer.reference_y`.
 
     Returns:
-      Sums by path, including "tokens", the number of valid tokens. All sums have the leading axes
-      of the layer's kernel matrices: those of a scanned stack and the batch axes of an einsum.
+        Sums by path, including "tokens", the number of valid tokens. All sums have the leading axes
+        of the layer's kernel matrices: those of a scanned stack and the batch axes of an einsum.
 
     Raises:
-      ValueError: there are no batches or no valid tokens, values are not finite, a layer was not
-        called, its aux was not returned by `forward`, or it has a custom matmul or precision.
+        ValueError: there are no batches or no valid tokens, values are not finite, a layer was not
+            called, its aux was not returned by `forward`, or it has a custom matmul or precision.
     """
-    if not isinstance(batches, Iterable) or isinstance(batches, str | Mapping):
-        raise ValueError(f"batches must be an iterable of inputs, got {short(batches)}")
-    if not callable(forward):
-        raise ValueError(f"forward must be callable (model, batch), got {short(forward)}")
     step = _make_step(_make_observed(model, reports, references), forward)
     total: dict[str, Sums] = {}
     for batch in batches:
-        for leaf in jax.tree.leaves(batch):
-            if not isinstance(leaf, jax.Array | np.ndarray | np.generic | float | int):
-                raise ValueError(f"batch leaves must be arrays or numbers, got {short(leaf)}")
         _add(total, step(batch))
     if missing := sorted(reports.keys() - total.keys()):
-        raise ValueError(
-            f"no statistics for {paths.near_misses(missing[0], missing)}: every layer must be "
-            "called, and `forward` must return any aux that the model returns"
-        )
+        raise ValueError(f"no statistics for {missing[0]}: `forward` must call it and return aux")
     for path, sums in total.items():
         if not np.any(sums["tokens"]):
             raise ValueError(f"the batches have no valid tokens for {path or 'the model'}")
@@ -194,10 +183,8 @@ def _make_observed(
         path = location.path
         if path not in reports:
             continue
-        try:
+        with paths.naming("observe", path):
             layer = nnx_layers.make_adaptable(location.child, {})
-        except ValueError as error:
-            raise ValueError(f"cannot observe {path}: {error}") from error
         paths.set_child(location, layer)
         if layer.adapter is None:
             adaptation.attach(layer, Observed(path, None, reports[path]), jax.random.key(0))
@@ -230,13 +217,13 @@ def _add(total: dict[str, Sums], more: Any) -> None:
 def input_moments(
     model: nnx.Module, batches: Iterable[Any], pattern: str = ".*", forward: Forward = call
 ) -> dict[str, jax.Array]:
-    """Uncentered second moments Σ x xᵀ of layer inputs, f32 [..., I, I] by path.
+    """Uncentered second moments Σ x xᵀ of layer inputs, f32 `[..., I, I]` by path.
 
     LoRA's initialization "eva" requires them in `adapt(..., statistics=...)`. Covers dense layers
     and einsums whose path matches the pattern; third-party einsum layers must already be adapted.
 
     Raises:
-      ValueError: as for `observe`, or the pattern matches no dense layer or einsum.
+        ValueError: as for `observe`, or the pattern matches no dense layer or einsum.
     """
     paths.check_rules([(pattern, None)], lambda _: True, "None")
     layer_paths = [
@@ -245,8 +232,7 @@ def input_moments(
     ]
     reports = {path: second_moment for path in layer_paths if re.search(pattern, path)}
     if not reports:
-        close = paths.near_misses(pattern, layer_paths) or "none"
-        raise ValueError(f"{short(pattern)} matches no dense layer or einsum; available: {close}")
+        raise ValueError(paths.no_match_message(pattern, layer_paths, {}))
     sums_by_path = observe(model, batches, reports, forward)
     return {path: sums["moment"] for path, sums in sums_by_path.items()}
 

@@ -27,10 +27,10 @@ class Compaction(NamedTuple):
     """Ranks of the smaller adapters, and their errors on the calibration set.
 
     Attributes:
-      ranks: required rank by path, int [...], one per layer of a stack.
-      layer_errors: relative error ‖Δy‖ / ‖y‖ of each layer's output y by path, f32 [...]. The bias
-        is not part of y, and the norms are over valid tokens.
-      output_error: relative error ‖Δy‖ / ‖y‖ over all outputs y of the model.
+        ranks: required rank by path, int `[...]`, one per layer of a stack.
+        layer_errors: relative error ‖Δy‖ / ‖y‖ of each layer's output y by path, f32 `[...]`. The
+            bias is not part of y, and the norms are over valid tokens.
+        output_error: relative error ‖Δy‖ / ‖y‖ over all outputs y of the model.
     """
 
     ranks: dict[str, np.ndarray]
@@ -42,7 +42,7 @@ def lora_sp_layers(model: nnx.Module) -> dict[str, Any]:
     """Layers with a LoRA-SP adapter, by path.
 
     Raises:
-      ValueError: the model has no such layers, or has shapes without values.
+        ValueError: the model has no such layers, or has shapes without values.
     """
     locations = paths.locate(nnx.List([validate.with_values(model)]), AdaptedLayer)
     layers = {p.path: p.child for p in locations if isinstance(p.child.method, BankMethod)}

@@ -18,7 +18,6 @@ from lorasp_jax.adapters.compress.compaction import (
     replace_adapters,
 )
 from lorasp_jax.peft import LoRA
-from lorasp_jax.peft.fields import short
 from lorasp_jax.peft.method import Params
 
 
@@ -36,25 +35,24 @@ def distill(
     ignores that the scores in ΔW(x) x depend on the same x.
 
     Args:
-      model: not modified.
-      batches: calibration set. The update is zero along input directions that do not occur in it,
-        for instance if it has fewer tokens than a layer has input features.
-      rank: LoRA rank. None uses the bank's rank, which also caps `rank`, because a larger rank
-        could not reduce the error.
-      forward: how to call the model on a batch; see `lorasp_jax.adapters.compress.calibration`.
+        model: not modified.
+        batches: calibration set. The update is zero along input directions that do not occur in it,
+            for instance if it has fewer tokens than a layer has input features.
+        rank: LoRA rank. None uses the bank's rank, which also caps `rank`, because a larger rank
+            could not reduce the error.
+        forward: how to call the model on a batch; see `lorasp_jax.adapters.compress.calibration`.
 
     Raises:
-      ValueError: rank is below 1, or the model has no LoRA-SP layers.
+        ValueError: rank is below 1, or the model has no LoRA-SP layers.
     """
-    if rank is not None and not (type(rank) is int and rank >= 1):
-        raise ValueError(f"rank must be an integer of at least 1, or None, got {short(rank)}")
     layers = lora_sp_layers(model)
     sums = calibration.observe(model, batches, dict.fromkeys(layers, _regression_sums), forward)
     replacements: Replacements = {}
     ranks = {}
     for path, layer in layers.items():
         kernel = layer.kernel_matrices()
-        r = min(rank or layer.method.rank, layer.method.rank, *kernel.shape[-2:])
+        largest = min(layer.method.rank, *kernel.shape[-2:])
+        r = largest if rank is None else min(rank, largest)
         fit = adaptation.over_stack(functools.partial(_fitted, rank=r), kernel)
         u = adaptation.over_stack(layer.method.up, kernel)(layer.adapter.get_value())
         params = fit(sums[path]["xx"], sums[path]["xz"], u)
@@ -72,7 +70,7 @@ def _regression_sums(layer: Layer) -> Sums:
 
 
 def _fitted(xx: jax.Array, xz: jax.Array, u: jax.Array, *, rank: int) -> Params:
-    """A [I, r] and B [r, O] that minimize Σ ‖z U - x A B‖² over the calibration set.
+    """A `[I, r]` and B `[r, O]` that minimize Σ ‖z U - x A B‖² over the calibration set.
 
     The full-rank optimum is M = (Σ x xᵀ)⁻¹ (Σ x zᵀ) U. The rank-r optimum projects M onto the r
     leading right singular vectors of the fitted outputs X M, where the rows of X are the inputs

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import numbers
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,7 +19,6 @@ from lorasp_jax.adapters.compress.compaction import (
     replace_adapters,
 )
 from lorasp_jax.peft import Method
-from lorasp_jax.peft.fields import short
 from lorasp_jax.peft.lora_sp.bank import BankMethod
 from lorasp_jax.peft.lora_sp.gpu_kernel import supported_size
 from lorasp_jax.peft.method import Params
@@ -44,25 +42,21 @@ def prune(
     of a stack keep as many directions as the one that needs most.
 
     Args:
-      model: not modified; the result shares its frozen arrays and can be trained further.
-      batches: calibration set.
-      tolerance: in [0, 1). With 0, outputs on the calibration set do not change.
-      rank: number of directions to keep in each layer, the most used ones, instead of a tolerance;
-        at least 1. A smaller bank keeps all of its directions.
-      for_kernel: keep more directions, 16, 32, 64, ... in all, as the fused kernel on NVIDIA GPUs
-        needs; without it, a smaller bank can be slower.
-      forward: how to call the model on a batch; see `lorasp_jax.adapters.compress.calibration`.
+        model: not modified; the result shares its frozen arrays and can be trained further.
+        batches: calibration set.
+        tolerance: in [0, 1). With 0, outputs on the calibration set do not change.
+        rank: number of directions to keep in each layer, the most used ones, instead of a
+            tolerance; at least 1. A smaller bank keeps all of its directions.
+        for_kernel: keep more directions, 16, 32, 64, ... in all, as the fused kernel on NVIDIA GPUs
+            needs; without it, a smaller bank can be slower.
+        forward: how to call the model on a batch; see `lorasp_jax.adapters.compress.calibration`.
 
     Raises:
-      ValueError: tolerance is outside [0, 1), rank is not a positive integer or given together
-        with a tolerance, or the model has no LoRA-SP layers.
+        ValueError: tolerance is outside [0, 1), rank is not a positive integer or given together
+            with a tolerance, or the model has no LoRA-SP layers.
     """
-    if not (isinstance(tolerance, numbers.Real) and 0 <= tolerance < 1):
-        raise ValueError(f"tolerance must be in [0, 1), got {short(tolerance)}")
-    if rank is not None and not (type(rank) is int and rank >= 1 and tolerance == 0):
-        raise ValueError(
-            f"rank must be an integer of at least 1, without a tolerance, got {short(rank)}"
-        )
+    if not 0 <= tolerance < 1 or (rank is not None and (rank < 1 or tolerance)):
+        raise ValueError(f"set a tolerance in [0, 1) or a rank > 0, got {tolerance} and {rank}")
     layers = lora_sp_layers(model)
     sums = calibration.observe(model, batches, dict.fromkeys(layers, _usage), forward)
     replacements: Replacements = {}

@@ -27,7 +27,6 @@ from lorasp_jax.dense import AdaptedLayer, AdapterParam, Dense, validate
 from lorasp_jax.kernels.frozen_matmul import uses_float8
 from lorasp_jax.kernels.platform import multiplies_float8
 from lorasp_jax.kernels.quantized_weights import KINDS, Kind, QuantizedKernel, quantize_kernel
-from lorasp_jax.peft.fields import short
 
 # (id of a variable, equation, kind) -> (quantized variable, original variable, error). Storing the
 # original keeps its id valid.
@@ -38,10 +37,11 @@ class QuantizationResult(NamedTuple):
     """A model with quantized kernels, and the quantization errors.
 
     Attributes:
-      model: with quantized kernels.
-      errors: relative error ‖W − Ŵ‖ / ‖W‖ of the quantized kernel Ŵ by path, in the Frobenius norm
-        over all layers of a stack. For isotropic inputs, this is also the relative RMS error of the
-        layer's output, without bias. NaN while JAX traces, as inside `nnx.eval_shape`.
+        model: with quantized kernels.
+        errors: relative error ‖W − Ŵ‖ / ‖W‖ of the quantized kernel Ŵ by path, in the Frobenius
+            norm over all layers of a stack. For isotropic inputs, this is also the relative RMS
+            error of the layer's output, without bias. NaN while JAX traces, as inside
+            `nnx.eval_shape`.
     """
 
     model: nnx.Module
@@ -52,14 +52,14 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
     """Quantize the kernels of dense layers and einsums by path rules.
 
     Args:
-      model: not modified; the result shares all other arrays.
-      rules: (pattern, kind) pairs, where kind is "float8", "int8", "nf4" or None. As for `adapt`,
-        the first match wins, and None skips the path. Rules apply to `Dense`, `nnx.Linear`,
-        `nnx.LinearGeneral`, `nnx.Einsum` and adapted layers of other einsum classes.
+        model: not modified; the result shares all other arrays.
+        rules: (pattern, kind) pairs, where kind is "float8", "int8", "nf4" or None. As for `adapt`,
+            the first match wins, and None skips the path. Rules apply to `Dense`, `nnx.Linear`,
+            `nnx.LinearGeneral`, `nnx.Einsum` and adapted layers of other einsum classes.
 
     Raises:
-      ValueError: a rule applies to no layer (the message lists near misses), a kind is unknown, or
-        a kernel is trainable, already quantized or not finite.
+        ValueError: a rule applies to no layer (the message lists near misses), a kind is unknown,
+            or a kernel is trainable, already quantized or not finite.
     """
     kinds = " or ".join(map(repr, (*KINDS, None)))
     paths.check_rules(rules, lambda kind: kind in (*KINDS, None), kinds)
@@ -73,18 +73,13 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
             continue
         used.add(matching[0])
         if (kind := matching[0][1]) is not None:
-            try:
+            with paths.naming("quantize", location.path):
                 layer, errors[location.path] = _quantize_layer(location.child, kind, shared)
-            except ValueError as error:
-                raise ValueError(f"cannot quantize {location.path}: {error}") from error
             paths.set_child(location, layer)
     for rule in rules:
         if rule not in used:
-            close = paths.near_misses(rule[0], [location.path for location in layers]) or "none"
-            raise ValueError(
-                f"rule {short(rule[0])} applies to nothing; available dense layers and einsums: "
-                f"{close}"
-            )
+            available = [location.path for location in layers]
+            raise ValueError(paths.no_match_message(rule[0], available, {}))
     return QuantizationResult(root[0], errors)
 
 

@@ -1,7 +1,7 @@
 """Load and save Hugging Face PEFT adapter folders: LoRA, rsLoRA, DoRA and pruned AdaLoRA.
 
 A folder has adapter_config.json and adapter_model.safetensors, with tensors named
-base_model.model.<module>.lora_A.weight etc., in torch's layout [out, in] (format of PEFT 0.21.2).
+base_model.model.<module>.lora_A.weight etc., in torch's layout `[out, in]` (format of PEFT 0.21.2).
 """
 
 import collections
@@ -20,7 +20,6 @@ import safetensors.numpy
 from flax import nnx
 
 from lorasp_jax.adapters import adaptation, paths
-from lorasp_jax.adapters.io.native import write_atomic
 from lorasp_jax.adapters.io.peft_folders import CONFIG, PREFIX, TENSORS, Adapter, read_folder
 from lorasp_jax.adapters.io.peft_full import (
     Names,
@@ -29,6 +28,7 @@ from lorasp_jax.adapters.io.peft_full import (
     full_parameters,
 )
 from lorasp_jax.adapters.layers import nnx_layers
+from lorasp_jax.base.writing import write_bytes, write_text
 from lorasp_jax.dense import AdaptedLayer, AdapterParam, validate
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA
 from lorasp_jax.peft.fields import short
@@ -39,25 +39,19 @@ def dotted(path: str, index: tuple[int, ...]) -> str:
     """Default module name, for models whose attribute names match torch's.
 
     Raises:
-      ValueError: the layer is in a stack, so its name cannot be guessed.
+        ValueError: the layer is in a stack, so its name cannot be guessed.
     """
     if index:
-        raise ValueError(
-            f"{path} is a stack of layers: pass names=, a function (path, index) -> module name"
-        )
+        raise ValueError(f"{path} is a stack: pass names=, a function (path, index) -> name")
     return path.replace("/", ".")
 
 
 def checked_names(names: Names) -> Names:
-    """Wrap `names` to raise ValueError for invalid and duplicate names."""
-    if not callable(names):
-        raise ValueError(f"names must be callable (path, index) -> str, got {short(names)}")
+    """Wrap `names` to raise ValueError for duplicate names."""
     layer_of: dict[str, tuple[str, tuple[int, ...]]] = {}
 
     def checked(path: str, index: tuple[int, ...]) -> str:
         name = names(path, index)
-        if not isinstance(name, str) or not name:
-            raise ValueError(f"names{(path, index)} must return a non-empty str, got {short(name)}")
         if (first := layer_of.setdefault(name, (path, index))) != (path, index):
             raise ValueError(f"names returns {short(name)} for both {first} and {(path, index)}")
         return name
@@ -81,16 +75,16 @@ def load_peft(
     methods' `dropout`, which is active only under `with_dropout`.
 
     Args:
-      folder: local folder with adapter_config.json and adapter_model.safetensors, or a Hub
-        repository hf://owner/name, from which only these two files are downloaded.
-      model: not modified; its adapters on other layers are kept.
-      names: function (path, index) -> module name; index is the position in a scanned stack, or ().
-        By default, "a/0/b" becomes "a.0.b".
-      einsums: as for `adapt`.
+        folder: local folder with adapter_config.json and adapter_model.safetensors, or a Hub
+            repository hf://owner/name, from which only these two files are downloaded.
+        model: not modified; its adapters on other layers are kept.
+        names: function (path, index) -> module name; index is the position in a scanned stack, or
+            (). By default, "a/0/b" becomes "a.0.b".
+        einsums: as for `adapt`.
 
     Raises:
-      ValueError: files are missing or damaged, the adapter type is not supported, the model lacks a
-        module, or an adapter does not fit its layer.
+        ValueError: files are missing or damaged, the adapter type is not supported, the model lacks
+            a module, or an adapter does not fit its layer.
     """
     nnx_layers.check_einsums(einsums)
     root = nnx.List([validate.module(model)])
@@ -120,16 +114,17 @@ def match_folder(
     """Match a PEFT folder against a model's layers and parameters.
 
     Args:
-      folder: as for `load_peft`.
-      shapes: shape [..., I, O] of the kernel matrices of each layer, by path.
-      sizes: shape of each parameter, by path.
-      names: as for `load_peft`.
+        folder: as for `load_peft`.
+        shapes: shape `[..., I, O]` of the kernel matrices of each layer, by path.
+        sizes: shape of each parameter, by path.
+        names: as for `load_peft`.
 
     Returns:
-      Rules for `adapt`, the adapters' parameters by path, and the fully trained parameters by path.
+        Rules for `adapt`, the adapters' parameters by path, and the fully trained parameters by
+        path.
 
     Raises:
-      ValueError: as for `load_peft`.
+        ValueError: as for `load_peft`.
     """
     folder, names = _local_folder(folder), checked_names(names)
     config, modules, full = read_folder(folder)
@@ -178,20 +173,18 @@ def save_peft(
     AdaLoRA is saved as the equivalent LoRA, without pruned directions.
 
     Args:
-      folder: created if absent; an adapter in it is replaced.
-      model: adapted with LoRA, AdaLoRA or both, or with DoRA only. Fully fine-tuned parameters
-        become PEFT's `bias` and `modules_to_save`.
-      names: as for `load_peft`.
-      base: value of base_model_name_or_path.
+        folder: created if absent; an adapter in it is replaced.
+        model: adapted with LoRA, AdaLoRA or both, or with DoRA only. Fully fine-tuned parameters
+            become PEFT's `bias` and `modules_to_save`.
+        names: as for `load_peft`.
+        base: value of base_model_name_or_path.
 
     Raises:
-      ValueError: there are no adapters, PEFT does not support one of them, LoRA and DoRA are mixed,
-        or the dropout rates differ.
+        ValueError: there are no adapters, PEFT does not support one of them, LoRA and DoRA are
+            mixed, or the dropout rates differ.
     """
     folder, names = validate.folder(folder), checked_names(names)
     validate.with_values(model)
-    if not isinstance(base, str | None):
-        raise ValueError(f"base must be the base model's name (str), got {short(base)}")
     layers = _supported_layers(model)
     use_dora, lora_dropout = _common_settings([layer.method for layer in layers.values()])
     modules = {
@@ -209,8 +202,8 @@ def save_peft(
     config |= {"use_dora": use_dora, "lora_dropout": lora_dropout}
     folder.mkdir(parents=True, exist_ok=True)
     data = safetensors.numpy.save(tensors | full_values, {"format": "pt"})
-    write_atomic(folder / TENSORS, data)
-    write_atomic(folder / CONFIG, json.dumps(config, indent=2).encode())
+    write_bytes(folder / TENSORS, data)
+    write_text(folder / CONFIG, json.dumps(config, indent=2))
 
 
 def _supported_layers(model: nnx.Module) -> dict[str, AdaptedLayer]:
@@ -221,37 +214,26 @@ def _supported_layers(model: nnx.Module) -> dict[str, AdaptedLayer]:
     for location in paths.locate(nnx.List([model]), AdaptedLayer):
         if location.path in adapted:
             if isinstance(location.child, nnx_layers.LoRALayer):
-                raise ValueError(
-                    f"{location.path} is neither dense nor an einsum, so PEFT cannot store it"
-                )
+                raise ValueError(f"PEFT cannot store {location.path}: not dense and no einsum")
             layers[location.path] = location.child
     return layers
 
 
 def _common_settings(methods: Collection[Any]) -> tuple[bool, float]:
     """`use_dora` and `lora_dropout`; raise ValueError unless all methods agree on both."""
-    use_dora = {isinstance(method, DoRA) for method in methods}
-    rates = {dropout_rate(method) for method in methods}
-    if len(use_dora) != 1:
-        raise ValueError("a PEFT folder needs at least one adapter and cannot mix LoRA and DoRA")
-    if len(rates) != 1:
-        raise ValueError(
-            f"PEFT stores a single lora_dropout, but the adapters have {sorted(rates)}: set a "
-            "common rate with layer.method = dataclasses.replace(layer.method, dropout=0.1)"
-        )
-    return use_dora.pop(), rates.pop()
+    settings = {(isinstance(method, DoRA), dropout_rate(method)) for method in methods}
+    if len(settings) != 1:
+        raise ValueError(f"PEFT needs one use_dora and lora_dropout, got {sorted(settings)}")
+    return settings.pop()
 
 
 def _check_fits(folder: pathlib.Path, module: str, adapter: Adapter, d_in: int, d_out: int) -> None:
-    """Raise ValueError unless the adapter's shapes match a kernel [I, O]."""
+    """Raise ValueError unless the adapter's shapes match a kernel `[I, O]`."""
     a, b = adapter["lora_a"].shape, adapter["lora_b"].shape
     rank = a[-1]
     magnitude = adapter.get("magnitude", np.empty(d_out)).shape
     if (a, b, magnitude) != ((d_in, rank), (rank, d_out), (d_out,)):
-        raise ValueError(
-            f"{folder}: adapter shapes {a} and {b} of {module} do not match the {d_in}x{d_out} "
-            "kernel of the model"
-        )
+        raise ValueError(f"{folder}: {module} has shapes {a} and {b} for a {d_in}x{d_out} kernel")
 
 
 def _check_used(
@@ -261,10 +243,8 @@ def _check_used(
     if not modules:
         raise ValueError(f"{folder} contains no adapters")
     if unused:
-        close = paths.near_misses(min(unused), candidates)
-        raise ValueError(
-            f"{folder} adapts {short(min(unused))}, which the model lacks; the model has {close}"
-        )
+        name, close = min(unused), paths.near_misses(min(unused), candidates)
+        raise ValueError(f"{folder} adapts {short(name)}, which the model lacks; it has {close}")
 
 
 def _stacked(adapters: list[Adapter], leading: list[int]) -> tuple[float, Adapter]:
@@ -289,10 +269,7 @@ def _is_supported(path: str, method: Any) -> bool:
     if not isinstance(method, LoRA | AdaLoRA):
         raise ValueError(f"{path} uses {method.name}, which Hugging Face PEFT does not support")
     if method.splits_kernel:
-        raise ValueError(
-            f"the adapter of {path} split the kernel, so it cannot be used with another base: "
-            "merge the adapter instead"
-        )
+        raise ValueError(f"the adapter of {path} split the kernel: merge it instead")
     return True
 
 

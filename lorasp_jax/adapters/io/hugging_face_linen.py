@@ -27,19 +27,19 @@ def load_peft_linen(
     """Load the adapters of a Hugging Face PEFT folder into a Linen model.
 
     Args:
-      folder: as for `hugging_face.load_peft`.
-      model: any Linen module.
-      variables: variables of the bare model, with "params"; not modified.
-      *args: the model's call arguments; the model is called to find its layers.
-      names: as for `hugging_face.load_peft`.
-      einsums: as for `LinenAdapter`.
-      **kwargs: the model's call arguments.
+        folder: as for `hugging_face.load_peft`.
+        model: any Linen module.
+        variables: variables of the bare model, with "params"; not modified.
+        *args: the model's call arguments; the model is called to find its layers.
+        names: as for `hugging_face.load_peft`.
+        einsums: as for `LinenAdapter`.
+        **kwargs: the model's call arguments.
 
     Returns:
-      (adapter, variables) for `adapter.apply(variables, ...)`.
+        (adapter, variables) for `adapter.apply(variables, ...)`.
 
     Raises:
-      ValueError: as for `hugging_face.load_peft`.
+        ValueError: as for `hugging_face.load_peft`.
     """
     bare = LinenAdapter(model, [(".*", None)], einsums)
     shapes = bare.kernel_shapes(variables, *args, **kwargs)

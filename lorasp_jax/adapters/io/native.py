@@ -21,22 +21,30 @@ import safetensors.numpy
 from flax import nnx
 
 from lorasp_jax import peft
-from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.layers import nnx_layers
-from lorasp_jax.base import digest
+from lorasp_jax.base import digest, json_values
+from lorasp_jax.base.files import (
+    RefusedError,
+    as_value_error,
+    check_memory,
+    check_regular,
+    read_json,
+)
+from lorasp_jax.base.writing import write_bytes, write_text
 from lorasp_jax.dense import AdapterParam, validate
 from lorasp_jax.peft import Method, to_settings
-from lorasp_jax.peft.fields import short
 
 TENSORS, DESCRIPTION = "adapter.safetensors", "adapter.json"
 FORMAT, VERSION = "lorasp_jax adapter", 2
-FIELDS: dict[str, type] = {
+FIELDS: dict[str, Any] = {
     "base": str,
-    "weights": dict,
+    "weights": {str: str},
     "sha256": str,
-    "methods": dict,
-    "metadata": dict,
+    "methods": {str: {}},
+    "metadata": {},
 }
+"""Schema of the JSON, see `json_values.check`."""
 
 
 def save_adapters(
@@ -51,23 +59,20 @@ def save_adapters(
     Each file is written atomically.
 
     Args:
-      folder: created if absent; an adapter in it is replaced.
-      model: an adapted model.
-      base: optional name of the base, in addition to the fingerprints of its weights.
-      metadata: any JSON-serializable dict with str keys.
+        folder: created if absent; an adapter in it is replaced.
+        model: an adapted model.
+        base: optional name of the base, in addition to the fingerprints of its weights.
+        metadata: any JSON-serializable dict with str keys.
 
     Raises:
-      ValueError: the model has no trainable parameters, or metadata does not round-trip through
-        JSON.
+        ValueError: the model has no trainable parameters, or metadata has a number that is not
+            finite.
+        TypeError: metadata is not JSON-serializable.
     """
     folder, adapters = validate.folder(folder), nnx.state(validate.with_values(model), AdapterParam)
-    if not isinstance(base, str):
-        raise ValueError(f"base must be the base model's name (str), got {short(base)}")
     tensors = {name: np.asarray(leaf) for name, leaf in _leaves_by_name(adapters).items()}
     if not tensors:
-        raise ValueError(
-            "the model has no adapters to save; for a combined model, extract one first"
-        )
+        raise ValueError("the model has no adapters; of a combined model, extract one first")
     data = safetensors.numpy.save(tensors)
     description = {
         "format": FORMAT,
@@ -76,12 +81,13 @@ def save_adapters(
         "weights": digest.fingerprints(_frozen_weights(model)),
         "sha256": hashlib.sha256(data).hexdigest(),
         "methods": {path: to_settings(m) for path, m in adaptation.methods(model).items()},
-        "metadata": _checked_metadata({} if metadata is None else metadata),
+        "metadata": dict(metadata or {}),
     }
-    text = json.dumps(digest.with_digest(description), indent=2)
+    json_values.check(description, FIELDS)
+    text = json.dumps(digest.with_digest(description), indent=2, allow_nan=False)
     folder.mkdir(parents=True, exist_ok=True)
-    write_atomic(folder / TENSORS, data)
-    write_atomic(folder / DESCRIPTION, text.encode())
+    write_bytes(folder / TENSORS, data)
+    write_text(folder / DESCRIPTION, text)
 
 
 def load_adapters(
@@ -98,26 +104,24 @@ def load_adapters(
     at the same paths.
 
     Args:
-      folder: written by `save_adapters`.
-      model: not modified.
-      base: if given, must equal the name that was saved.
-      any_base: whether to skip the base check. By default, every base array must match the one used
-        in training, up to bf16 rounding. An array is not compared if only one of the two is
-        quantized, or if an adapter split it.
-      einsums: as passed to `adapt`.
+        folder: written by `save_adapters`.
+        model: not modified.
+        base: if given, must equal the name that was saved.
+        any_base: whether to skip the base check. By default, every base array must match the one
+            used in training, up to bf16 rounding. An array is not compared if only one of the two
+            is quantized, or if an adapter split it.
+        einsums: as passed to `adapt`.
 
     Raises:
-      ValueError: files are missing, damaged or do not belong together, the base differs, or the
-        adapters do not fit the model.
+        ValueError: files are missing, damaged or do not belong together, the base differs, or the
+            adapters do not fit the model.
     """
     folder = validate.folder(folder)
     description, tensors = _read(folder)
     if base is not None and description["base"] != base:
-        raise ValueError(
-            f"the adapter in {folder} was trained on base {description['base']!r}, not on "
-            f"{short(base)}"
-        )
-    saved_methods = _methods(description["methods"], folder)
+        raise ValueError(f"{folder} was trained on base {description['base']!r}, not {base!r}")
+    with paths.naming("load the methods in", folder):
+        saved_methods = {p: peft.from_settings(s) for p, s in description["methods"].items()}
     model_methods = {path: method.as_saved for path, method in adaptation.methods(model).items()}
     if not model_methods:
         model = _adapt_as_saved(model, saved_methods, tensors, folder, einsums)
@@ -125,9 +129,7 @@ def load_adapters(
         different = sorted(
             p for p in model_methods | saved_methods if model_methods.get(p) != saved_methods.get(p)
         )
-        raise ValueError(
-            f"{folder} and the model have different adapters, first at {different[0]!r}"
-        )
+        raise ValueError(f"{folder} and the model have different adapters at {different[0]!r}")
     if not any_base:
         _check_weights(model, description["weights"], folder)
     graphdef, adapters, frozen = adaptation.split(model)
@@ -147,14 +149,12 @@ def _adapt_as_saved(
 
     Shapes are checked first, since a damaged or malicious file could request too much memory.
     """
-    try:
-        # FullFineTuning first, since an adapted layer may have fully fine-tuned parameters.
-        paths = sorted(methods, key=lambda path: not methods[path].trains_base)
-        rules = [(f"^{re.escape(path)}$", methods[path]) for path in paths]
-        adapt = lambda: adaptation.adapt(model, rules, rngs=nnx.Rngs(0), einsums=einsums)  # noqa: E731
+    # FullFineTuning first, since an adapted layer may have fully fine-tuned parameters.
+    order = sorted(methods, key=lambda path: not methods[path].trains_base)
+    rules = [(f"^{re.escape(path)}$", methods[path]) for path in order]
+    adapt = lambda: adaptation.adapt(model, rules, rngs=nnx.Rngs(0), einsums=einsums)  # noqa: E731
+    with paths.naming("fit to the model the adapters in", folder):
         adapters = adaptation.split(nnx.eval_shape(adapt))[1]
-    except (ValueError, TypeError, OverflowError) as error:
-        raise ValueError(f"{folder} does not fit the model: {error}") from error
     _matched_leaves(adapters, tensors, methods, folder)
     return adapt()
 
@@ -178,9 +178,8 @@ def _check_weights(model: nnx.Module, saved: Mapping[str, str], folder: pathlib.
     fingerprints = digest.fingerprints(common)
     if changed := [name for name in fingerprints if fingerprints[name] != saved[name]]:
         raise ValueError(
-            f"the adapter in {folder} was trained on a different base: {len(changed)} of "
-            f"{len(fingerprints)} arrays differ, first {changed[0]!r}; pass any_base=True to load "
-            "it anyway"
+            f"{folder} was trained on another base: {len(changed)} of {len(fingerprints)} arrays "
+            f"differ, first {changed[0]!r}; any_base=True loads it anyway"
         )
 
 
@@ -206,9 +205,7 @@ def _matched_leaves(
         expected |= {prefix + name: shape for name, shape in shapes.items()}
     for name, shape in expected.items():
         if saved[name] != shape:
-            raise ValueError(
-                f"tensor {name!r} has shape {saved[name]} in {folder}, but {shape} in the model"
-            )
+            raise ValueError(f"{name} is {saved[name]} in {folder}, but {shape} in the model")
     return leaves
 
 
@@ -218,98 +215,43 @@ def _leaves_by_name(adapters: nnx.State) -> dict[str, jax.Array]:
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
-def _methods(saved: Mapping[str, Any], folder: pathlib.Path) -> dict[str, Method]:
-    try:
-        return {path: peft.from_settings(settings) for path, settings in saved.items()}
-    except (ValueError, TypeError, OverflowError) as error:
-        raise ValueError(f"{folder} has invalid adapter settings: {error}") from error
-
-
-def _checked_metadata(metadata: Any) -> dict[str, Any]:
-    """Return metadata as a dict; raise ValueError if it does not round-trip through JSON."""
-    try:
-        restored = json.loads(json.dumps(metadata, allow_nan=False))
-    except (TypeError, ValueError, RecursionError) as error:
-        raise ValueError(f"metadata is not JSON-serializable: {error}") from error
-    if not isinstance(metadata, Mapping) or restored.keys() != metadata.keys():
-        raise ValueError(f"metadata must be a dict with str keys, got {short(metadata)}")
-    return restored
-
-
-def write_atomic(path: pathlib.Path, data: bytes) -> None:
-    """Write a file atomically, replacing an existing one."""
-    from lorasp_jax.base.writing import write_bytes  # imported here because envs sets an XLA flag
-
-    write_bytes(path, data)
-
-
-def read_bytes(path: pathlib.Path) -> bytes:
-    """Read a file.
+def read_tensors(path: pathlib.Path) -> tuple[bytes, dict[str, np.ndarray]]:
+    """Read a safetensors file; return its content and its tensors by name.
 
     Raises:
-      ValueError: the file is larger than this machine's memory.
+        ValueError: the file is damaged, or a tensor is not floating-point or not finite.
     """
-    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    if (size := path.stat().st_size) > memory:
-        raise ValueError(f"{path} has {size} bytes, more than this machine's memory")
-    return path.read_bytes()
-
-
-def read_tensors(path: pathlib.Path, data: bytes) -> dict[str, np.ndarray]:
-    """Decode the content of a safetensors file into tensors by name.
-
-    `path` is only for error messages.
-
-    Raises:
-      ValueError: the file is damaged, or a tensor is not floating-point or not finite.
-    """
-    try:
+    with as_value_error(path, safetensors.SafetensorError):
+        check_memory(check_regular(path).stat().st_size, path)
+        data = path.read_bytes()
         tensors = dict(sorted(safetensors.numpy.load(data).items()))
-    except (ValueError, KeyError, TypeError, safetensors.SafetensorError) as error:
-        raise ValueError(f"{path} is damaged or not a safetensors file: {error}") from error
-    for name, tensor in tensors.items():
-        if not jnp.issubdtype(tensor.dtype, jnp.floating):
-            raise ValueError(f"tensor {name!r} in {path} is {tensor.dtype}, not floating point")
-        if not np.isfinite(tensor.astype(np.float32)).all():
-            raise ValueError(f"tensor {name!r} in {path} has non-finite values")
-    return tensors
+        for name, tensor in tensors.items():
+            is_float = jnp.issubdtype(tensor.dtype, jnp.floating)
+            if not is_float or not np.isfinite(tensor.astype(np.float32)).all():
+                raise ValueError(f"tensor {name!r} must be floating-point and finite")
+    return data, tensors
 
 
 def _read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Read and verify the description and the tensors."""
-    for name in (DESCRIPTION, TENSORS):
-        if not (folder / name).is_file():
-            raise ValueError(
-                f"{folder} has no {name}; an adapter folder needs {DESCRIPTION} and {TENSORS}"
-            )
-    data = read_bytes(folder / TENSORS)
     description = read_description(folder)
+    data, tensors = read_tensors(folder / TENSORS)
     if description["sha256"] != hashlib.sha256(data).hexdigest():
         raise ValueError(f"{folder / TENSORS} is damaged, or does not belong to {DESCRIPTION}")
-    return description, read_tensors(folder / TENSORS, data)
+    return description, tensors
 
 
 def read_description(folder: pathlib.Path) -> dict[str, Any]:
     """Read the adapter.json in a folder.
 
     Raises:
-      ValueError: the file is missing, damaged, or of an unsupported format or version.
+        ValueError: the file is missing, damaged, or of an unsupported format or version.
     """
     path = folder / DESCRIPTION
-    try:
-        description = json.loads(read_bytes(path))
-        supported = (description["format"], description["version"]) == (FORMAT, VERSION)
-        if supported:
-            description = digest.verify_digest(description)
-            wrong = [
-                name for name, kind in FIELDS.items() if not isinstance(description[name], kind)
-            ]
-            if wrong:
-                field = wrong[0]
-                kind = FIELDS[field].__name__
-                raise ValueError(f"{field} must be a {kind}, got {short(description[field])}")
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged or not an adapter description: {error}") from error
-    if not supported:
-        raise ValueError(f"{path} is not a {FORMAT} of version {VERSION}")
+    with as_value_error(path):
+        description = read_json(path)
+        if (description["format"], description["version"]) != (FORMAT, VERSION):
+            raise RefusedError(f"{path} is not a {FORMAT} of version {VERSION}")
+        description = digest.verify_digest(description)
+        json_values.check(description, FIELDS)
     return description

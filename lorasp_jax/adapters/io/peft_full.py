@@ -2,7 +2,7 @@
 
 With `bias` "all" or "lora_only", PEFT trains biases. It stores them as <module>.base_layer.bias for
 adapted layers and as <module>.bias for others. `modules_to_save` makes whole modules trainable.
-Weights are stored in torch's layout, [out, in] for a dense layer.
+Weights are stored in torch's layout, `[out, in]` for a dense layer.
 """
 
 import math
@@ -35,8 +35,8 @@ def full_parameters(
     """A folder's fully trained parameters, by path, in the model's layout.
 
     Raises:
-      ValueError: the model lacks a parameter or has a different shape, or the folder covers only
-        some layers of a stack.
+        ValueError: the model lacks a parameter or has a different shape, or the folder covers only
+            some layers of a stack.
     """
     values, unused = {}, dict(full)
     for path, size in sizes.items() if full else ():
@@ -48,7 +48,7 @@ def full_parameters(
         if not parts:
             continue
         if len(parts) < len(keys):
-            raise ValueError(f"{folder} has the {kind} of only some layers of the stack {module}")
+            raise ValueError(f"{folder} has the {kind} of only some layers of {module}")
         value = np.stack([_from_torch(part) if name == "kernel" else part for part in parts])
         rows = value.shape[1:] if name == "kernel" else (value[0].size,)
         shape = tuple(size[len(leading) :])
@@ -77,9 +77,7 @@ def check_biases(
     ]
     trained = modules if bias == "all" else set(modules) & set(adapted)
     if bias != "none" and trained and not any(kind == "bias" for _, kind in full):
-        raise ValueError(
-            f"the adapter in {folder} was trained with bias {bias!r}, but has no bias tensors"
-        )
+        raise ValueError(f"{folder} was trained with bias {bias!r}, but has no bias tensors")
 
 
 def export_full_parameters(
@@ -88,7 +86,7 @@ def export_full_parameters(
     """A model's fully trained parameters by PEFT name, and the PEFT config fields about them.
 
     Raises:
-      ValueError: PEFT cannot store a parameter.
+        ValueError: PEFT cannot store a parameter.
     """
     locations = [p for p in paths.locate(nnx.List([model]), nnx.Param) if p.name != "adapter"]
     trainable = [location for location in locations if isinstance(location.child, AdapterParam)]
@@ -119,7 +117,7 @@ def _module(location: paths.Location) -> str:
 def _stack(name: str, size: Sequence[int], matrices: Sequence[int] | None) -> tuple[int, ...]:
     """Sizes of the leading stack axes of a parameter.
 
-    `size` is the parameter's shape. `matrices` is the shape [..., I, O] of its layer's kernel
+    `size` is the parameter's shape. `matrices` is the shape `[..., I, O]` of its layer's kernel
     matrices, or None if the layer is neither dense nor an einsum.
     """
     if matrices is not None:
@@ -128,7 +126,7 @@ def _stack(name: str, size: Sequence[int], matrices: Sequence[int] | None) -> tu
 
 
 def _from_torch(kernel: np.ndarray) -> np.ndarray:
-    """Convert torch's [out, in, *sizes] to [*sizes, I, O]; sizes are those of a convolution."""
+    """Convert torch's `[out, in, *sizes]` to `[*sizes, I, O]`; sizes are those of a convolution."""
     return kernel.transpose(*range(2, kernel.ndim), 1, 0)
 
 

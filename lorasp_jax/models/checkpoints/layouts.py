@@ -48,7 +48,7 @@ def reshaped(ours: str, theirs: str, ours_shape: Shape, theirs_shape: Shape) -> 
 
 
 def transposed(ours: str, theirs: str) -> Rule:
-    """Rule for our matrix [I, O] stored as [O, I], as in PyTorch's linear layers."""
+    """Rule for our matrix `[I, O]` stored as `[O, I]`, as in PyTorch's linear layers."""
     return Rule(
         (ours,),
         (theirs,),
@@ -59,7 +59,7 @@ def transposed(ours: str, theirs: str) -> Rule:
 
 
 def stacked(ours: str, theirs: Iterable[str], *, transpose: bool = False) -> Rule:
-    """Rule for our array [L, ...] stored as one array per layer, optionally transposed."""
+    """Rule for our array `[L, ...]` stored as one array per layer, optionally transposed."""
     names = tuple(theirs)
 
     def stack_layers(layers: Iterator[np.ndarray]) -> list[np.ndarray]:
@@ -114,9 +114,7 @@ def to_ours(
     def pop(name: str, shape: Shape) -> np.ndarray:
         array = np.asarray(theirs.pop(name))
         if array.shape != shape:
-            raise ModelMismatchError(
-                f"{name} of {source} must have shape {shape}, got {array.shape}"
-            )
+            raise ModelMismatchError(f"{name} of {source} is {array.shape}, expected {shape}")
         if not jnp.issubdtype(array.dtype, jnp.floating) or not np.isfinite(array).all():
             raise ValueError(f"{name} of {source} must be floating point and finite")
         return array

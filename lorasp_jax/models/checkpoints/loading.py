@@ -2,15 +2,13 @@
 
 import dataclasses
 import functools
-import json
 import logging
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-from lorasp_jax.base import hub
-from lorasp_jax.base.files import read_text
+from lorasp_jax.base import hub, json_values
+from lorasp_jax.base.files import as_value_error, read_json
 from lorasp_jax.models import backbone
 from lorasp_jax.models.checkpoints import lerobot_config, native, published
 from lorasp_jax.models.checkpoints.layouts import ModelMismatchError
@@ -79,10 +77,7 @@ class ModelFolder:
     def _size_source(self) -> str:
         """Explain where the sizes come from when the caller passed no config."""
         if self.layout == "openpi":
-            return (
-                "openpi checkpoints do not store model sizes, so those of the published pi0 were "
-                "used: pass a config"
-            )
+            return "openpi stores no sizes, so those of the published pi0 were used: pass a config"
         policy = self.fields["type"]
         return f"the sizes come from {self.folder / native.CONFIG}, which has type {policy!r}"
 
@@ -133,54 +128,32 @@ def load_config(where: str | os.PathLike[str]) -> Any:
 def _read_fields(folder: Path) -> dict[str, Any]:
     """Read config.json; empty if there is none."""
     path = folder / native.CONFIG
-    try:
-        fields = json.loads(read_text(path)) if path.exists() else {}
-    except (OSError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged") from error
-    if not isinstance(fields, dict):
-        raise ValueError(f"{path} is damaged")
+    with as_value_error(path):
+        fields = read_json(path) if path.exists() else {}
+        json_values.check(fields, {})
     return fields
 
 
 def _lerobot_config(folder: Path, fields: dict[str, Any]) -> BackboneConfig:
-    config = folder / native.CONFIG
     if not fields and any(path.exists() for path in weight_files(folder)):
-        raise ValueError(
-            f"{folder} contains weights, but no {config.name} with their sizes: pass a config"
-        )
-    if not fields:
-        raise ValueError(
-            f"{folder} contains no model: expected this project's or LeRobot's {config.name}, "
-            "or openpi's params/_METADATA"
-        )
+        raise ValueError(f"{folder} has weights, but no {native.CONFIG} with sizes: pass a config")
     if "type" not in fields:
         raise ValueError(
-            f"{config} must have 'backbone' (this project) or 'type' (a LeRobot policy)"
+            f"{folder} contains no model: expected this project's or LeRobot's {native.CONFIG}, "
+            "or openpi's params/_METADATA"
         )
-    return _parse_lerobot(lerobot_config.parse, folder, fields)
-
-
-def _parse_lerobot(
-    parse: Callable[[dict[str, Any]], Any], folder: Path, fields: dict[str, Any]
-) -> Any:
-    try:
-        return parse(fields)
-    except ValueError as error:
-        raise ValueError(
-            f"{folder / native.CONFIG} does not match any backbone: {str(error).rstrip('.')}"
-        ) from error
+    with as_value_error(folder / native.CONFIG):
+        return lerobot_config.parse(fields)
 
 
 def _require_same_heads(config: Any, folder: Path, fields: dict[str, Any]) -> None:
     """Raise ValueError if config type or heads differ; tensor shapes do not reveal heads."""
-    stored = _parse_lerobot(lerobot_config.parse_towers, folder, fields)
+    with as_value_error(folder / native.CONFIG):
+        stored = lerobot_config.parse_towers(fields)
     if not isinstance(config, type(stored)):
         expected, actual = (type(c).__name__ for c in (stored, config))
         raise ValueError(f"config must be a {expected} for the policy in {folder}, got {actual}")
     for name in ("vision", "language", "action"):
         expected, actual = getattr(stored, name), getattr(config, name)
         if expected.kernel_sizes == actual.kernel_sizes and expected != actual:
-            raise ValueError(
-                f"{folder} does not match the config: {name} must have the heads of {expected}, "
-                f"got {actual}"
-            )
+            raise ValueError(f"{folder} has the {name} heads of {expected}, not of {actual}")

@@ -22,7 +22,8 @@ from flax import nnx
 
 from lorasp_jax.adapters.combine.adapter_set import AdapterSetParam
 from lorasp_jax.adapters.compress.quantization import is_quantized
-from lorasp_jax.base.files import check_local, read_text
+from lorasp_jax.base import json_values
+from lorasp_jax.base.files import as_value_error, check_local, read_json
 from lorasp_jax.base.writing import write_bytes
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models import backbone
@@ -79,9 +80,7 @@ def base_arrays(model: nnx.Module) -> dict[str, np.ndarray]:
         ValueError: the model has adapters or quantized kernels, or does not match its config.
     """
     if jax.tree.leaves(nnx.state(model, (AdapterParam, AdapterSetParam))):
-        raise ValueError(
-            "saving needs a model without adapters: merge the adapters or save them separately"
-        )
+        raise ValueError("saving needs a model without adapters: merge them or save them apart")
     if is_quantized(model):
         raise ValueError("saving needs unquantized kernels: save the base before quantizing")
     arrays = named_arrays(model)
@@ -124,15 +123,8 @@ def load_native(folder: Folder, config: Any = None) -> Any:
         raise ValueError(f"{folder} does not match the config: {_difference(stored, config)}")
     arrays = TensorFiles(weight_files(folder))
     if _digest(description, arrays) != description["sha256"]:  # before allocating the model
-        raise ValueError(
-            f"{folder} is damaged: its weights and config do not match the hash in {CONFIG}"
-        )
-    model = nnx.eval_shape(lambda: config.create(nnx.Rngs(0)))
-    try:
-        model = set_arrays(model, arrays)
-    except ValueError as error:
-        raise ValueError(f"the weights in {folder} do not match its {CONFIG}: {error}") from error
-    return model
+        raise ValueError(f"{folder} is damaged: weights and config do not match their hash")
+    return set_arrays(nnx.eval_shape(lambda: config.create(nnx.Rngs(0))), arrays)
 
 
 def load_config(folder: Folder) -> Any:
@@ -251,21 +243,12 @@ def _difference(stored: Any, config: Any) -> str:
 
 
 def _description(folder: pathlib.Path) -> dict[str, Any]:
-    invalid = f"{folder / CONFIG} is damaged or was not written by this project"
-    try:
-        description = json.loads(read_text(folder / CONFIG))
-        valid = isinstance(description["config"], dict) and isinstance(description["sha256"], str)
-    except FileNotFoundError as error:
-        raise ValueError(f"{folder} contains no model: {CONFIG} is missing") from error
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(invalid) from error
-    if not valid:
-        raise ValueError(invalid)
+    with as_value_error(folder / CONFIG):
+        description = read_json(folder / CONFIG)
+        json_values.check(description, {"backbone": str, "config": {}, "sha256": str})
     return description
 
 
 def _config(folder: pathlib.Path, description: Mapping[str, Any]) -> Any:
-    try:
+    with as_value_error(folder / CONFIG):
         return backbone.find(description["backbone"]).from_dict(description["config"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{folder / CONFIG} does not describe a supported backbone") from error

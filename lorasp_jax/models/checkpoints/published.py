@@ -98,8 +98,7 @@ def save(folder: Path, model: Any, layout: str, dtypes: Mapping[str, Any] | None
     check_local(folder)
     published_names = _published_names(model.config)
     if layout not in published_names.LAYOUTS:
-        choices = ", ".join(published_names.LAYOUTS)
-        raise ValueError(f"layout must be one of {choices}, got {layout!r}")
+        raise ValueError(f"layout must be one of {[*published_names.LAYOUTS]}, got {layout!r}")
     target = folder / ("params" if layout == "openpi" else SINGLE)
     if target.exists():
         raise ValueError(f"{target} already exists: choose another folder")
@@ -139,10 +138,7 @@ def _open(folder: Path, lerobot_name: Callable[[str], str]) -> tuple[str, Mutabl
         return "openpi", _restore(params)
     files = weight_files(folder)
     if not ((folder / INDEX).exists() or files[0].exists()):
-        raise ValueError(
-            f"{folder} contains neither an openpi Orbax checkpoint (params/_METADATA) nor "
-            f"LeRobot safetensors ({SINGLE})"
-        )
+        raise ValueError(f"{folder} has neither openpi's params/_METADATA nor LeRobot's {SINGLE}")
 
     def rename(name: str) -> str:
         return lerobot_name(name.removeprefix(_PREFIX).removeprefix(_COMPILED))

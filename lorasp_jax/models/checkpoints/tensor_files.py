@@ -1,6 +1,5 @@
 """Lazy access to safetensors: a single file, or shards with Hugging Face's index."""
 
-import json
 import math
 import re
 from collections.abc import Callable, Iterator, MutableMapping
@@ -10,7 +9,13 @@ from typing import Any
 import numpy as np
 import safetensors
 
-from lorasp_jax.base.files import check_memory, path_beside, read_text
+from lorasp_jax.base.files import (
+    as_value_error,
+    check_memory,
+    check_regular,
+    join_inside,
+    read_json,
+)
 
 SINGLE, INDEX = "model.safetensors", "model.safetensors.index.json"
 
@@ -24,12 +29,9 @@ def weight_files(folder: Path) -> list[Path]:
     index = folder / INDEX
     if not index.exists():
         return [folder / SINGLE]
-    try:
-        weight_map = json.loads(read_text(index))["weight_map"]
-        names = sorted(set(weight_map.values()))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{index} is damaged") from error
-    return [path_beside(index, name) for name in names]
+    with as_value_error(index):
+        names = sorted(set(read_json(index)["weight_map"].values()))
+    return [join_inside(folder, name) for name in names]
 
 
 class TensorFiles(MutableMapping[str, np.ndarray]):
@@ -47,22 +49,12 @@ class TensorFiles(MutableMapping[str, np.ndarray]):
     def __init__(self, files: list[Path], rename: Callable[[str], str] = str) -> None:
         self._tensors: dict[str, tuple[Any, str]] = {}
         for path in files:
-            try:
-                if path.exists() and not path.is_file():
-                    raise OSError("not a regular file")
-                file = safetensors.safe_open(path, framework="np")
-            except FileNotFoundError as error:
-                raise ValueError(f"{path.parent} lacks {path.name}") from error
-            except (OSError, safetensors.SafetensorError) as error:
-                raise ValueError(f"{path} is damaged or truncated") from error
-            for stored in file.keys():  # noqa: SIM118, safe_open is not iterable
-                name = rename(stored)
-                if name in self._tensors:
-                    other = self._tensors[name][1]
-                    raise ValueError(
-                        f"{path} has the same tensor under two names, {other} and {stored}"
-                    )
-                self._tensors[name] = file, stored
+            with as_value_error(path, safetensors.SafetensorError):
+                file = safetensors.safe_open(check_regular(path), framework="np")
+                for stored in file.keys():  # noqa: SIM118, safe_open is not iterable
+                    if (name := rename(stored)) in self._tensors:
+                        raise ValueError(f"it has {name} twice, also as {stored}")
+                    self._tensors[name] = file, stored
 
     def rename(self, old: str, new: str) -> None:
         """Rename a tensor in this mapping; the file stays unchanged."""

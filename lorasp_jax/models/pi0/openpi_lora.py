@@ -49,8 +49,6 @@ def attach(model: Any, leaves: Mapping[str, np.ndarray], *, scale: float = 1.0) 
     Raises:
         ValueError: leaves are missing, unexpected or wrongly shaped.
     """
-    if not leaves:
-        raise ValueError("leaves must contain LoRA weights of openpi, got none")
     pairs, remaining = {}, dict(leaves)
     for tower, suffix in _TOWERS.items():
         if any(f"einsum{suffix}/lora_" in name for name in leaves):
@@ -100,17 +98,13 @@ def _expert_pairs(
 def _pop_pair(leaves: dict[str, np.ndarray], prefix: str, kernel: tuple[int, ...]) -> Pair:
     """Pop A [..., I, r] and B [..., r, O] of a kernel [..., I, O] from `leaves`."""
     names = f"{prefix}lora_a", f"{prefix}lora_b"
-    for name in names:
-        if name not in leaves:
-            raise ValueError(f"openpi's LoRA lacks {name}")
+    if missing := [name for name in names if name not in leaves]:
+        raise ValueError(f"openpi's LoRA lacks {missing[0]}")
     a, b = (leaves.pop(name) for name in names)
     *outer, d_in, d_out = kernel
     rank = a.shape[-1] if a.ndim else 0
     if (a.shape, b.shape) != ((*outer, d_in, rank), (*outer, rank, d_out)):
-        raise ModelMismatchError(
-            f"{names[0]} and lora_b must fit the model's kernel shape {kernel}, "
-            f"got shapes {a.shape} and {b.shape}"
-        )
+        raise ModelMismatchError(f"{names[0]} {a.shape} and {b.shape} do not fit {kernel}")
     return a, b
 
 

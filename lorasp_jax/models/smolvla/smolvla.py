@@ -44,10 +44,7 @@ class SmolVLAConfig(BackboneConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.action.depth % 2:
-            raise ValueError(
-                "depth must be even, because self- and cross-attention alternate; "
-                f"got {self.action.depth}"
-            )
+            raise ValueError("depth must be even, because self- and cross-attention alternate")
 
     def create(self, rngs: nnx.Rngs) -> SmolVLA:
         """Create a model with random weights; works under `nnx.eval_shape`."""

@@ -98,7 +98,7 @@ def test_rows_of_an_example_are_contiguous(params, x, kernel):
     y, _ = apply(params, weights, x, kernel)
     folded, _ = apply(params, weights, x.reshape(12, D_IN), kernel)
     np.testing.assert_allclose(folded.reshape(y.shape), y, rtol=1e-5, atol=1e-5)
-    with pytest.raises(ValueError, match="chosen for 4 examples, but a layer got 3 rows"):
+    with pytest.raises(ValueError, match=r"4 examples .* 3 rows"):
         apply(params, weights, x[:3], kernel)
 
 
@@ -120,7 +120,7 @@ def test_merge(params, members, x, kernel):
     expected, _ = method.apply(own, x, kernel)
     np.testing.assert_allclose(x @ method.merge(own, kernel), expected, rtol=1e-4, atol=1e-4)
     assert method.merge(own, kernel.astype(jnp.bfloat16)).dtype == jnp.bfloat16
-    with pytest.raises(ValueError, match="choose one for the whole batch first"):
+    with pytest.raises(ValueError, match="per example"):
         method.merge(own | {"choice": jnp.ones((2, 4))}, kernel)
     with pytest.raises(ValueError, match="LoRA-SP"):
         SET.merge(params | {"choice": jnp.ones(len(METHODS))}, kernel)
@@ -168,5 +168,5 @@ def test_bank_slots_round_trip(members):
     np.testing.assert_array_equal(params["lora_b"], members["a"]["lora_b"])
     assert get_slot(bank, 1) == (None, None)
     assert get_slot(set_slot(bank, 0, None, None), 0) == (None, None)
-    with pytest.raises(ValueError, match="rank 4 exceeds the maximum rank 3"):
+    with pytest.raises(ValueError, match="rank 4 exceeds 3"):
         set_slot(empty_bank(1, 3, (D_IN, D_OUT)), 0, LORAS["b"], members["b"])

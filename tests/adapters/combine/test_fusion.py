@@ -85,14 +85,12 @@ def test_zero_deltas():
 
 
 def test_fuse_errors():
-    with pytest.raises(ValueError, match=r"cannot fuse sp at inp: LoRASP.* is not plain LoRA"):
+    with pytest.raises(ValueError, match="sp at inp"):
         lorasp_jax.fuse(pair(), {"pour": 1.0, "sp": 0.5})
-    with pytest.raises(ValueError, match="unknown adapter 'pure'; the model has pour"):
+    with pytest.raises(ValueError, match=r"'pure'.* pour"):
         lorasp_jax.fuse(pair(), {"pure": 1.0})
-    with pytest.raises(ValueError, match="rank must be an integer from 1 to 1048576, got 0"):
+    with pytest.raises(ValueError, match="rank"):
         lorasp_jax.fuse(pair(), WEIGHTS, rank=0)
-    with pytest.raises(ValueError, match="weights must be a non-empty mapping from name"):
-        lorasp_jax.fuse(pair(), {})
 
 
 UNMERGEABLE = ("dora", "full", "lora_moe", "lora_sp", "lora_sp_release")
@@ -139,24 +137,20 @@ def test_unmerge_with_fully_fine_tuned_weights():
     assert adaptation.methods(back) == adaptation.methods(model)
     assert_close(call(back, X), call(model, X))
     assert_close(back.blocks.kernel.get_value(), NET.blocks.kernel.get_value())
-    with pytest.raises(ValueError, match="the merged model has no parameter "):
+    with pytest.raises(ValueError, match="no parameter"):
         lorasp_jax.unmerge(nnx.Dict(blocks=lorasp_jax.merge(model).blocks), model)
 
 
 def test_unmerge_errors():
     model = trained(("blocks", LoRA(rank=2)), seed=4)
     merged = lorasp_jax.merge(model)
-    for method, message in (
-        (DoRA(rank=2), r"cannot unmerge blocks: DoRA.* is not additive"),
-        (SP, "cannot unmerge blocks: LoRA-SP chooses its directions per input"),
-        (LoRAMoE(experts=2, rank=2), "cannot unmerge blocks: LoRA-MoE's delta depends"),
-    ):
-        with pytest.raises(ValueError, match=message):
+    for method in (DoRA(rank=2), SP, LoRAMoE(experts=2, rank=2)):
+        with pytest.raises(ValueError, match="cannot unmerge blocks"):
             lorasp_jax.unmerge(merged, trained(("blocks", method), seed=4))
-    with pytest.raises(ValueError, match="must have no adapters, but blocks has one"):
+    with pytest.raises(ValueError, match="blocks has one"):
         lorasp_jax.unmerge(model, model)
-    with pytest.raises(ValueError, match="has no layer blocks"):
+    with pytest.raises(ValueError, match="layer blocks"):
         lorasp_jax.unmerge(merged.inp, model)
     other = adaptation.adapt(merged.inp, [("", LoRA(rank=2))], rngs=nnx.Rngs(0))
-    with pytest.raises(ValueError, match="cannot unmerge : "):
+    with pytest.raises(ValueError, match="cannot unmerge the model"):
         lorasp_jax.unmerge(merged.out, other)

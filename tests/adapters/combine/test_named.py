@@ -143,45 +143,43 @@ def test_combined_model_is_frozen_and_shares_the_base():
 
 
 def test_unknown_names():
-    with pytest.raises(ValueError, match=r"unknown adapter 'puor'; the model has pour"):
+    with pytest.raises(ValueError, match=r"'puor'.* pour"):
         lorasp_jax.choose(combined(), "puor")
-    with pytest.raises(ValueError, match="unknown adapter 'press2'"):
+    with pytest.raises(ValueError, match="'press2'"):
         lorasp_jax.choose(combined(), ["pour", {"press2": 0.5}])
-    with pytest.raises(ValueError, match="unknown adapter 'prss'"):
+    with pytest.raises(ValueError, match="'prss'"):
         lorasp_jax.extract(combined(), "prss")
-    with pytest.raises(ValueError, match="no named adapters: combine models first"):
+    with pytest.raises(ValueError, match="no named adapters"):
         lorasp_jax.choose(NET, "pour")
-    for bad in (jnp.ones(3), [], np.array([0, 1, 2, 3]), np.ones((2, 2, 4))):
-        with pytest.raises(
-            ValueError, match=r"must be a floating-point array \[4\] or \[B, 4\], got "
-        ):
+    for bad in (jnp.ones(3), [], np.ones((2, 2, 4))):
+        with pytest.raises(ValueError, match=r"\[4\] or \[B, 4\]"):
             lorasp_jax.choose(combined(), bad)
 
 
 def test_combine_errors():
     other = with_random_parameters(Net)
     other.inp.kernel.set_value(other.inp.kernel.get_value() + 1)
-    with pytest.raises(ValueError, match="pour and b have different bases, first at 'inp/kernel'"):
+    with pytest.raises(ValueError, match=r"pour and b .*'inp/kernel'"):
         lorasp_jax.combine({"pour": models()["pour"], "b": other})
-    with pytest.raises(ValueError, match=r"full also trains the base weight out/(kernel|bias)"):
+    with pytest.raises(ValueError, match=r"full .* out/(kernel|bias)"):
         lorasp_jax.combine({"full": trained(("out", FullFineTuning()), seed=0)})
-    with pytest.raises(ValueError, match="inp split the kernel"):
+    with pytest.raises(ValueError, match="inp split"):
         lorasp_jax.combine({"a": trained(("inp", LoRA(2, initialization="pissa")), seed=0)})
-    with pytest.raises(ValueError, match="is already a combined model"):
+    with pytest.raises(ValueError, match="already a combined"):
         lorasp_jax.combine({"a": combined()})
-    with pytest.raises(ValueError, match="rank 4 exceeds the maximum rank 3"):
+    with pytest.raises(ValueError, match="rank 4 exceeds 3"):
         lorasp_jax.combine(models(), rank=3)
-    with pytest.raises(ValueError, match="must be a non-empty mapping from name"):
+    with pytest.raises(ValueError, match="models"):
         lorasp_jax.combine({})
 
 
 def test_swap_errors():
-    with pytest.raises(ValueError, match=r"open at blocks requires the method DoRA\(rank=2"):
+    with pytest.raises(ValueError, match=r"open at blocks .* DoRA"):
         lorasp_jax.swap(combined(), "open", trained(("inp", SP), seed=0))
-    with pytest.raises(ValueError, match="pour at blocks requires the method LoRA"):
+    with pytest.raises(ValueError, match=r"pour at blocks .* LoRA"):
         lorasp_jax.swap(combined(), "pour", models()["open"])
     few = lorasp_jax.combine({"open": models()["open"], "pour": models()["pour"]})
-    with pytest.raises(ValueError, match="pour adapts out, but the combined model has no"):
+    with pytest.raises(ValueError, match="pour adapts out"):
         lorasp_jax.swap(few, "pour", models()["press"])
 
 

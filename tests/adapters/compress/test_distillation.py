@@ -86,5 +86,5 @@ def test_constant_scores_distill_exactly(batches):
 
 
 def test_bad_rank(batches):
-    with pytest.raises(ValueError, match="at least 1, or None, got 0"):
+    with pytest.raises(ValueError, match="rank"):
         lorasp_jax.distill(lora_sp_model(VARIANTS[0]), batches, rank=0)

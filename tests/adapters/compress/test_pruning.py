@@ -148,14 +148,9 @@ def test_a_pruned_model_trains_saves_and_loads(batches, tmp_path):
     assert adaptation.count(smaller).trainable < adaptation.count(model).trainable
 
 
-def test_bad_tolerance(batches):
-    with pytest.raises(ValueError, match=r"tolerance must be in \[0, 1\)"):
-        lorasp_jax.prune(lora_sp_model(VARIANTS[0]), batches, 1.0)
-
-
 def test_needs_lora_sp(batches):
     net = adaptation.adapt(Net(nnx.Rngs(0)), [("heads", LoRA(rank=2))], rngs=nnx.Rngs(1))
-    with pytest.raises(ValueError, match="the model has no LoRA-SP layers"):
+    with pytest.raises(ValueError, match="LoRA-SP"):
         lorasp_jax.prune(net, batches)
 
 
@@ -191,7 +186,9 @@ def test_kernels_get_all_directions_in_use(batches):
     jax.tree.map(np.testing.assert_array_equal, same.ranks, report.ranks)
 
 
-@pytest.mark.parametrize("options", [{"rank": 0}, {"rank": 2.0}, {"rank": 2, "tolerance": 0.1}])
-def test_bad_rank(batches, options):
-    with pytest.raises(ValueError, match="rank must be an integer of at least 1, without a tol"):
+@pytest.mark.parametrize(
+    "options", [{"rank": 0}, {"rank": 2, "tolerance": 0.1}, {"tolerance": 1.0}]
+)
+def test_bad_options(batches, options):
+    with pytest.raises(ValueError, match=r"tolerance .* rank"):
         lorasp_jax.prune(lora_sp_model(VARIANTS[0]), batches, **options)

@@ -70,9 +70,9 @@ def test_methods_on_a_quantized_base(name):
     """Adapters attached before or after quantization match those on dequantized kernels."""
     method = METHODS[name]
     if method.trains_base:
-        with pytest.raises(ValueError, match="inp/kernel is quantized and cannot be fully"):
+        with pytest.raises(ValueError, match="inp/kernel is quantized"):
             adaptation.adapt(quantized("nf4"), [("inp", method)], rngs=nnx.Rngs(0))
-        with pytest.raises(ValueError, match="cannot quantize inp: its kernel is trainable"):
+        with pytest.raises(ValueError, match=r"quantize inp: .* trainable"):
             lorasp_jax.quantize(trained(("inp", method), seed=0), [("", "nf4")])
         return
     model = trained(("inp|blocks", method), seed=1, net=quantized("nf4"))
@@ -139,7 +139,7 @@ def test_named_adapters_on_a_quantized_base():
 
 def test_adapters_that_split_kernels_come_first():
     pissa = LoRA(rank=2, initialization="pissa")
-    with pytest.raises(ValueError, match="adapt first, then quantize"):
+    with pytest.raises(ValueError, match="quantized kernel"):
         adaptation.adapt(quantized("int8"), [("inp", pissa)], rngs=nnx.Rngs(0))
     model, errors = lorasp_jax.quantize(trained(("inp", pissa), seed=1), [("inp", "nf4")])
     assert_close(call(model, X), call(dequantized(model), X))
@@ -166,13 +166,10 @@ def test_rules():
     assert errors["blocks"] < 0.01 < errors["out"]
     assert not jax.tree.leaves(nnx.state(model, AdapterParam))
     for rules, message in (
-        (
-            [("blcks", "nf4")],
-            r"rule 'blcks' applies to nothing; available dense layers and einsums: blocks",
-        ),
-        ([("", "nf4"), ("out", "int8")], "rule 'out' applies to nothing"),
-        ([("out", "fp4")], "rule 'out' must have 'float8' or 'int8' or 'nf4' or None, got 'fp4'"),
-        ([("(", "nf4")], r"rule '\(' is not a valid regular expression"),
+        ([("blcks", "nf4")], "'blcks' .* blocks"),
+        ([("", "nf4"), ("out", "int8")], "rule 'out'"),
+        ([("out", "fp4")], "'nf4' or None.* 'fp4'"),
+        ([("(", "nf4")], r"'\(' is not"),
     ):
         with pytest.raises(ValueError, match=message):
             lorasp_jax.quantize(NET, rules)
@@ -180,7 +177,7 @@ def test_rules():
         lorasp_jax.quantize(model, [("out", "nf4")])
     broken = Net()
     broken.out.kernel.set_value(broken.out.kernel.get_value().at[0].set(jnp.inf))
-    with pytest.raises(ValueError, match="cannot quantize out: the kernel has NaN"):
+    with pytest.raises(ValueError, match=r"quantize out: .* NaN"):
         lorasp_jax.quantize(broken, [("", "nf4")])
     with pytest.raises(ValueError, match="out/kernel is quantized"):
         adaptation.adapt(model, [("out", FullFineTuning())], rngs=nnx.Rngs(0))

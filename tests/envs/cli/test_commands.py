@@ -55,25 +55,21 @@ def test_bad_input_is_one_sentence(tmp_path, run, monkeypatch):
     press = "--task press --robot piper --out"
     for text, out, message in (
         (f"collect {press}", existing, "already exists"),
-        (f"collect --overwrite {press}", photos, "photos is not a folder of envs-rlds-1 episodes"),
+        (f"collect --overwrite {press}", photos, "photos"),
         (f"collect --num-episodes 0 {press}", tmp_path / "new", "num_episodes"),
-        (f"collect --num-envs 0 {press}", tmp_path / "new", "num_envs must be at least 1"),
-        (f"collect --randomize --control-dt 0.02 {press}", tmp_path / "new", "latency must lie in"),
+        (f"collect --num-envs 0 {press}", tmp_path / "new", "num_envs"),
+        (f"collect --randomize --control-dt 0.02 {press}", tmp_path / "new", "latency"),
         (f"collect --control-dt 0.03 {press}", tmp_path / "new", "multiple of 0.02 s"),
         (f"collect --actions voltage {press}", tmp_path / "new", "joint, delta_joint, end_eff"),
-        (f"collect --distractors 5 {press}", tmp_path / "new", "distractors must be at most 4"),
+        (f"collect --distractors 5 {press}", tmp_path / "new", "distractors"),
         ("collect --task press dance --robot piper --out", tmp_path / "new", "dance"),
-        (
-            "collect --task all --robot piper --out",
-            tmp_path / "e.npz",
-            "npz file can hold only one task",
-        ),
+        ("collect --task all --robot piper --out", tmp_path / "e.npz", "one task"),
         (f"play --image-size 33 {press}", tmp_path / "a.mp4", "must be even, got 33"),
         ("play --task dance --robot piper --out", tmp_path / "a.mp4", "dance"),
         ("gallery --task press --robot r2d2 --out", tmp_path / "g", "r2d2"),
-        (f"collect {press}", "gs://bucket/press", "cannot write to the URL gs:/bucket/press"),
-        (f"play {press}", "gs://bucket/press.mp4", "cannot write to the URL gs:/bucket/press.mp4"),
-        ("gallery --task press --robot piper --out", "gs://bucket", "press_piper.gif: give a path"),
+        (f"collect {press}", "gs://bucket/press", "URL gs:/bucket/press"),
+        (f"play {press}", "gs://bucket/press.mp4", "URL gs:/bucket/press.mp4"),
+        ("gallery --task press --robot piper --out", "gs://bucket", "press_piper.gif"),
     ):
         code, output = run(text, out)
         assert code == 2
@@ -148,10 +144,7 @@ def test_killed_and_resumed(tmp_path, run, moment):
 
     code, output = run(COLLECT, "--out", out, "--seed", 1)
     assert code == 2
-    assert (
-        "killed.partial was started with seed 0, not 1: continue with the same value, or delete"
-        in output
-    )
+    assert "killed.partial has seed 0, not 1" in output
 
     code, output = run(COLLECT, "--out", out)
     assert code == 0, output
@@ -268,7 +261,7 @@ def test_an_edited_robot_is_a_different_one(tmp_path, run):
     code, output = run(text, "--out", tmp_path / "done")
     assert (code, "already exists" in output) == (2, True)
     code, output = run(text, "--out", tmp_path / "begun")
-    assert (code, "was started with model" in output) == (2, True)
+    assert (code, "begun.partial has model" in output) == (2, True)
 
 
 def test_a_second_process_is_refused(tmp_path, run):

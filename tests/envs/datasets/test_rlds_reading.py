@@ -1,9 +1,6 @@
 """Read invalid RLDS datasets, and only parts of valid ones."""
 
-import contextlib
 import dataclasses
-import itertools
-import json
 
 import numpy as np
 import pytest
@@ -57,7 +54,7 @@ def test_values_that_are_not_finite(path):
     episodes.state[1, 0, 2] = np.nan
     rewrite(path, episodes)
     before = content(path)
-    with pytest.raises(ValueError, match=r"press is damaged .*state is not finite in dimension 2"):
+    with pytest.raises(ValueError, match=r"press is damaged .*state .* dimension 2"):
         rlds.read(path)
     assert content(path) == before
 
@@ -68,42 +65,3 @@ def test_an_empty_episode(path):
     rewrite(path, dataclasses.replace(one, image=nothing, length=np.array([1, 0, 1], np.int32)))
     with pytest.raises(ValueError, match="press is damaged"):
         rlds.read(path)
-
-
-def changes(node):
-    """Yield after each way to break one thing in a JSON value, then undo it."""
-    keys = list(node) if isinstance(node, dict) else range(len(node))
-    for key in keys:
-        kept = node[key]
-        for value in (None, -1, "x", [], {}):
-            node[key] = value
-            yield
-        node[key] = kept
-        if isinstance(kept, (dict, list)):
-            yield from changes(kept)
-        if isinstance(node, dict):
-            del node[key]
-            yield
-            node[key] = kept
-
-
-@pytest.mark.parametrize(
-    ("name", "every"), [("metadata.json", 2), ("features.json", 8), ("dataset_info.json", 1)]
-)
-def test_a_changed_description_is_harmless_or_refused(name, every, path):
-    """Missing columns, wrong shapes and wrong types: only ValueErrors are raised."""
-    good = json.loads((path / name).read_text())
-    refused = tried = 0
-    for _ in itertools.islice(changes(good), 0, None, every):
-        tried += 1
-        (path / name).write_text(json.dumps(good))
-        before = content(path)
-        try:
-            with contextlib.suppress(ValueError):
-                rlds.read(path)
-                refused -= 1
-        finally:
-            assert content(path) == before
-        refused += 1
-    assert tried > 30
-    assert refused > tried // 4

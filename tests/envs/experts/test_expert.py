@@ -165,7 +165,7 @@ def test_collect_keeps_successes_in_order():
 
 def test_collect_gives_up_on_a_broken_expert():
     record = fake_record([True, False, False, False])
-    with pytest.raises(ValueError, match="solved only 4 of 16 layouts of 'press' with 'piper'"):
+    with pytest.raises(ValueError, match="4 of 16"):
         envs.collect("press", num_episodes=50, num_envs=4, key=jax.random.key(0), record=record)
 
 
@@ -186,7 +186,7 @@ def test_expert_success_counts_full_and_partial_batches():
 
 @pytest.mark.parametrize("number", [0, -1])
 def test_number_of_episodes_must_be_positive(number):
-    with pytest.raises(ValueError, match="num_episodes must be at least 1"):
+    with pytest.raises(ValueError, match="num_episodes"):
         envs.collect("press", num_episodes=number, key=jax.random.key(0))
-    with pytest.raises(ValueError, match="num_episodes must be at least 1"):
+    with pytest.raises(ValueError, match="num_episodes"):
         envs.expert_success("press", num_episodes=number, key=jax.random.key(0))

@@ -22,9 +22,7 @@ def test_video(tmp_path):
 
 @pytest.mark.parametrize("shape", [(5, 31, 64, 3), (5, 32, 63, 3)])
 def test_odd_sizes_raise(tmp_path, shape):
-    with pytest.raises(
-        ValueError, match=f"height and width must be even, got {shape[1]} x {shape[2]}"
-    ):
+    with pytest.raises(ValueError, match=f"even, got {shape[1]} x {shape[2]}"):
         video.write_video(tmp_path / "v.mp4", np.zeros(shape, np.uint8), fps=10)
     assert not list(tmp_path.iterdir())
 

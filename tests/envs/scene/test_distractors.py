@@ -36,7 +36,7 @@ def test_only_the_chosen_number_is_there(robot_name):
 
 @pytest.mark.parametrize("count", [-1, 5])
 def test_count_is_checked(count):
-    with pytest.raises(ValueError, match=rf"distractors must be at (least 0|most 4), got {count}"):
+    with pytest.raises(ValueError, match="distractors"):
         envs.make("press", distractors=count)
 
 

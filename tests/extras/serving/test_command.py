@@ -61,7 +61,7 @@ def test_a_checkpoint_is_loaded_with_and_without_adapters(dummy_base, tmp_path):
     [
         ({"where": "assets/pi0_nano"}, "number of joints: pass --joints"),
         ({"size": "huge"}, "unknown size 'huge'"),
-        ({"statistics": str(ROOT / "tests" / "models")}, "cannot find statistics"),
+        ({"statistics": str(ROOT / "tests" / "models")}, "no statistics in"),
         ({"cameras": {"top": "front"}}, "keys of cameras"),
     ],
 )

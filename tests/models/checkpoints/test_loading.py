@@ -62,7 +62,7 @@ def test_lerobot(lerobot, caplog):
     assert_same(model, published.load_published(smolvla.GOLDEN, smolvla.CONFIG)[0])
     (lerobot / "config.json").unlink()
     assert_same(models.load(lerobot, smolvla.CONFIG), model)
-    with pytest.raises(ValueError, match=r"contains weights, but no config\.json"):
+    with pytest.raises(ValueError, match=r"config\.json"):
         models.load(lerobot)
 
 
@@ -102,13 +102,10 @@ def test_ours_and_the_hub(tmp_path, monkeypatch):
 def test_invalid_folders_raise(lerobot, tmp_path):
     with pytest.raises(ValueError, match="contains no model"):
         models.load(tmp_path)
-    with pytest.raises(ValueError, match="no_such does not exist"):
+    with pytest.raises(ValueError, match="no_such"):
         models.load(tmp_path / "no_such")
     (lerobot / "config.json").write_text(json.dumps({**FIELDS, "type": "act"}))
-    with pytest.raises(
-        ValueError,
-        match=r"config\.json does not match any backbone: type must be one of .*, got 'act'",
-    ):
+    with pytest.raises(ValueError, match=r"config\.json .* 'act'"):
         models.load(lerobot)
     for text in ("{", "[]"):
         (lerobot / "config.json").write_text(text)

@@ -60,9 +60,9 @@ def test_hash_covers_the_base_without_adapters(folder, model):
     for has_adapters in (adapted, lorasp_jax.combine({"own": adapted})):
         with pytest.raises(ValueError, match="without adapters"):
             models.save(folder, has_adapters)
-    with pytest.raises(ValueError, match="save the base before quantizing"):
+    with pytest.raises(ValueError, match="quantiz"):
         models.save(folder, lorasp_jax.quantize(loaded, [("state_proj", "int8")]).model)
-    with pytest.raises(ValueError, match="cannot write to the URL gs:/bucket/base"):
+    with pytest.raises(ValueError, match="URL"):
         models.save("gs://bucket/base", loaded)
 
 
@@ -76,7 +76,7 @@ def test_shards_respect_the_maximum_size(tmp_path, model, monkeypatch):
     sharded = models.weights_hash(tmp_path)
     assert models.weights_hash(models.load(tmp_path)) == sharded
     shards[1].unlink()
-    with pytest.raises(ValueError, match=f"lacks {shards[1].name}"):
+    with pytest.raises(ValueError, match=shards[1].name):
         models.load(tmp_path)
     models.save(tmp_path, model)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["config.json", "model.safetensors"]
@@ -85,10 +85,7 @@ def test_shards_respect_the_maximum_size(tmp_path, model, monkeypatch):
 
 def test_wrong_sizes_raise(folder):
     other = dataclasses.replace(CONFIG, image_size=64)
-    with pytest.raises(
-        ValueError,
-        match=r"does not match the config: image_size is 32 in the folder, 64 in the config$",
-    ):
+    with pytest.raises(ValueError, match=r"image_size is 32 in the folder, 64 in the config$"):
         models.load(folder, other)
 
 
@@ -107,34 +104,34 @@ def edit_config(folder, **change):
 
 
 def test_damaged_and_foreign_folders_raise(folder):
-    with pytest.raises(ValueError, match=r"contains no model: config\.json is missing"):
+    with pytest.raises(ValueError, match=r"config\.json is missing"):
         native.load_native(folder / "nothing")
     sizes = json.loads((folder / "config.json").read_text())["config"]
     edit_config(folder, config={**sizes, "vocabulary": 7})
-    with pytest.raises(ValueError, match="weights and config do not match the hash"):
+    with pytest.raises(ValueError, match="hash"):
         models.load(folder)
     edit_config(folder, config=sizes, sha256="0" * 64)
-    with pytest.raises(ValueError, match="weights and config do not match the hash"):
+    with pytest.raises(ValueError, match="hash"):
         models.load(folder)
     for change in ({"backbone": "no_such"}, {"config": {"vision": {}}}):
         edit_config(folder, **{"config": sizes, "backbone": "pi0", **change})
-        with pytest.raises(ValueError, match="does not describe a supported backbone"):
+        with pytest.raises(ValueError, match=r"config\.json"):
             models.load(folder)
     (folder / "config.json").write_text('{"architectures": []}')
-    with pytest.raises(ValueError, match="was not written by this project"):
+    with pytest.raises(ValueError, match=r"config\.json"):
         native.load_native(folder)
 
 
 def test_a_truncated_file_raises(folder):
     path = folder / "model.safetensors"
     path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(ValueError, match=r"model\.safetensors is damaged or truncated"):
+    with pytest.raises(ValueError, match=r"model\.safetensors is damaged"):
         models.load(folder)
 
 
 def test_set_arrays_lists_missing_and_unexpected_arrays(model):
-    with pytest.raises(ValueError, match="missing arrays: action/blocks/down_proj/kernel, "):
+    with pytest.raises(ValueError, match=r"missing .*action/blocks/down_proj/kernel"):
         models.set_arrays(model, {})
     arrays = native.named_arrays(model)
-    with pytest.raises(ValueError, match=r"unexpected arrays: lm_head$"):
+    with pytest.raises(ValueError, match=r"unexpected .*lm_head"):
         models.set_arrays(model, {**arrays, "lm_head": np.zeros(1)})

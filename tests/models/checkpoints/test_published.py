@@ -162,26 +162,24 @@ def test_older_lerobot_versions(model, tensors, tmp_path):
 
 def test_mismatched_checkpoints_raise(model, tensors, tmp_path):
     lora = {**tensors, "model.extra.lora_A.weight": np.zeros((2, 2), np.float32)}
-    with pytest.raises(ValueError, match=r"has unexpected leaves extra\.lora_A\.weight"):
+    with pytest.raises(ValueError, match=r"unexpected .* extra\.lora_A\.weight"):
         published.load_published(write(tmp_path / "more", lora), CONFIG)
     incomplete = {name: a for name, a in tensors.items() if "layers.1.mlp.up_proj" not in name}
     with pytest.raises(ValueError, match=r"lacks .*layers\.1\.mlp\.up_proj\.weight"):
         published.load_published(write(tmp_path / "incomplete", incomplete), CONFIG)
     other = dataclasses.replace(CONFIG, action_dim=7)
-    with pytest.raises(
-        ValueError, match=r"state_proj/kernel of .* must have shape \(7, 64\), got \(32, 64\)"
-    ):
+    with pytest.raises(ValueError, match=r"state_proj/kernel .*\(32, 64\), expected \(7, 64\)"):
         published.load_published(OPENPI, other)
     twice = {**tensors, "state_proj.bias": np.zeros(64, np.float32)}
-    with pytest.raises(ValueError, match="the same tensor under two names"):
+    with pytest.raises(ValueError, match=r"state_proj.bias twice"):
         published.load_published(write(tmp_path / "twice", twice), CONFIG)
-    with pytest.raises(ValueError, match="neither an openpi Orbax checkpoint"):
+    with pytest.raises(ValueError, match="neither openpi"):
         published.load_published(tmp_path, CONFIG)
     with pytest.raises(ValueError, match="already exists"):
         published.save(tmp_path / "more", model, "lerobot")
-    with pytest.raises(ValueError, match="layout must be one of openpi, lerobot, got 'torch'"):
+    with pytest.raises(ValueError, match=r"layout .* 'torch'"):
         published.save(tmp_path / "new", model, "torch")
-    with pytest.raises(ValueError, match="cannot write to the URL gs:/bucket/base"):
+    with pytest.raises(ValueError, match="URL"):
         published.save(Path("gs://bucket/base"), model, "openpi")
 
 
