@@ -16,7 +16,9 @@ WITHOUT_EXAMPLES = {"runs", "benchmarks", "architecture", "study", "libero", "me
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 OPTION = re.compile(r"^\| `(\w+)` \| `([^`]+)` \| \S", re.MULTILINE)
 LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)|src(?:set)?=\"([^\":]+)\"")
-FILE = re.compile(r"`((?:lorasp_jax|envs|studies|benchmarks|configs|examples|tests)/[\w/]+\.py)[`:]")
+FILE = re.compile(
+    r"`((?:lorasp_jax|envs|studies|benchmarks|configs|examples|tests)/[\w/]+\.py)[`:]"
+)
 FUNCTION = re.compile(r"`([\w/]+\.py)::(\w+)`")
 NODE = re.compile(r"^    ([\w.]+)\[", re.MULTILINE)
 ARROWS = re.compile(r"^    ([\w.]+(?: --> [\w.]+)+)$", re.MULTILINE)
