@@ -11,6 +11,8 @@ from lorasp_jax import peft
 from tests import ROOT, test_imports
 
 PAGES = sorted([*ROOT.glob("docs/*.md"), *ROOT.glob("docs/methods/*.md")])
+OTHERS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("studies/*/README.md"))]
+"""Pages whose links and files are checked, but not their examples."""
 WITHOUT_EXAMPLES = {"runs", "benchmarks", "architecture", "study", "libero", "metaworld"}
 """Reference pages, and two about other packages."""
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
@@ -66,19 +68,19 @@ def test_page_uses_the_method(name):
     assert peft.find(name).__name__ in code
 
 
-@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", [*PAGES, *OTHERS], ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_resolve(page):
     for link, source in LINK.findall(BLOCK.sub("", page.read_text())):
         target = link or source
         assert (page.parent / target).exists(), f"{page} links to {target}"
 
 
-@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", [*PAGES, *OTHERS], ids=lambda page: str(page.relative_to(ROOT)))
 def test_named_files_exist(page):
     assert [file for file in FILE.findall(page.read_text()) if not (ROOT / file).is_file()] == []
 
 
-@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", [*PAGES, *OTHERS], ids=lambda page: str(page.relative_to(ROOT)))
 def test_named_functions_exist(page):
     for file, name in FUNCTION.findall(page.read_text()):
         tree = ast.parse((ROOT / file).read_text())
