@@ -13,7 +13,7 @@ from tests import ROOT, test_imports
 PAGES = sorted([*ROOT.glob("docs/*.md"), *ROOT.glob("docs/methods/*.md")])
 OTHERS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("studies/*/README.md"))]
 """Pages whose links and files are checked, but not their examples."""
-WITHOUT_EXAMPLES = {"runs", "benchmarks", "architecture", "study", "libero", "metaworld"}
+WITHOUT_EXAMPLES = {"runs", "launch", "benchmarks", "architecture", "study", "libero", "metaworld"}
 """Reference pages, and two about other packages."""
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 OPTION = re.compile(r"^\| `(\w+)` \| `([^`]+)` \| \S", re.MULTILINE)
