@@ -67,7 +67,7 @@ def test_result_table_quotes_both_studies():
         *row(STUDY, "2 | LoRA-SP minus"),
         *(minus(row(table, "full fine-tuning")[1]) for table in tables),
     ]
-    assert row(README, "its own success") == [
+    assert row(README, "itself") == [
         *(means[-1] for means in own),
         *(row(table, "LoRA-SP")[0] for table in tables),
     ]
