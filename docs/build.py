@@ -38,7 +38,9 @@ OUTSIDE = (
     "assets/**/*.gif",
     "assets/*.png",
     "notebooks/*.ipynb",
-    "benchmarks/*.md",
+    "studies/*/README.md",
+    "studies/performance/peers.md",
+    "studies/*/*.svg",
     "CONTRIBUTING.md",
     "LICENSE",
     "CITATION.cff",
@@ -127,8 +129,9 @@ def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
     uri = page.file.src_uri
     if uri.startswith("api/") or uri == REFERENCE_PAGE:
         return markdown
-    folder = "" if uri in ("index.md", "CONTRIBUTING.md") else posixpath.dirname(f"docs/{uri}")
     pages = {"README.md": "index.md", REFERENCE: REFERENCE_PAGE}
+    outside = uri == "index.md" or (ROOT / uri).is_file()
+    folder = posixpath.dirname(uri if outside else f"docs/{uri}")
 
     def rewrite(match: re.Match) -> str:
         target = posixpath.normpath(posixpath.join(folder, match[2]))

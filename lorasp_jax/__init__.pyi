@@ -30,6 +30,7 @@ from .adapters.io.hugging_face import save_peft as save_peft
 from .adapters.io.native import load_adapters as load_adapters
 from .adapters.io.native import save_adapters as save_adapters
 from .adapters.linen import LinenAdapter as LinenAdapter
+from .adapters.summary import auxiliary_loss as auxiliary_loss
 from .adapters.summary import collect_aux as collect_aux
 from .adapters.summary import summary as summary
 from .peft import AdaLoRA as AdaLoRA

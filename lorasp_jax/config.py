@@ -6,6 +6,7 @@ from typing import Literal
 
 from envs.scene.ranges import Randomization
 from lorasp_jax.peft import Method, fields
+from lorasp_jax.peft.auxiliary import AUXILIARY_WEIGHTS
 
 SCALES = ("smoke", "cpu", "accelerator")
 MAX_NAME_BYTES = 200
@@ -164,13 +165,13 @@ class OptimConfig:
 class AuxiliaryConfig:
     """Weights of the auxiliary losses, eq. 14 of arXiv 2603.07404."""
 
-    spectral: float = 1e-2
+    spectral: float = AUXILIARY_WEIGHTS["spectral"]
     """Weight of the spectral loss 1 - E_k, eq. 13."""
-    balance: float = 1e-3
+    balance: float = AUXILIARY_WEIGHTS["balance"]
     """Weight of the balance loss."""
-    z: float = 1e-3
+    z: float = AUXILIARY_WEIGHTS["z"]
     """Weight of the router z-loss."""
-    orthogonality: float = 0.1
+    orthogonality: float = AUXILIARY_WEIGHTS["orthogonality"]
     """Weight of AdaLoRA's orthogonality penalty, eq. 4 of arXiv 2303.10512."""
     warmup: float = 0.02
     """Fraction of the steps over which the weights rise linearly from zero."""
@@ -178,7 +179,7 @@ class AuxiliaryConfig:
     def __post_init__(self) -> None:
         """Validate the fields."""
         fields.check_fields(self)
-        _at_least(0, self, "spectral", "balance", "z", "orthogonality")
+        _at_least(0, self, *AUXILIARY_WEIGHTS)
         if not 0 <= self.warmup <= 1:
             raise ValueError(f"warmup must lie in [0, 1], got {self.warmup}")
 

@@ -9,9 +9,11 @@ import pytest
 
 from lorasp_jax.evaluation.intervals import wilson_interval
 from lorasp_jax.extras.latency import figure as latency
+from studies.performance import float8
 from tests import ROOT
 
 FOLDER = ROOT / "docs" / "figures"
+PERFORMANCE = ROOT / "studies" / "performance"
 
 
 @pytest.fixture
@@ -81,11 +83,11 @@ def test_the_latency_figure_and_tables_show_what_was_measured(script, tmp_path, 
         assert jerk.split(", ") == [f"{p['jerk']:.0f}" for p in shown]
 
 
-def test_the_float8_figure_and_table_show_what_was_measured(script, tmp_path):
-    script("float8").main(tmp_path / "float8.svg")
+def test_the_float8_figure_and_table_show_what_was_measured(tmp_path):
+    float8.main(tmp_path / "float8.svg")
     assert (tmp_path / "float8.svg").stat().st_size > 20_000
-    found = json.loads((ROOT / "docs/float8.json").read_text())["small"]
-    page = (ROOT / "docs/benchmarks.md").read_text()
+    found = json.loads((PERFORMANCE / "float8.json").read_text())["small"]
+    page = (PERFORMANCE / "README.md").read_text()
     table = page.partition("| π0 small, bf16 | float8 |")[2].partition("\n\n")[0]
     rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", table, re.M)
     assert {task for task, _ in rows} == {*found["pi0"]["bf16"][0]["successes"]}
@@ -103,7 +105,7 @@ def test_the_float8_figure_and_table_show_what_was_measured(script, tmp_path):
 
 
 def test_the_table_of_other_programs_shows_what_was_measured():
-    found = json.loads((ROOT / "docs/peers.json").read_text())["tables"]
+    found = json.loads((PERFORMANCE / "peers.json").read_text())["tables"]
     page = (ROOT / "docs/benchmarks.md").read_text()
     table = page.partition("| work | program |")[2].partition("\n\n")[0]
     shown = re.findall(r"\| ([\d.]+) \| ([\d.]+) GiB \|$", table, re.M)

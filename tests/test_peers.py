@@ -157,7 +157,7 @@ def test_every_variant_has_a_module_and_an_install_command():
 
 
 def test_the_guide_names_every_table_and_the_pinned_versions():
-    text = (ROOT / "benchmarks" / "peers.md").read_text()
+    text = (ROOT / "studies/performance/peers.md").read_text()
     assert set(re.findall(r"^\| `([a-z0-9-]+)` \|", text, re.MULTILINE)) == set(cases.TABLES)
     for command in cases.INSTALL.values():
         for pin in re.findall(r"[a-z\]]+==[\d.]+", command):

@@ -15,10 +15,10 @@ from lorasp_jax import peft
 PUBLIC = {
     "lorasp_jax": """
         AdaLoRA DoRA FullFineTuning LinenAdapter LoRA LoRAMoE LoRASP LoRASPRelease adapt
-        auxiliary_losses choose collect_aux combine config count data dense distill evaluation
-        extract fuse hugging_face input_moments load_adapters load_peft merge models named peft
-        penalties policies prune quantize save_adapters save_peft split summary swap training
-        unmerge with_dropout
+        auxiliary_loss auxiliary_losses choose collect_aux combine config count data dense distill
+        evaluation extract fuse hugging_face input_moments load_adapters load_peft merge models
+        named peft penalties policies prune quantize save_adapters save_peft split summary swap
+        training unmerge with_dropout
     """,
     "lorasp_jax.peft": """
         AdaLoRA Aux DoRA FullFineTuning LoRA LoRAMoE LoRASP LoRASPRelease Method

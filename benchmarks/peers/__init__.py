@@ -1,1 +1,1 @@
-"""Time openpi, LeRobot, qwix and Hugging Face PEFT beside this project; see `peers.md`."""
+"""Time openpi, LeRobot, qwix and PEFT beside this project; see `studies/performance/peers.md`."""

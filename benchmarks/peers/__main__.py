@@ -5,7 +5,8 @@
     python -m benchmarks.peers --size tiny --out tiny.json    # on a CPU
 
 Each case runs alone in a process of its program's interpreter (`--python`), with its program's
-folders in front of the module search path (`--path`). `benchmarks/peers.md` explains the set-up.
+folders in front of the module search path (`--path`). `studies/performance/peers.md` explains the
+set-up.
 """
 
 import argparse

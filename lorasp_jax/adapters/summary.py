@@ -1,17 +1,20 @@
-"""Summarize an adapted model in a table, and collect the aux that its layers stored."""
+"""Summarize an adapted model in a table; collect the aux that its layers stored and its losses."""
 
 import math
 from collections.abc import Mapping
 from typing import Any
 
 import flax.traverse_util
+import jax
+import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax.adapters.adaptation import Counts, count
+from lorasp_jax.adapters.adaptation import Counts, count, penalties
 from lorasp_jax.adapters.layers.nnx_layers import kernel_of
 from lorasp_jax.adapters.paths import EINSUMS_HINT, locate, locate_layers, locate_other_matrices
 from lorasp_jax.dense import AUX_NAME, AdapterAux, AdapterParam, validate
 from lorasp_jax.peft import Aux
+from lorasp_jax.peft.auxiliary import AUXILIARY_WEIGHTS, auxiliary_losses
 from lorasp_jax.peft.fields import short
 
 Row = tuple[str, ...]
@@ -132,3 +135,26 @@ def collect_aux(model: nnx.Module | Mapping[str, Any]) -> dict[str, Aux]:
             "(NNX) or with mutable=['intermediates'] (Linen)"
         )
     return {"/".join(map(str, path)): aux for path, aux in aux_by_path.items()}
+
+
+def auxiliary_loss(model: nnx.Module | Mapping[str, Any]) -> jax.Array:
+    """Add up the auxiliary losses of the model's last call: add the result to your loss.
+
+    Each loss is averaged over the layers that have it (`auxiliary_losses`), and weighted as in
+    `AuxiliaryConfig`; the losses of the parameters alone (`penalties`) are included for NNX.
+
+    Args:
+      model: as for `collect_aux`, in the same traced function; an NNX model's stored aux is
+        removed.
+
+    Returns:
+      f32 scalar; 0 if no method has auxiliary losses, as with LoRA.
+
+    Raises:
+      ValueError: no adapted layer stored any aux; full fine-tuning alone stores none.
+    """
+    losses = auxiliary_losses(collect_aux(model))
+    if isinstance(model, nnx.Module):
+        losses |= penalties(model)
+    weighted = [AUXILIARY_WEIGHTS[name] * value for name, value in losses.items()]
+    return jnp.asarray(sum(weighted), jnp.float32)

@@ -9,6 +9,15 @@ import jax.numpy as jnp
 
 from lorasp_jax.peft.fields import short
 
+AUXILIARY_WEIGHTS: Mapping[str, float] = {
+    "spectral": 1e-2,
+    "balance": 1e-3,
+    "z": 1e-3,
+    "orthogonality": 0.1,
+}
+"""Default weight of each auxiliary loss, eq. 14 of the LoRA-SP paper; AdaLoRA's orthogonality is
+eq. 4 of arXiv 2303.10512."""
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)

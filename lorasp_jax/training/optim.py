@@ -6,6 +6,7 @@ import optax
 
 from lorasp_jax.config import AuxiliaryConfig, OptimConfig
 from lorasp_jax.peft import AdaLoRA, Method
+from lorasp_jax.peft.auxiliary import AUXILIARY_WEIGHTS
 
 
 def learning_rate(config: OptimConfig) -> optax.Schedule:
@@ -43,11 +44,6 @@ def auxiliary_weights(config: AuxiliaryConfig, steps: int) -> dict[str, optax.Sc
     """Return the weight schedule of each auxiliary loss: linear warm-up from zero."""
     warmup_steps = max(round(config.warmup * steps), 1)
     return {
-        name: optax.linear_schedule(0.0, weight, warmup_steps)
-        for name, weight in (
-            ("spectral", config.spectral),
-            ("balance", config.balance),
-            ("z", config.z),
-            ("orthogonality", config.orthogonality),
-        )
+        name: optax.linear_schedule(0.0, getattr(config, name), warmup_steps)
+        for name in AUXILIARY_WEIGHTS
     }

@@ -116,19 +116,6 @@ def test_fixed_numbers_in_the_text(complete):
     assert "for LoRA of rank r, that of the paper's rank 2r, since R is 64 here" in complete
 
 
-def test_the_readme_quotes_the_main_result():
-    *_, quoted = (ROOT / "README.md").read_text().partition("[study](docs/study.md)")
-    page = (ROOT / "docs" / "study.md").read_text().partition("**Main result")[2]
-    assert "shows no gain over LoRA with r = R" in page
-    for kind, readme in (
-        ("r = R = 64:", "(−0.8 and −1.1 "),
-        ("mean active rank:", "(+4.0 and +2.9)"),
-    ):
-        line = page.partition(kind)[2].partition("\n")[0]
-        assert readme in quoted
-        assert re.findall(r"([−+][\d.]+) points \[", line) == re.findall(r"[−+][\d.]+", readme)
-
-
 def test_the_page_has_no_times_of_runs_that_shared_gpus(complete):
     costs = section(complete, "Costs")
     assert "samples/s" not in costs

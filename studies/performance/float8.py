@@ -1,6 +1,6 @@
-"""Draw loss curves with frozen weights in bf16 and float8: python docs/figures/float8.py
+"""Draw loss curves with frozen weights in bf16 and float8: python studies/performance/float8.py
 
-Reads docs/float8.json, writes float8.svg next to this file.
+Reads float8.json and writes float8.svg, both next to this file.
 """
 
 import json
@@ -19,8 +19,8 @@ SKIPPED = 20
 
 @mpl.rc_context(STYLE)
 def main(path: Path = HERE / "float8.svg") -> None:
-    """Draw the loss of all runs in docs/float8.json, one panel per backbone and size."""
-    runs = json.loads((HERE.parent / "float8.json").read_text())
+    """Draw the loss of all runs in float8.json, one panel per backbone and size."""
+    runs = json.loads((HERE / "float8.json").read_text())
     small = runs["small"]
     panels = {
         "π0 small, three seeds": small["pi0"],
