@@ -84,8 +84,6 @@ def train(
     except RunError as error:
         for callback in callbacks:
             callback.on_stop(run, str(error))
-        # Otherwise another process could make the first one exit before `on_stop` is done.
-        processes.barrier("stopped")
         raise
     finally:
         checkpoints.close()
