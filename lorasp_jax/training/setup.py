@@ -23,7 +23,6 @@ from lorasp_jax.adapters import adaptation, summary
 from lorasp_jax.adapters.compress import calibration
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Batch, encode, flatten, sample_batch, windows
-from lorasp_jax.data.checked_images import load_images
 from lorasp_jax.data.source import Source
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.models import presets
@@ -282,7 +281,7 @@ def _batch_sampler(run: Run, processor: Processor, chunk: int) -> Callable[[jax.
     if run.streams:
         stream = Stream(run.steps, batch_size=size, chunk=chunk, seed=run.config.seed)
         return lambda key: encode(key, next(stream), processor, state_noise=noise)
-    steps = jax.device_put(load_images(run.steps))
+    steps = jax.device_put(run.steps)
     return jax.jit(
         lambda key: sample_batch(
             key, steps, processor, batch_size=size, chunk=chunk, state_noise=noise
@@ -327,6 +326,7 @@ def _load_dataset(run: Run, source: Source, free_bytes: float) -> None:
         bar = progress.add_task(f"reading {run.config.data.source}", total=None)
         report = lambda done, total: progress.update(bar, completed=done, total=total)  # noqa: E731
         cache = as_cache(source, run.folder, report)
+        cache.verify_images()
         progress.update(bar, completed=cache.num_steps, total=cache.num_steps)
     metadata = cache.metadata
     run.dataset, run.episodes, run.simulated = cache.steps, outline(cache), is_simulated(cache)

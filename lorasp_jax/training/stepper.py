@@ -15,7 +15,6 @@ from envs.compilation import messages
 from envs.datasets.episodes import Episodes
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Raw, Steps, fit_to_size, flatten
-from lorasp_jax.data.checked_images import load_images
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.training.cost import flops, preflight
 from lorasp_jax.training.cost.speed import Speed
@@ -159,7 +158,7 @@ def make_stepper(
         return StreamingStepper(jitted, frozen, _batches(run, mesh, start), speed)
 
     def generation(number: int) -> Steps:
-        steps = load_images(run.steps)
+        steps = run.steps
         if number:
             episodes = collect(run.config, number)
             steps = fit_to_size(flatten(list(episodes.values())), len(steps.end))
