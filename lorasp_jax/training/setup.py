@@ -1,8 +1,7 @@
 """Build a run from a config: base, adapters, demonstrations and processor."""
 
-import contextlib
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -137,14 +136,13 @@ def prepare(
     """Build a run and load or collect its demonstrations.
 
     Args:
-        config: the run's config.
-        folder: the run's folder.
+        config, folder: the run's config and folder.
         console: prints progress.
         started: `time.perf_counter()` when this process started.
         load_base: returns the base, like `base_model`.
         collect: collects demonstrations, like `demonstrations`.
-        meanwhile: functions that run in threads of their own until the demonstrations are there, to
-            compile what the run needs next. Their errors are raised here.
+        meanwhile: functions that compile what the run needs next, in threads of their own until
+            the demonstrations are there. Their errors are raised here.
 
     Raises:
         ValueError: see `build`; also if the dataset cannot be read or the expert fails.
@@ -155,34 +153,30 @@ def prepare(
     console.print(headline(config, model))
     console.print(f"memory per device: {built.memory}; rematerialization: {base.config.remat}")
     run = Run(config, folder, console, built.base_hash, started)
-    with (
-        run.timed("collect"),
-        processes.first_process_first("collected"),
-        _in_threads(meanwhile, run, built),
-    ):
-        if built.source:
-            _load_dataset(run, built.source, built.free_bytes)
-        else:
-            run.episodes = _collect(run, built.prompts.instructions, collect)
-    run.streams = processes.any_process(run.streams)  # all or none: they share batches
+    _load_or_collect(run, built, collect, meanwhile)
     relative = config.model.relative_actions
     inputs = processor([*run.episodes.values()], model.config, built.prompts, relative=relative)
     if config.peft.needs_statistics:
-        statistics = input_moments(run, base, inputs)
-        model = _adapt(config, base, config.peft, statistics)
+        model = _adapt(config, base, config.peft, input_moments(run, base, inputs))
     if built.source:
         console.print(_camera_summary(inputs), markup=False, soft_wrap=True)
     run.policy = Policy(model, inputs)
     return run
 
 
-@contextlib.contextmanager
-def _in_threads(functions: Sequence[Meanwhile], run: Run, built: RunSetup) -> Iterator[None]:
-    """Run functions during this block and wait for them, unless it raises."""
-    futures = [in_thread(function, run, built) for function in functions]
-    yield
-    for future in futures:
-        future.result()
+def _load_or_collect(
+    run: Run, built: RunSetup, collect: Collect, meanwhile: Sequence[Meanwhile]
+) -> None:
+    """Load the dataset or collect demonstrations, with `meanwhile` in threads, and wait for all."""
+    with run.timed("collect"), processes.first_process_first("collected"):
+        futures = [in_thread(function, run, built) for function in meanwhile]
+        if built.source:
+            _load_dataset(run, built.source, built.free_bytes)
+        else:
+            run.episodes = _collect(run, built.prompts.instructions, collect)
+        for future in futures:
+            future.result()
+    run.streams = processes.any_process(run.streams)  # all or none: they share batches
 
 
 def headline(config: Config, model: Backbone) -> str:
