@@ -12,7 +12,7 @@ from jax.interpreters import partial_eval
 find_processes = clusters.ClusterEnv.auto_detect_unset_distributed_params
 """Detect the coordinator address, number of processes and process index in Slurm, Open MPI,
 Kubernetes or a TPU pod. `jax.distributed.initialize` calls this function but does not expose its
-result, which the processes need to compare versions before JAX connects them."""
+result, needed to say what is awaited and to check the port: JAX crashes if it is in use."""
 
 eliminate_dead_code = partial_eval.dce_jaxpr
 """Remove equations with unused results from a jaxpr; `jax.jit` does so only during compilation.

@@ -4,7 +4,7 @@ import io
 import os
 import signal
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -73,12 +73,6 @@ class Miniature(nnx.Module):
         hidden, first = self.inp(noise + observation.state[:, None], return_aux=True)
         predicted, second = self.out(jnp.tanh(hidden), return_aux=True)
         return (predicted - actions) ** 2, {"action": {"inp": first, "out": second}}
-
-
-class StepCount(NamedTuple):
-    """The part of a training state that a `Stepper` itself reads."""
-
-    step: jax.Array
 
 
 class Terminate(Callback):

@@ -21,10 +21,6 @@ COMMANDS = {
         "lorasp_jax.extras.latency.__main__",
         "evaluate policies whose actions arrive late",
     ),
-    "correction": (
-        "lorasp_jax.training.correction.__main__",
-        "train a network that corrects actions which arrive late",
-    ),
     "envs": ("envs.__main__", "collect, render or play episodes of the scripted experts"),
     "data": ("lorasp_jax.data.__main__", "inspect or convert datasets"),
     "report": (

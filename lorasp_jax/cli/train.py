@@ -31,15 +31,16 @@ def main(arguments: Sequence[str], program: str = "python train.py") -> int:
     from lorasp_jax.training.overrides import parse
     from lorasp_jax.training.run_folder import to_json
 
-    console, errors = Console(), processes.ExitConsole(stderr=True)
+    console, errors = Console(), Console(stderr=True)
     resume = resume_command(arguments, program)
 
     def adapt() -> None:
         with sigterm_as_interrupt():
             if "--distributed" in arguments:
-                processes.initialize(console, f"to resume: {resume}")
+                processes.initialize(console)
                 console.quiet = not processes.is_first()
-            command = parse(arguments, program)
+            with processes.together():
+                command = parse(arguments, program)
             options = {"resume": command.resume, "dry_run": command.dry_run}
             processes.agree("settings", to_json(command.config) | options)
             _execute(command, console, started)
@@ -67,7 +68,7 @@ def _execute(command: "Command", console: Console, started: float) -> None:
         dry_run(command.config, folder, console)
         return
     with contextlib.ExitStack() as stack:
-        with processes.first_process_first("opened"):
+        with processes.together():
             if processes.is_first():
                 stack.enter_context(open_run(command.config, RUNS, resume=command.resume))
         if not (command.resume and (folder / "results.json").exists()):
@@ -111,5 +112,6 @@ def run(command: "Command", folder: Path, console: Console, started: float) -> N
         callbacks = [Export(), judge, Report(), *callbacks]
         first = processes.is_first()
         loop.train(training_run, callbacks if first else [], resume=bool(command.resume))
+    processes.barrier("ended")  # after uploads, which may take longer than JAX waits at exit
     report = folder / "report.html"
     console.print(f"finished in {training_run.seconds['total']:.0f} s: {report}", markup=False)

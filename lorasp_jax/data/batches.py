@@ -173,3 +173,9 @@ def sample_batch(
     start_key, noise_key = jax.random.split(key)
     raw = draw(start_key, steps, batch_size=batch_size, chunk=chunk)
     return encode(noise_key, raw, processor, state_noise=state_noise)
+
+
+def nbytes(tree: Any) -> int:
+    """Return the size of the arrays or shapes in a pytree [bytes]."""
+    leaves = [leaf for leaf in jax.tree.leaves(tree) if hasattr(leaf, "dtype")]
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in leaves)

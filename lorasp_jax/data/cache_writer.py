@@ -10,19 +10,20 @@ from lorasp_jax.base.files import as_value_error, check_regular
 
 
 class Column:
-    """An .npy file that grows along its first axis."""
+    """An .npy file that grows along its first axis; `crc32` is the checksum of its rows."""
 
     def __init__(self, path: Path, like: np.ndarray) -> None:
         """Create an empty file for rows of the same dtype and shape as those of `like`."""
         self._file = path.open("wb")
         self._header = {"descr": np.lib.format.dtype_to_descr(like.dtype), "fortran_order": False}
-        self._row_shape, self._length = like.shape[1:], 0
+        self._row_shape, self._length, self.crc32 = like.shape[1:], 0, 0
         self._write_header()
 
     def append(self, rows: np.ndarray) -> None:
         """Append rows."""
         rows = np.ascontiguousarray(rows)
         self._file.write(rows.data)
+        self.crc32 = zlib.crc32(rows.data, self.crc32)
         self._length += len(rows)
 
     def close(self) -> None:
@@ -66,6 +67,12 @@ def map_column(
             )
         if path.stat().st_size != array.offset + array.nbytes:
             raise ValueError(f"its size does not match the shape {expected}")
-        if crc32 is not None and zlib.crc32(array.data) != crc32:
-            raise ValueError("its checksum does not match")
-        return array.view(np.ndarray)
+    if crc32 is not None:
+        verify_column(path, array, crc32)
+    return array.view(np.ndarray)
+
+
+def verify_column(path: Path, array: np.ndarray, crc32: int) -> None:
+    """Raise ValueError unless an array, mapped from `path`, has this checksum."""
+    if zlib.crc32(array.data) != crc32:
+        raise ValueError(f"{path} is damaged (its checksum does not match)")

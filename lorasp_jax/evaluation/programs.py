@@ -24,9 +24,8 @@ from lorasp_jax.config import Config
 from lorasp_jax.evaluation import rollout
 from lorasp_jax.evaluation.rollout import Rollout, act, as_rollout, num_calls, predict
 from lorasp_jax.models.sampling import Sampler
-from lorasp_jax.policies.correction import CorrectionHead, correct
 from lorasp_jax.policies.policy import Policy
-from lorasp_jax.policies.processor import Processor, RawObservation
+from lorasp_jax.policies.processor import RawObservation
 from lorasp_jax.training.distributed import mesh as meshes
 
 
@@ -129,21 +128,6 @@ class Worlds:
         self.state, poses = _act(self._env, self.state, actions[:, :execute_steps])
         return poses
 
-    def correct(
-        self, head: CorrectionHead, chunk: jax.Array, step: int, index: np.ndarray
-    ) -> jax.Array:
-        """Observe the worlds and correct action `step` of chunks `[W, C, J+1]`.
-
-        Args:
-            head: the correction head.
-            chunk: the actions to be executed.
-            step: which of them to correct.
-            index: `[C]` int32, index of each action in the chunk that it was sampled in.
-        """
-        observation = _observe(self._env, self.state)
-        inputs = (self._policy.processor, observation, chunk, np.int32(step), index)
-        return jax.device_put(_correct()(head, *inputs), self._place)
-
     def hold(self, action: jax.Array, steps: int) -> None:
         """Execute the same action `[W, J+1]` for a number of control steps."""
         self.state = _hold(self._env, self.state, action, np.int32(steps))
@@ -209,24 +193,6 @@ def _predict() -> Callable[..., Any]:
     """Return the jitted `predict`; not a constant, because its options start JAX's backend."""
     options = fast_cpu.without_simulation()
     return jax.jit(predict, static_argnames="denoise_steps", compiler_options=options)
-
-
-@functools.cache
-def _correct() -> Callable[..., Any]:
-    """Return the jitted `correct`; not a constant, for the same reason as `_predict`."""
-
-    def correct_action(
-        head: CorrectionHead,
-        processor: Processor,
-        observation: RawObservation,
-        chunk: jax.Array,
-        step: jax.Array,
-        index: jax.Array,
-    ) -> jax.Array:
-        indices = jnp.broadcast_to(index[step], len(chunk))
-        return correct(head, processor, observation, chunk[:, step], indices)
-
-    return jax.jit(correct_action, compiler_options=fast_cpu.without_simulation())
 
 
 def _placement(policy: Policy) -> Any:

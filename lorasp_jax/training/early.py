@@ -11,16 +11,15 @@ from envs.datasets.episodes import Episodes
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.base import messages
 from lorasp_jax.config import Config
-from lorasp_jax.data.batches import flatten
+from lorasp_jax.data.batches import flatten, nbytes
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor
-from lorasp_jax.training import loop, setup
-from lorasp_jax.training.cost.preflight import nbytes
+from lorasp_jax.training import program, setup
+from lorasp_jax.training.batches import DrawnBatches
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.optim import make_optimizer
 from lorasp_jax.training.run import Run
 from lorasp_jax.training.step import init_state
-from lorasp_jax.training.windows import DrawnWindows
 
 
 def compile_training(run: Run, built: setup.RunSetup) -> None:
@@ -59,11 +58,11 @@ def data_shapes(run: Run, built: setup.RunSetup) -> tuple[int, Any]:
     mesh, size = meshes.make_mesh(config.fsdp, run.devices), config.optim.batch_size
     episode = jax.eval_shape(lambda: flatten([_first_episode(config, built)]))
     steps = jax.tree.map(lambda x: jax.ShapeDtypeStruct((count, *x.shape[1:]), x.dtype), episode)
-    windows = DrawnWindows(steps, mesh, size, built.base.config.chunk)
+    drawn = DrawnBatches(steps, mesh, size, built.base.config.chunk)
     if source is None or nbytes(steps) <= built.free_bytes:
-        call_size = windows.call_size(min(config.log_every, config.optim.steps))
-        return nbytes(steps), windows.shapes(call_size)
-    return 0, windows.shapes(1)
+        call_size = drawn.call_size(min(config.log_every, config.optim.steps))
+        return nbytes(steps), drawn.shapes(call_size)
+    return 0, drawn.shapes(1)
 
 
 def _blank_processor(config: Config, built: setup.RunSetup) -> Processor:
@@ -103,10 +102,10 @@ def _lower(run: Run, built: setup.RunSetup, batches: Any) -> Any:
         functools.partial(init_state, optimizer=optimizer, ema=config.optim.ema > 0), adapters
     )
     shardings = meshes.shardings(state, mesh)
-    frozen = loop.Frozen(frozen, _blank_processor(config, built).shared())
+    frozen = program.Frozen(frozen, _blank_processor(config, built).shared())
     frozen = jax.tree.map(_with_sharding, frozen, meshes.shardings(frozen, mesh))
     state = jax.tree.map(_with_sharding, state, shardings)
-    steps = loop.jit_steps(run, graphdef, optimizer, shardings)
+    steps = program.jit_steps(run, graphdef, optimizer, shardings)
     return steps.lower(frozen, batches, state, jax.random.key(0))
 
 

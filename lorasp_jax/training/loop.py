@@ -1,10 +1,9 @@
 """The training loop: resume, train, log, save. Evaluation and reports are callbacks."""
 
 import contextlib
-import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 from flax import nnx
@@ -12,22 +11,21 @@ from flax import nnx
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.base.bars import bars
 from lorasp_jax.config import Config, OptimConfig
-from lorasp_jax.data.batches import Raw, encode
 from lorasp_jax.policies.policy import Policy
-from lorasp_jax.policies.processor import Processor
-from lorasp_jax.training import compilation
+from lorasp_jax.training.batches import Collect, make_batches
 from lorasp_jax.training.checkpoint import Checkpoints
+from lorasp_jax.training.cost.speed import Speed
 from lorasp_jax.training.demonstrations import fresh_demonstrations
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.guard import summarize
 from lorasp_jax.training.interrupt import deferred
-from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
-from lorasp_jax.training.random_streams import RandomStream, StepKeys
+from lorasp_jax.training.optim import make_optimizer
+from lorasp_jax.training.program import Frozen, Program, jit_steps
+from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import MetricsLog
-from lorasp_jax.training.step import TrainState, init_state, train_step
-from lorasp_jax.training.stepper import Collect, Stepper, make_stepper
+from lorasp_jax.training.step import TrainState, init_state
 
 
 class RunError(ValueError):
@@ -50,47 +48,60 @@ def train(
         collect: collects new demonstrations if `data.fresh_every` is set.
 
     Raises:
-        RunError: too many consecutive steps were skipped, or an update was non-finite. The last
-            checkpoint is kept.
-        KeyboardInterrupt: a signal stopped the run. The state is saved first, unless a second
-            signal arrives.
+        RunError: too many consecutive steps were skipped, or an update was non-finite.
+        KeyboardInterrupt: a signal stopped the run; without a second one, the state is saved first.
     """
-    graphdef, adapters, frozen = adaptation.split(run.policy.model)
+    state, policy, make_program = _split(run)
+    run.policy = policy(state)
+    checkpoints = Checkpoints(run.folder, run.base_hash, run.console)
+    restored = checkpoints.restore(state) if resume else None
+    state = restored or state
+    program = make_program(int(state.step), collect)
+    if restored is None:
+        program.compile(state, _log_interval(run.config, int(state.step)))  # in the background
+        _call(callbacks, run, "on_start")
+    try:
+        with run.timed("train"):
+            state = _loop(run, state, program, checkpoints, callbacks, policy)
+    except RunError as error:
+        for callback in callbacks:
+            callback.on_stop(run, str(error))
+        raise
+    finally:
+        checkpoints.close()
+    run.policy = policy(state)
+    _call(callbacks, run, "on_end")
+
+
+def _split(
+    run: Run,
+) -> tuple[TrainState, Callable[[TrainState], Policy], Callable[[int, Collect], Program]]:
+    """Place the run on its devices.
+
+    Returns:
+        The initial state, a function that returns the policy of a state, and one that creates the
+        program that trains from a step on.
+    """
+    graphdef, adapters, parameters = adaptation.split(run.policy.model)
     methods = adaptation.methods(run.policy.model).values()
     optimizer = make_optimizer(run.config.optim, methods)
     state = init_state(adapters, optimizer, ema=run.config.optim.ema > 0)
     mesh = meshes.make_mesh(run.config.fsdp, run.devices)
     shardings = meshes.shardings(state, mesh)
     state = processes.device_put(state, shardings)
-    frozen = Frozen(frozen, run.policy.processor.shared())
-    frozen = processes.device_put(frozen, meshes.shardings(frozen, mesh))
     processor = run.policy.processor
+    frozen = Frozen(parameters, processor.shared())
+    frozen = processes.device_put(frozen, meshes.shardings(frozen, mesh))
 
     def policy(state: TrainState) -> Policy:
         return Policy(nnx.merge(graphdef, state.eval_adapters, frozen.parameters), processor)
 
-    run.policy = policy(state)
-    checkpoints = Checkpoints(run.folder, run.base_hash, run.console)
-    restored = checkpoints.restore(state) if resume else None
-    state = restored or state
-    jitted = jit_steps(run, graphdef, optimizer, shardings)
-    stepper = make_stepper(run, jitted, frozen, mesh, int(state.step), collect)
-    if restored is None:
-        stepper.compile(state, _log_interval(run.config, int(state.step)))  # in the background
-        _call(callbacks, run, "on_start")
-    try:
-        with run.timed("train"):
-            state = _loop(run, state, stepper, checkpoints, callbacks, policy)
-    except RunError as error:
-        for callback in callbacks:
-            callback.on_stop(run, str(error))
-        # Otherwise another process could make the first one exit before `on_stop` is done.
-        processes.barrier("stopped")
-        raise
-    finally:
-        checkpoints.close()
-    run.policy = policy(state)
-    _call(callbacks, run, "on_end")
+    def make_program(start: int, collect: Collect) -> Program:
+        speed = Speed.of(run.config, run.policy.model.config)
+        batches = make_batches(run, mesh, start, collect, speed)
+        return Program(jit_steps(run, graphdef, optimizer, shardings), frozen, batches, speed)
+
+    return state, policy, make_program
 
 
 def _call(callbacks: Sequence[Callback], run: Run, hook: str) -> None:
@@ -120,59 +131,6 @@ def _local_policy(run: Run, name: str) -> Iterator[None]:
     processes.barrier(name)
 
 
-class Frozen(NamedTuple):
-    """What training does not change.
-
-    Attributes:
-        parameters: frozen parameters of the model.
-        processor: normalizes the batches; an input of the training program and not a part of it, so
-            that runs on other demonstrations have the same program.
-    """
-
-    parameters: Any
-    processor: Processor
-
-
-def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) -> Callable:
-    """Return the jitted scan over steps: (frozen, batches, state, key) -> state, metrics.
-
-    `frozen` is a `Frozen`, `batches` a `Raw`; the batches and the metrics have a leading axis over
-    steps. `shardings` are those of the state, from `meshes.shardings`. If a run calls this
-    again with equal inputs, it gets the same program, which JAX has traced already.
-    """
-    optim, mesh = run.config.optim, shardings.step.mesh
-    step = functools.partial(
-        train_step,
-        graphdef=graphdef,
-        optimizer=optimizer,
-        weights=auxiliary_weights(run.config.auxiliary, optim.steps),
-        parts=optim.accumulate,
-        ema=optim.ema,
-        spike=optim.spike,
-        max_delay=optim.rtc_max_delay,
-    )
-
-    def body(state: TrainState, raw: Raw, frozen: Frozen, key: jax.Array) -> Any:
-        keys = StepKeys.of(key, state.step)
-        noise = optim.state_noise
-        batch = encode(keys.state_noise, raw, frozen.processor, state_noise=noise)
-        batch = jax.lax.with_sharding_constraint(batch, meshes.batch_sharding(mesh))
-        return step(state, frozen.parameters, batch, keys.loss)
-
-    # Keep the state's sharding: the compiled program accepts no other as its input.
-    @functools.partial(
-        jax.jit,
-        donate_argnames="state",
-        out_shardings=(shardings, meshes.replicated(mesh)),
-        compiler_options=compilation.step_options(mesh.size),
-    )
-    def scan(frozen: Frozen, batches: Raw, state: TrainState, key: jax.Array) -> Any:
-        return jax.lax.scan(lambda state, raw: body(state, raw, frozen, key), state, batches)
-
-    inputs = optim, run.config.auxiliary, graphdef, *jax.tree.leaves(shardings)
-    return run.programs.setdefault(inputs, scan)
-
-
 def _log_interval(config: Config, done: int) -> int:
     """Return the number of steps until the next log entry or the end of training."""
     return min(config.log_every, config.optim.steps - done)
@@ -181,33 +139,31 @@ def _log_interval(config: Config, done: int) -> int:
 def _loop(
     run: Run,
     state: TrainState,
-    stepper: Stepper,
+    program: Program,
     checkpoints: Checkpoints,
     callbacks: Sequence[Callback],
     policy: Callable[[TrainState], Policy],
 ) -> TrainState:
     """Run log intervals until the last step or a signal to stop."""
     config, key = run.config, RandomStream.TRAINING.key(run.config.seed)
-    total, saved = config.optim.steps, int(state.step)
+    total, saved, stopped = config.optim.steps, int(state.step), False
     with (
         contextlib.closing(MetricsLog(run.folder, saved)) as log,
         deferred() as stop,
         bars(run.console, "samples", per_step=config.optim.batch_size) as progress,
     ):
         bar = progress.add_task("compiling train step ...", total=total, completed=saved)
-        stopped = False
         while (done := int(state.step)) < total and not stopped:
             count = _log_interval(config, done)
-            state, metrics = stepper(state, key, count)
+            state, metrics = program(state, key, done, count)
             rows, done = jax.device_get(metrics), done + count
             means = summarize(rows)
-            values = {name: float(mean.mean()) for name, mean in means.items()}
-            values |= stepper.speed.end(count)
+            values = {name: float(x.mean()) for name, x in means.items()} | program.speed.end(count)
             if error := _failure(config.optim, rows, values, done, saved):
                 log.write(done, values)
                 raise error
-            loss = values.get("task", math.nan)
-            progress.update(bar, completed=done, description=f"training, loss {loss:.4f}")
+            text = f"training, loss {values.get('task', math.nan):.4f}"
+            progress.update(bar, completed=done, description=text)
             run.policy = policy(state)
             values = _call_on_log(callbacks, run, done, values)
             log.write(done, values, {name: mean for name, mean in means.items() if mean.ndim})

@@ -1,11 +1,7 @@
 """Parse the command line into a `Config`: experiment file, scale, method and dotted overrides."""
 
 import argparse
-import contextlib
 import dataclasses
-import difflib
-import io
-import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
@@ -18,8 +14,6 @@ from lorasp_jax import peft
 from lorasp_jax.config import SCALES, Config
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.training import experiment_file
-from lorasp_jax.training.help_text import REGISTRY
-from lorasp_jax.training.scales import differences
 
 HELP = {"-h", "--help"}
 
@@ -44,8 +38,8 @@ def parse(arguments: Sequence[str], program: str = "python train.py") -> Command
     """Parse command-line arguments; `program` is the program name in the help text.
 
     Raises:
-        ValueError: an unknown config, scale, method, field, task or robot, or an invalid value.
-        SystemExit: after printing the help text.
+        ValueError: an unknown config, scale, method, task or robot, or an invalid value.
+        SystemExit: after printing the help text, or what is wrong with a field.
     """
     parser = _option_parser(program)
     try:
@@ -63,12 +57,12 @@ def parse(arguments: Sequence[str], program: str = "python train.py") -> Command
     elif wants_help:
         config = Config(name="NAME", scale=known.scale, peft=LoRASP())
     else:
-        _check_names(rest, Config(name="NAME", scale=known.scale, peft=LoRASP()))
         parser.print_help()
         raise ValueError("--config is required, for example --config configs/multitask.py")
     if wants_help:
         _option_parser(program, config.peft.name).print_help()
-        print(f"\n{_scale_note(known.config, known.scale)}")
+        defaults = f"for --scale {known.scale}" if known.config else "built-in"
+        print(f"\nthe defaults below are {defaults}")
         rest = ["--help"]  # the rest may be incomplete, as in --seed --help
     if known.method is not None:
         config = dataclasses.replace(config, peft=_with_rank_of(config.peft, known.method))
@@ -111,14 +105,9 @@ def _option_parser(program: str = "", method: str = "") -> argparse.ArgumentPars
     methods = ", ".join(peft.names())
     default = ", ".join(filter(None, ["the experiment's", method]))
     parser.add_argument("--method", help=f"adapter method: {methods} (default: {default})")
-    parser.add_argument(
-        "--resume",
-        nargs="?",
-        const=True,
-        default=False,
-        choices=["auto"],
-        help="resume the run of this name; with auto, start it if it does not exist",
-    )
+    text = "resume the run of this name; with auto, start it if it does not exist"
+    resume: Any = {"nargs": "?", "const": True, "default": False, "choices": ["auto"]}
+    parser.add_argument("--resume", help=text, **resume)
     parser.add_argument(
         "--dry-run",
         action="store_true",
@@ -133,14 +122,6 @@ def _option_parser(program: str = "", method: str = "") -> argparse.ArgumentPars
         help="train in several processes started by a launcher, see docs/launch.md",
     )
     return parser
-
-
-def _scale_note(path: Path | None, scale: str) -> str:
-    """Compare an experiment's scales and name the scale of the printed defaults."""
-    if path is None:
-        return "the defaults below are built-in; add --config FILE to see the experiment's"
-    table = differences(lambda scale: load(path, scale))
-    return f"{table}the defaults below are for --scale {scale}"
 
 
 def choose_scale(scale: str) -> str:
@@ -165,42 +146,20 @@ def load(path: Path, scale: str) -> Config:
 
 
 def override(config: Config, arguments: Sequence[str], program: str = "") -> Config:
-    """Apply dotted overrides such as `--peft.rank 64 --optim.steps 100`."""
-    wants_help = bool(HELP & set(arguments))
-    _check_names(arguments, config)
-    printed = io.StringIO()
-    quiet = contextlib.nullcontext() if wants_help else contextlib.redirect_stderr(printed)
-    try:
-        with quiet:
-            parsed = tyro.cli(
-                _concrete(config),
-                default=config,
-                args=list(arguments),
-                prog=program,
-                registry=REGISTRY,
-                config=(tyro.conf.AvoidSubcommands,),
-            )
-    except SystemExit as error:
-        if wants_help:
-            raise
-        raise ValueError(_sentence(printed.getvalue())) from error
+    """Apply dotted overrides such as `--peft.rank 64 --optim.steps 100`.
+
+    Raises:
+        SystemExit: after printing the help text, or what is wrong with a field.
+    """
+    parsed = tyro.cli(
+        _concrete(config),
+        default=config,
+        args=[*arguments],
+        prog=program,
+        config=(tyro.conf.AvoidSubcommands,),
+    )
     names = (field.name for field in dataclasses.fields(Config))
     return Config(**{name: getattr(parsed, name) for name in names})
-
-
-def _check_names(arguments: Sequence[str], config: Config) -> None:
-    """Raise ValueError for an unknown option."""
-    fields = ["--" + name for name, _ in _fields(config)]
-    for argument in arguments:
-        name = argument.split("=")[0].replace("_", "-")
-        negated = name.replace(".no-", ".")  # the option that sets a bool to False
-        if name.startswith("--") and not {name, negated} & {*fields, "--help"}:
-            options = vars(_option_parser().parse_args([]))
-            others = ["--" + name.replace("_", "-") for name in options]
-            close = difflib.get_close_matches(name, fields + others, n=1, cutoff=0.5)
-            valid = f": valid fields are {' '.join(fields)}"
-            hint = f": did you mean {close[0]}?" if close else valid
-            raise ValueError(f"unknown option {name}{hint}")
 
 
 def _check_simulated(config: Config) -> None:
@@ -214,13 +173,6 @@ def _check_simulated(config: Config) -> None:
         check("task", task)
     if not config.robot.endswith(".xml"):  # .xml: the user's own MJCF file
         check("robot", config.robot)
-
-
-def _sentence(message: str) -> str:
-    """Return the first paragraph below the title of tyro's framed error message, on one line."""
-    lines = [line.strip(" │╭╮╰╯─-") for line in message.splitlines()]
-    body = itertools.takewhile(bool, itertools.dropwhile(lambda line: not line, lines[1:]))
-    return " ".join(body).removeprefix("Error parsing ").removeprefix("Config: ")
 
 
 def _with_rank_of(current: peft.Method, name: str) -> peft.Method:

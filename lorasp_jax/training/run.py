@@ -28,7 +28,7 @@ class Run:
         streams: whether batches are read from disk because the dataset does not fit on the device.
         devices: devices to train on; None: all.
         simulated: whether the tasks can be evaluated in simulation.
-        programs: jitted training programs by their inputs; see `loop.jit_steps`.
+        programs: jitted training programs by their inputs; see `program.jit_steps`.
         policy: the current policy; read it in callbacks or after training, since each step donates
             its buffers.
         started: `time.perf_counter()` when this process started.

@@ -38,9 +38,9 @@ STOPPED = "stopped.json"
 """File with the reason why training stopped; removed when training continues."""
 
 
-ADDED = (("model", "base_dtype"), ("model", "chunk"), ("optim", "rtc_max_delay"))
-"""Settings that earlier versions lack; like them, `to_json` omits those at their defaults, which
-are 0 or empty."""
+_OPTIONAL = (("model", "base_dtype"), ("model", "chunk"), ("optim", "rtc_max_delay"))
+"""Settings that `to_json` omits at their defaults, which are 0 or empty: results files of studies
+do not have them."""
 
 
 def to_json(config: Config) -> dict[str, Any]:
@@ -49,7 +49,7 @@ def to_json(config: Config) -> dict[str, Any]:
     `scene` has only the ranges that differ from the defaults, and is absent if none do.
     """
     fields = json.loads(json.dumps(dataclasses.asdict(config)))
-    for group, name in ADDED:
+    for group, name in _OPTIONAL:
         if not fields[group][name]:
             del fields[group][name]
     scene = fields.pop("scene")
@@ -189,15 +189,9 @@ def _recorded(folder: Path) -> dict[str, Any]:
 
 
 def changed_settings(recorded: Mapping[str, Any], current: Mapping[str, Any]) -> list[str]:
-    """Return the dotted names of settings that differ between two results of `to_json`.
-
-    The recorded one may have been written by an earlier version.
-    """
-    earlier = {
-        "peft": without_removed(recorded["peft"]),
-        "evaluation": {"before": True, **recorded.get("evaluation", {})},  # every run did
-    }
-    return _differences({**recorded, **earlier}, current)
+    """Return the dotted names of settings that differ between two results of `to_json`."""
+    recorded = {**recorded, "peft": without_removed(recorded["peft"])}
+    return _differences(recorded, current)
 
 
 def _differences(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> list[str]:
@@ -277,8 +271,10 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
     rows = []
     for number, line in enumerate(lines, 1):
         try:
-            rows.append(verify_digest(json.loads(line)))
-            check(rows[-1], records.ROW)
+            row = json.loads(line)
+            check(row, records.ROW)
+            row.pop("digest", None)  # only in logs of an early version
+            rows.append(row)
         except (ValueError, RecursionError) as error:
             raise ValueError(
                 f"line {number} of {path} is damaged ({error}): restore the file or delete the line"
@@ -287,4 +283,4 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
 
 
 def _line(row: Mapping[str, float]) -> str:
-    return json.dumps(with_digest(row)) + "\n"
+    return json.dumps(row) + "\n"

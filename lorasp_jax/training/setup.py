@@ -1,8 +1,7 @@
 """Build a run from a config: base, adapters, demonstrations and processor."""
 
-import contextlib
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -24,7 +23,6 @@ from lorasp_jax.base import hub
 from lorasp_jax.base.bars import bars
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Batch, encode, flatten, sample_batch, windows
-from lorasp_jax.data.checked_images import load_images
 from lorasp_jax.data.source import Source
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.models import presets
@@ -138,14 +136,13 @@ def prepare(
     """Build a run and load or collect its demonstrations.
 
     Args:
-        config: the run's config.
-        folder: the run's folder.
+        config, folder: the run's config and folder.
         console: prints progress.
         started: `time.perf_counter()` when this process started.
         load_base: returns the base, like `base_model`.
         collect: collects demonstrations, like `demonstrations`.
-        meanwhile: functions that run in threads of their own until the demonstrations are there, to
-            compile what the run needs next. Their errors are raised here.
+        meanwhile: functions that compile what the run needs next, in threads of their own until
+            the demonstrations are there. Their errors are raised here.
 
     Raises:
         ValueError: see `build`; also if the dataset cannot be read or the expert fails.
@@ -156,34 +153,30 @@ def prepare(
     console.print(headline(config, model))
     console.print(f"memory per device: {built.memory}; rematerialization: {base.config.remat}")
     run = Run(config, folder, console, built.base_hash, started)
-    with (
-        run.timed("collect"),
-        processes.first_process_first("collected"),
-        _in_threads(meanwhile, run, built),
-    ):
-        if built.source:
-            _load_dataset(run, built.source, built.free_bytes)
-        else:
-            run.episodes = _collect(run, built.prompts.instructions, collect)
-    run.streams = processes.any_process(run.streams)  # all or none: they share batches
+    _load_or_collect(run, built, collect, meanwhile)
     relative = config.model.relative_actions
     inputs = processor([*run.episodes.values()], model.config, built.prompts, relative=relative)
     if config.peft.needs_statistics:
-        statistics = input_moments(run, base, inputs)
-        model = _adapt(config, base, config.peft, statistics)
+        model = _adapt(config, base, config.peft, input_moments(run, base, inputs))
     if built.source:
         console.print(_camera_summary(inputs), markup=False, soft_wrap=True)
     run.policy = Policy(model, inputs)
     return run
 
 
-@contextlib.contextmanager
-def _in_threads(functions: Sequence[Meanwhile], run: Run, built: RunSetup) -> Iterator[None]:
-    """Run functions during this block and wait for them, unless it raises."""
-    futures = [in_thread(function, run, built) for function in functions]
-    yield
-    for future in futures:
-        future.result()
+def _load_or_collect(
+    run: Run, built: RunSetup, collect: Collect, meanwhile: Sequence[Meanwhile]
+) -> None:
+    """Load the dataset or collect demonstrations, with `meanwhile` in threads, and wait for all."""
+    with run.timed("collect"), processes.first_process_first("collected"):
+        futures = [in_thread(function, run, built) for function in meanwhile]
+        if built.source:
+            _load_dataset(run, built.source, built.free_bytes)
+        else:
+            run.episodes = _collect(run, built.prompts.instructions, collect)
+        for future in futures:
+            future.result()
+    run.streams = processes.any_process(run.streams)  # all or none: they share batches
 
 
 def headline(config: Config, model: Backbone) -> str:
@@ -282,7 +275,7 @@ def _batch_sampler(run: Run, processor: Processor, chunk: int) -> Callable[[jax.
     if run.streams:
         stream = Stream(run.steps, batch_size=size, chunk=chunk, seed=run.config.seed)
         return lambda key: encode(key, next(stream), processor, state_noise=noise)
-    steps = jax.device_put(load_images(run.steps))
+    steps = jax.device_put(run.steps)
     return jax.jit(
         lambda key: sample_batch(
             key, steps, processor, batch_size=size, chunk=chunk, state_noise=noise
@@ -327,6 +320,7 @@ def _load_dataset(run: Run, source: Source, free_bytes: float) -> None:
         bar = progress.add_task(f"reading {run.config.data.source}", total=None)
         report = lambda done, total: progress.update(bar, completed=done, total=total)  # noqa: E731
         cache = as_cache(source, run.folder, report)
+        cache.verify_images()
         progress.update(bar, completed=cache.num_steps, total=cache.num_steps)
     metadata = cache.metadata
     run.dataset, run.episodes, run.simulated = cache.steps, outline(cache), is_simulated(cache)

@@ -54,13 +54,13 @@ def test_every_command_has_help_under_its_own_name(name, capsys):
 
 
 def test_train_is_the_same_program(tmp_path):
-    bad = ["--config", "configs/multitask.py", "--scale", "smoke", "--peft.rnk", "3"]
+    bad = ["--config", "configs/multitask.py", "--scale", "smoke", "--method", "lorra"]
     result = console("train", *bad, cwd=tmp_path)
     script = [sys.executable, str(ROOT / "train.py"), *bad]
     other = subprocess.run(script, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.returncode == other.returncode == 2
     assert result.stderr == other.stderr
-    assert "did you mean --peft.rank?" in result.stderr
+    assert "'lorra'" in result.stderr
     assert not list(tmp_path.iterdir())
 
 

@@ -9,7 +9,7 @@ from rich.console import Console
 import envs
 from lorasp_jax.training.distributed import processes
 
-processes.initialize(Console(), "add --resume")
+processes.initialize(Console())
 assert jax.process_count() == 2
 if jax.process_index() == 1:
     env = envs.make("press", num_envs=2, image_size=16)

@@ -5,7 +5,6 @@ import re
 
 import pytest
 
-from lorasp_jax.base.digest import with_digest
 from lorasp_jax.report.html import speed, write_report
 from lorasp_jax.training.run_folder import STOPPED, MetricsLog, to_json, write_json
 from tests.runs import CONFIG, RESULTS, finish
@@ -40,7 +39,7 @@ def test_full_fine_tuning_has_no_ranks(folder):
     write_json(folder / "config.json", config)
     results = {**RESULTS, "active_rank": {}, "layer_active_rank": {"vision": {}}}
     write_json(folder / "results.json", results)
-    (folder / "metrics.jsonl").write_text(json.dumps(with_digest({"step": 2, "task": 0.5})) + "\n")
+    (folder / "metrics.jsonl").write_text(json.dumps({"step": 2, "task": 0.5}) + "\n")
     assert "Active rank" not in write_report(folder).read_text()
 
 
@@ -86,7 +85,7 @@ def test_stopped_run_shows_the_reason(folder):
     (folder / "results.json").unlink()
     write_json(folder / STOPPED, {"reason": "the loss was <nan>"})
     with (folder / "metrics.jsonl").open("a") as file:
-        rows = [with_digest({"step": s, "skipped": 2.0}) for s in (6, 8)]
+        rows = [{"step": s, "skipped": 2.0} for s in (6, 8)]
         file.writelines(json.dumps(row) + "\n" for row in rows)
     page = write_report(folder).read_text()
     assert "<b>The run stopped:</b> the loss was &lt;nan&gt;." in page

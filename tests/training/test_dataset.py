@@ -12,21 +12,22 @@ import pytest
 from rich.console import Console
 
 from lorasp_jax.adapters import adaptation
-from lorasp_jax.base.digest import with_digest
 from lorasp_jax.config import DataConfig
 from lorasp_jax.data.batches import flatten
 from lorasp_jax.evaluation.callback import NoEvaluation
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.report.html import write_report
 from lorasp_jax.training import setup
+from lorasp_jax.training.batches import StreamedBatches
+from lorasp_jax.training.batches import streamed as read
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.cost.speed import Speed
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.loop import train
+from lorasp_jax.training.program import Program
 from lorasp_jax.training.run_folder import read_metrics, to_json, write_json
-from lorasp_jax.training.stepper import StreamingStepper, _batches
 from tests.models.random_models import random_backbone
-from tests.runs import CONFIG, StepCount, Terminate, leaves, make_run, random_episodes, repeatable
+from tests.runs import CONFIG, Terminate, leaves, make_run, random_episodes, repeatable
 
 
 def streamed(folder, devices=1):
@@ -64,19 +65,20 @@ def test_every_step_has_the_next_batch(tmp_path):
     @jax.jit
     def record(frozen, batches, state, key):
         assert len(batches.state) == 1
-        return StepCount(state.step + 1), {"sum": jnp.atleast_1d(batches.state.sum() + frozen)}
+        return state + 1, {"sum": jnp.atleast_1d(batches.state.sum() + frozen)}
 
     def sums(start, *counts):
-        stepper = StreamingStepper(record, 1.0, _batches(run, mesh, start), Speed(8, None))
-        state, totals = StepCount(jnp.asarray(start)), []
+        speed = Speed(8, None)
+        steps = Program(record, 1.0, StreamedBatches(read(run, mesh, start), speed), speed)
+        state, totals = jnp.asarray(start), []
         for count in counts:
-            state, metrics = stepper(state, jax.random.key(0), count)
+            state, metrics = steps(state, jax.random.key(0), int(state), count)
             assert metrics["sum"].shape == (count,)
             totals += [float(metrics["sum"].sum())]
-        assert state.step == start + sum(counts)
+        assert state == start + sum(counts)
         return totals
 
-    batches = _batches(run, mesh, 0)
+    batches = read(run, mesh, 0)
     each = [float(next(batches).state.sum() + 1) for _ in range(9)]
     near = {"rtol": 1e-5, "atol": 1e-5}  # another program sums in another order
     expected = [sum(each[:2]), sum(each[2:6]), sum(each[6:])]
@@ -139,7 +141,7 @@ def test_a_run_without_simulation_has_a_report(tmp_path):
     with run.timed("train"):
         pass
     write_json(run.folder / "config.json", to_json(run.config))
-    row = with_digest({"step": 2, "task": 0.5, "active_rank/vision": 3})
+    row = {"step": 2, "task": 0.5, "active_rank/vision": 3}
     (run.folder / "metrics.jsonl").write_text(json.dumps(row) + "\n")
     NoEvaluation().on_end(run)
     found = json.loads((run.folder / "results.json").read_text())

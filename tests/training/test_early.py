@@ -14,7 +14,7 @@ from lorasp_jax.evaluation.callback import Evaluation
 from lorasp_jax.evaluation.programs import split_rollout
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import LoRA
-from lorasp_jax.training import early, loop, setup
+from lorasp_jax.training import early, loop, program, setup
 from lorasp_jax.training.distributed import mesh as meshes
 from tests.evaluation.test_programs import POLICY, WORLD, Room, compilations
 from tests.models.random_models import random_backbone
@@ -60,7 +60,7 @@ def prepare(monkeypatch, tmp_path):
 
 
 def test_the_run_compiles_nothing_else(prepare, monkeypatch):
-    texts, jit_steps = [], loop.jit_steps
+    texts, jit_steps = [], program.jit_steps
 
     def recorded(*arguments):
         def lower(*shapes):
@@ -75,6 +75,7 @@ def test_the_run_compiles_nothing_else(prepare, monkeypatch):
         del config, task
         return ROOM, split_rollout(ROOM, execute_steps=1, denoise_steps=2)
 
+    monkeypatch.setattr(program, "jit_steps", recorded)
     monkeypatch.setattr(loop, "jit_steps", recorded)
     evaluation = Evaluation(compile_rollout, write_video=None)
     with compilations() as counts:
@@ -88,13 +89,13 @@ def test_the_run_compiles_nothing_else(prepare, monkeypatch):
 
 
 def test_the_run_traces_nothing_again(prepare, monkeypatch):
-    calls, train_step = [], loop.train_step
+    calls, train_step = [], program.train_step
 
     def counted(*arguments, **options):
         calls.append(None)
         return train_step(*arguments, **options)
 
-    monkeypatch.setattr(loop, "train_step", counted)
+    monkeypatch.setattr(program, "train_step", counted)
     run = prepare(early.compile_training)
     traced = len(calls)
     loop.train(run)

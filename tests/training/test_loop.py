@@ -10,9 +10,9 @@ import pytest
 
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.training.loop import RunError, train
+from lorasp_jax.training.program import Program
 from lorasp_jax.training.run import Callback
 from lorasp_jax.training.run_folder import read_metrics
-from lorasp_jax.training.stepper import Stepper
 from tests.runs import CONFIG, Miniature, Terminate, leaves, make_run, repeatable
 
 
@@ -92,13 +92,13 @@ def test_signal_handlers_are_restored(tmp_path):
 @pytest.mark.slow
 def test_each_step_count_compiles_once_and_during_the_callbacks(tmp_path, monkeypatch):
     compiled = []
-    original = Stepper.compile
+    original = Program.compile
 
     def compile_and_record(self, state, count):
         compiled.append((count, count in self._compiled))
         return original(self, state, count)
 
-    monkeypatch.setattr(Stepper, "compile", compile_and_record)
+    monkeypatch.setattr(Program, "compile", compile_and_record)
 
     class LogSize(Callback):
         def on_start(self, run):

@@ -73,14 +73,21 @@ CHOICES = [(f"--{name}", value) for name, values in OPTIONS.items() for value in
 
 
 @pytest.mark.parametrize(("option", "value"), CHOICES)
-def test_invalid_options_are_rejected_in_one_sentence(
+def test_invalid_options_are_rejected(
     option: str, value: str | None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(Exception) as caught:  # noqa: PT011 (the type is checked below)
-        parse([*MULTITASK, option] if value is None else [*MULTITASK, f"{option}={value}"])
     field = option.rpartition(".")[2].removeprefix("--")
-    check_refusal(caught.value, field, field.replace("-", "_"))
-    assert not "".join(capsys.readouterr())
+    with pytest.raises((SystemExit, ValueError)) as caught:
+        parse([*MULTITASK, option] if value is None else [*MULTITASK, f"{option}={value}"])
+    out, printed = capsys.readouterr()
+    assert not out
+    if isinstance(caught.value, SystemExit):  # tyro has printed what is wrong
+        assert caught.value.code == 2
+        assert "Traceback" not in printed
+        assert field in printed or field.replace("-", "_") in printed
+    else:
+        check_refusal(caught.value, field, field.replace("-", "_"))
+        assert not printed
 
 
 CONFIG = "from lorasp_jax.config import *\nfrom lorasp_jax.peft import LoRASP\n"

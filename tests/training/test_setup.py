@@ -16,6 +16,7 @@ from rich.console import Console
 from lorasp_jax import models
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.config import DataConfig, ModelConfig
+from lorasp_jax.data.batches import nbytes
 from lorasp_jax.data.opening import open_source
 from lorasp_jax.models import inputs
 from lorasp_jax.models.checkpoints import loading
@@ -188,9 +189,9 @@ def test_a_quantized_base_on_the_command_line_trains_and_acts(config, tmp_path):
     run.devices = jax.devices()[:1]
     _, adapters, frozen = adaptation.split(run.policy.model)
     codes = [leaf for leaf in jax.tree.leaves(frozen) if leaf.dtype == jnp.float8_e4m3fn]
-    assert sum(code.size for code in codes) > 0.5 * preflight.nbytes(frozen)  # the rest: fp32
+    assert sum(code.size for code in codes) > 0.5 * nbytes(frozen)  # the rest: fp32
     abstract = preflight.abstract_model(config, run.policy.model.config)
-    assert preflight.nbytes(adaptation.split(abstract)[2]) == preflight.nbytes(frozen)
+    assert nbytes(adaptation.split(abstract)[2]) == nbytes(frozen)
     train(run)
     _, trained, after = adaptation.split(run.policy.model)
     assert all((a == b).all() for a, b in zip(*map(jax.tree.leaves, (frozen, after)), strict=True))

@@ -161,7 +161,7 @@ def test_a_run_under_slurm_resumes_and_equals_one_process(slurm, tmp_path):
     assert job_field("ExitCode")() == "130:0"
     log = (tmp_path / "log").read_text()
     assert "waiting for 2 processes at localhost:" in log
-    assert log.count("stopped; to resume: python train.py --distributed --resume auto") == 1
+    assert "stopped; to resume: python train.py --distributed --resume auto" in log
     assert 0 < len(read_metrics(folder)) < STEPS
     slurm(*command("scontrol"))
     # slurmd does not restart a job within the second in which it was killed
@@ -169,7 +169,7 @@ def test_a_run_under_slurm_resumes_and_equals_one_process(slurm, tmp_path):
     wait_for(ended)
     assert job_field("JobState")() == "COMPLETED", (tmp_path / "log").read_text()
     assert job_field("Restarts")() == "1"
-    assert not re.search("Traceback|disconnected unexpectedly", (tmp_path / "log").read_text())
+    assert not re.search("Traceback|fatal errors", (tmp_path / "log").read_text())
     assert_same(folder, whole)
 
 

@@ -43,7 +43,7 @@ class CheckPolicy(Callback):
 def main(folder: str, streams: str) -> None:
     """Run until a signal, then resume; arrays over 1 KiB are sharded."""
     if "JAX_PROCESS_ID" in os.environ:
-        processes.initialize(Console(), "add --resume")
+        processes.initialize(Console())
     mesh.shardings = functools.partial(mesh.shardings, minimum=1024)
     config = dataclasses.replace(
         CONFIG,

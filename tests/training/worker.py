@@ -36,7 +36,7 @@ def main(args: argparse.Namespace) -> None:
     from lorasp_jax.training.distributed import processes
 
     if "JAX_PROCESS_ID" in os.environ:
-        processes.initialize(Console(), "add --resume")
+        processes.initialize(Console())
 
     work(args.folder, args.steps, args.until, args.fails, args.mesh, args.hangs)
 

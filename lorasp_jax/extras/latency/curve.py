@@ -26,10 +26,8 @@ from lorasp_jax.extras.latency.execution import (
     delayed_rollout,
 )
 from lorasp_jax.extras.latency.smoothness import action_delta, jerk
-from lorasp_jax.policies.correction import CorrectionHead
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training import records
-from lorasp_jax.training.correction import files as correction
 from lorasp_jax.training.export import describe, load_policy
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run_folder import CONFIG_FILE, read_json, recorded_ranges, write_json
@@ -55,11 +53,9 @@ SCHEMA: records.Schema = {
     "guidance": float,
     "episodes": int,
     "num_envs": int,
-    "correction?": str,
     "curves": {str: {str: [POINT]}},
 }
-"""Schema of latency.json; its curves are by task and execution, and `correction` is the SHA-256 of
-the correction head."""
+"""Schema of latency.json; its curves are by task and execution."""
 _CONFIG: records.Schema = records.CONFIG | {
     "image_size": int,
     "control_dt": float,
@@ -106,10 +102,6 @@ def measure(run: Path, options: Options, progress: Progress | None = None) -> di
     executions = _executions(run, config, options.executions)
     policy = load_policy(run)
     settings = _settings(config, options, policy.model.config.chunk)
-    head = None
-    if "corrected" in executions:
-        head = correction.load(run, policy)
-        settings["correction"] = correction.describe(run)["sha256"]
     steps, chunk = settings["execute_steps"], settings["chunk"]
     longest = min(MAX_DELAY, steps, chunk - steps)
     delays = options.delays or range(longest + 1)
@@ -123,7 +115,7 @@ def measure(run: Path, options: Options, progress: Progress | None = None) -> di
     ]
     bar = progress.add_task("", total=len(missing)) if progress else None
     policy = prepared(policy)
-    rollout = functools.cache(functools.partial(_rollout, run, config, settings, head))
+    rollout = functools.cache(functools.partial(_rollout, run, config, settings))
     for number, (task, execution, delay) in enumerate(missing):
         if progress and bar is not None:
             text = f"{task}, {execution}, delay {delay}"
@@ -188,7 +180,6 @@ def _rollout(
     run: Path,
     config: dict[str, Any],
     settings: dict[str, Any],
-    head: CorrectionHead | None,
     task: str,
     execution: str,
 ) -> tuple[Env, Callable[[Policy, jax.Array, int], Trace]]:
@@ -202,8 +193,7 @@ def _rollout(
     )
     names = ("execute_steps", "denoise_steps", "guidance")
     how = Settings(execution, **{name: settings[name] for name in names})
-    head = head if execution == "corrected" else None
-    return env, delayed_rollout(env, how, ranges=recorded_ranges(config), head=head)
+    return env, delayed_rollout(env, how, ranges=recorded_ranges(config))
 
 
 @functools.cache
@@ -264,8 +254,7 @@ def _executions(run: Path, config: dict[str, Any], chosen: Sequence[str]) -> lis
     trained = _trained_delay(config) > 0
     if "trained" in chosen and not trained:
         raise ValueError(f"{run} was not trained for execution trained: --optim.rtc-max-delay is 0")
-    supported = {"trained": trained, "corrected": (run / correction.DESCRIPTION).exists()}
-    return [*chosen] or [name for name in EXECUTIONS if supported.get(name, True)]
+    return [*chosen] or [name for name in EXECUTIONS if trained or name != "trained"]
 
 
 def _trained_delay(config: dict[str, Any]) -> int:

@@ -24,7 +24,6 @@ from envs.env import Env
 from envs.scene.ranges import Randomization
 from lorasp_jax.evaluation.programs import Worlds
 from lorasp_jax.models.flow_matching import first
-from lorasp_jax.policies.correction import CorrectionHead
 from lorasp_jax.policies.policy import Policy
 
 EXECUTIONS = {
@@ -32,7 +31,6 @@ EXECUTIONS = {
     "naive": "the robot goes on with the previous chunk, which the new one ignores",
     "trained": "as naive, but the new chunk continues the previous one, as learned in training",
     "guided": "as naive, but guidance makes the new chunk continue the previous one",
-    "corrected": "as naive, but a small network corrects each action with the latest observation",
 }
 
 
@@ -88,19 +86,15 @@ def delayed_rollout(
     settings: Settings,
     *,
     ranges: Randomization | None = None,
-    head: CorrectionHead | None = None,
 ) -> Callable[[Policy, jax.Array, int], Trace]:
     """Create a function (policy, key, d) that runs `env.num_envs` episodes with a delay of d steps.
 
     No program depends on d. Without delay, synchronous and naive execution are the rollout of
-    `programs.split_rollout`, bit for bit. `head` is for corrected execution.
+    `programs.split_rollout`, bit for bit.
 
     Raises:
-        ValueError: corrected execution without a head, or a head without it; also `check_delay`, by
-            the function that is returned.
+        ValueError: see `check_delay`; raised by the function that is returned.
     """
-    if (settings.execution == "corrected") != (head is not None):
-        raise ValueError("corrected execution, and no other, needs a correction head")
     steps, denoise = settings.execute_steps, settings.denoise_steps
     waits = settings.execution == "synchronous"
 
@@ -108,7 +102,7 @@ def delayed_rollout(
         check_delay(delay, steps, policy.model.config.chunk)
         worlds = Worlds(env, policy, key, ranges)
         chunk, _ = worlds.predict(0, denoise_steps=denoise)
-        commands = [_execute(worlds, chunk, steps, 0, head)]
+        commands = [_execute(worlds, chunk, steps)]
         period = steps + delay if waits else steps
         for call in range(1, 1 + math.ceil((env.max_steps - steps) / period)):
             previous = chunk[:, steps:]
@@ -120,30 +114,17 @@ def delayed_rollout(
                 commands += [last] * delay
             else:
                 chunk = _switch(previous, chunk, np.int32(delay))
-            commands.append(_execute(worlds, chunk, steps, delay, head))
+            commands.append(_execute(worlds, chunk, steps))
         info, commands = jax.device_get((worlds.state.info, commands))
         return Trace(info["success"], info["steps"], np.concatenate(commands, axis=1))
 
     return rollout
 
 
-def _execute(
-    worlds: Worlds, chunk: jax.Array, steps: int, delay: int, head: CorrectionHead | None
-) -> jax.Array:
-    """Execute the first s actions of `chunk` `[W, C, J+1]`; return what was commanded.
-
-    With a head, every action is corrected. The first d actions are those of the previous chunk.
-    """
-    if head is None:
-        worlds.act(chunk, steps)
-        return chunk[:, :steps]
-    own = np.arange(chunk.shape[1], dtype=np.int32)
-    index = np.where(own < delay, own + np.int32(steps), own)
-    commands = []
-    for step in range(steps):
-        commands.append(worlds.correct(head, chunk, step, index))
-        worlds.hold(commands[-1], 1)
-    return jnp.stack(commands, axis=1)
+def _execute(worlds: Worlds, chunk: jax.Array, steps: int) -> jax.Array:
+    """Execute the first s actions of `chunk` `[W, C, J+1]` and return them."""
+    worlds.act(chunk, steps)
+    return chunk[:, :steps]
 
 
 def _condition(settings: Settings, previous: jax.Array, delay: int) -> dict[str, Any]:

@@ -17,7 +17,6 @@ COLORS = {
     "naive": "#efb118",
     "trained": "#4269d0",
     "guided": "#3ca951",
-    "corrected": "#ff725c",
 }
 ROWS = {
     "success": "success [%]",

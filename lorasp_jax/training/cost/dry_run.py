@@ -1,10 +1,8 @@
 """Dry run: parameter counts, memory and FLOPs of a run, from shapes alone."""
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
-import jax
 from flax import nnx
 from rich.console import Console
 from rich.table import Table
@@ -16,7 +14,7 @@ from lorasp_jax.dense import AdaptedLayer
 from lorasp_jax.training import early, setup
 from lorasp_jax.training.base import base_model
 from lorasp_jax.training.cost import preflight
-from lorasp_jax.training.cost.preflight import HEADROOM, byte_unit, nbytes
+from lorasp_jax.training.cost.preflight import byte_unit
 from lorasp_jax.training.run import Run
 
 
@@ -39,7 +37,11 @@ def dry_run(
     run = Run(config, folder, console, built.base_hash)
     held, batches = early.data_shapes(run, built)
     compiled = early.compile_steps(run, built, batches)
-    console.print(_memory_table(built, held, batches, compiled.memory_analysis()))
+    console.print(f"memory per device, estimated: {built.memory}", soft_wrap=True)
+    if (analysis := compiled.memory_analysis()) is not None:
+        console.print(f"memory per device, compiled: {_planned(held, analysis)}", soft_wrap=True)
+    unit, name = byte_unit(built.available)
+    console.print(f"memory per device, available: {built.available / unit:,.0f} {name}")
     step_flops = preflight.step_flops(config, built.base.config)
     console.print(
         f"one step of {config.optim.batch_size} windows: {step_flops / 1e12:.4g} TFLOP; "
@@ -56,52 +58,22 @@ def _parameter_table(model: nnx.Module) -> Table:
             part = "projections" if isinstance(child, AdaptedLayer) else name
             pair = adaptation.count(child), counts.get(part, adaptation.Counts(0, 0))
             counts[part] = adaptation.Counts(*map(sum, zip(*pair, strict=True)))
-    table = _table("part", "parameters", "trainable", "share")
+    table = Table("part")
+    for column in ("parameters", "trainable", "share"):
+        table.add_column(column, justify="right")
     for part, (trainable, total) in (counts | {"all": adaptation.count(model)}).items():
         table.add_row(part, f"{total:,}", f"{trainable:,}", f"{trainable / max(total, 1):.2%}")
     return table
 
 
-def _memory_table(built: setup.RunSetup, held: int, batches: Any, analysis: Any) -> Table:
-    """Tabulate the memory per device, as estimated and as compiled.
+def _planned(held: int, analysis: Any) -> str:
+    """Describe the memory that XLA plans for a step on each device, `analysis`.
 
-    `held` is the size of the dataset on every device [bytes], which is no argument of the compiled
-    program; `batches` are the shapes of those that a call takes. `analysis` is the
-    `memory_analysis` of the compiled step, or None if the backend does not provide it.
+    `held` is the size of the dataset on every device [bytes], which is no argument of the program.
     """
-    local = nbytes(batches) / len(jax.tree.leaves(batches)[0].sharding.device_set)
-    estimate = {"demonstrations": held + local, **dataclasses.asdict(built.memory)}
-    resident = ("base", "adapters", "optimizer", "demonstrations")
-    arguments = sum(estimate[name] for name in resident)
-    temporaries = sum(estimate[name] for name in estimate if name not in resident)
-    headroom = built.memory.peak * (1 - 1 / HEADROOM)
-    compiled: list[Any] = [None, None, None]
-    if analysis is not None:
-        inputs, temporary = analysis.argument_size_in_bytes + held, analysis.temp_size_in_bytes
-        temporary += analysis.output_size_in_bytes - analysis.alias_size_in_bytes
-        compiled = [inputs, temporary, inputs + temporary]
-    peak = arguments + temporaries + headroom
-    unit, name = byte_unit(max(peak, compiled[2] or 0))
-
-    def add(part: str, *values: float | None) -> None:
-        table.add_row(part, *("not reported" if v is None else f"{v / unit:.3f}" for v in values))
-
-    title = f"{name} per device, {built.available / unit:,.0f} available"
-    table = _table(title, "estimated", "compiled")
-    for part in resident:
-        add(f"  {part}", estimate[part])
-    add("arguments", arguments, compiled[0])
-    for part in ("gradients", "activations", "recomputation"):
-        add(f"  {part}", estimate[part])
-    add("  headroom", headroom)
-    add("temporary", temporaries + headroom, compiled[1])
-    add("peak", peak, compiled[2])
-    return table
-
-
-def _table(first: str, *numeric: str) -> Table:
-    """Create an empty table with a text column followed by right-aligned numeric columns."""
-    table = Table(first)
-    for name in numeric:
-        table.add_column(name, justify="right")
-    return table
+    temporary = analysis.temp_size_in_bytes
+    temporary += analysis.output_size_in_bytes - analysis.alias_size_in_bytes
+    parts = {"dataset": held, "arguments": analysis.argument_size_in_bytes, "temporary": temporary}
+    unit, name = byte_unit(peak := sum(parts.values()))
+    listed = ", ".join(f"{part} {value / unit:.2f}" for part, value in parts.items())
+    return f"{listed}, peak {peak / unit:.2f} {name}"

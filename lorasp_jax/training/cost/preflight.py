@@ -2,9 +2,8 @@
 
 Base, adapters, gradients and optimizer state are counted exactly. Activations are the batch and
 the residuals that JAX saves for the backward pass; XLA may save fewer, most of all without
-rematerialization. What one layer takes to recompute comes on top (`working_set`). `HEADROOM`
-covers the rest. For pi0 and SmolVLA at published sizes with rematerialization, the estimate is 2 to
-30 % above what XLA plans for an H100.
+rematerialization. With it, what one layer recomputes comes on top. `HEADROOM` covers the rest. A
+dry run prints what XLA plans beside it.
 """
 
 import dataclasses
@@ -15,18 +14,17 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 from flax import nnx
 
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config
-from lorasp_jax.data.batches import Batch
+from lorasp_jax.data.batches import Batch, nbytes
 from lorasp_jax.models import presets
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.observation import abstract_observation
 from lorasp_jax.training.base import quantized
-from lorasp_jax.training.cost import flops, working_set
+from lorasp_jax.training.cost import flops
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
 from lorasp_jax.training.step import Metrics, init_state, loss_fn
@@ -118,32 +116,46 @@ def _out_of_memory_message(config: Config, memory: Memory, remat: Remat, availab
 def estimate_memory(config: Config, backbone: BackboneConfig) -> Memory:
     """Estimate the memory of one training step, sharded over `config.fsdp` devices."""
     local_batch = max(1, config.optim.batch_size // jax.device_count())
-    step = abstract_step(config, backbone, max(1, local_batch // config.optim.accumulate))
+    micro_batch = max(1, local_batch // config.optim.accumulate)
+    step = abstract_step(config, backbone, micro_batch)
     optimizer = make_optimizer(config.optim, {config.peft.as_saved})
-
     init = functools.partial(init_state, optimizer=optimizer, ema=config.optim.ema > 0)
-
-    def passes(adapters: Any, frozen: Any, batch: Batch) -> Any:
-        loss, vjp, _ = jax.vjp(lambda a: step.loss(a, frozen, batch), adapters, has_aux=True)
-        return vjp, None if backbone.remat == "none" else vjp(jnp.ones_like(loss))
-
-    arrays = step.adapters, step.frozen, step.batch
-    closed, (saved, _) = jax.make_jaxpr(passes, return_shape=True)(*arrays)
-    jaxpr = closed.jaxpr
-    residuals = {id(v): v.aval for v in jaxpr.outvars[: len(jax.tree.leaves(saved))]}
-    for variable in (*jaxpr.invars, *jaxpr.constvars):  # inputs are counted separately
-        residuals.pop(id(variable), None)
     local_bytes = functools.partial(meshes.bytes_on_device, fsdp=config.fsdp)
     adapters = local_bytes(step.adapters)
+    saved = functools.partial(_saved_bytes, config, size=micro_batch)
     return Memory(
         base=local_bytes(step.frozen),
         adapters=adapters,
         gradients=adapters * (1 if config.optim.accumulate == 1 else 2),
         optimizer=local_bytes(jax.eval_shape(init, step.adapters)) - adapters,
-        activations=nbytes(list(residuals.values()))
-        + nbytes(abstract_batch(backbone, local_batch)),
-        recomputation=working_set.largest(jaxpr),
+        activations=saved(backbone) + nbytes(abstract_batch(backbone, local_batch)),
+        recomputation=0 if backbone.remat == "none" else _recomputed_bytes(saved, backbone),
     )
+
+
+def _recomputed_bytes(saved: Callable[[BackboneConfig], int], backbone: BackboneConfig) -> float:
+    """Return the bytes of the matrix products of one layer and of their gradients."""
+    products, full = (
+        saved(dataclasses.replace(backbone, remat=remat)) for remat in ("products", "full")
+    )
+    return 2 * (products - full) / min(backbone.vision.depth, backbone.language.depth)
+
+
+@functools.cache
+def _saved_bytes(config: Config, backbone: BackboneConfig, *, size: int) -> int:
+    """Return the bytes of the residuals that a forward pass of `size` windows saves.
+
+    Its inputs, such as the parameters, are not counted.
+    """
+    step = abstract_step(config, backbone, size)
+
+    def forward(adapters: Any, frozen: Any, batch: Batch) -> Any:
+        return jax.vjp(lambda a: step.loss(a, frozen, batch), adapters, has_aux=True)[1]
+
+    jaxpr = jax.make_jaxpr(forward)(step.adapters, step.frozen, step.batch).jaxpr
+    inputs = {id(variable) for variable in (*jaxpr.invars, *jaxpr.constvars)}
+    saved = {id(v): v.aval for v in jaxpr.outvars if id(v) not in inputs}
+    return nbytes([*saved.values()])
 
 
 def adapted_model(config: Config, backbone: BackboneConfig, key: jax.Array) -> Backbone:
@@ -195,9 +207,3 @@ def available_bytes() -> float:
         return float(stats["bytes_limit"])
     host_bytes = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     return host_bytes / jax.local_device_count()
-
-
-def nbytes(tree: Any) -> int:
-    """Return the size of the arrays or shapes in a pytree [bytes]."""
-    leaves = [leaf for leaf in jax.tree.leaves(tree) if hasattr(leaf, "dtype")]
-    return sum(leaf.size * leaf.dtype.itemsize for leaf in leaves)

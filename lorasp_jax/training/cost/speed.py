@@ -10,7 +10,9 @@ from typing import Any
 
 import jax
 
-from lorasp_jax.training.cost import flops
+from lorasp_jax.config import Config
+from lorasp_jax.models.config import BackboneConfig
+from lorasp_jax.training.cost import flops, preflight
 from lorasp_jax.training.cost.preflight import GIB
 
 
@@ -26,6 +28,14 @@ class Speed:
         self._batch_size, self._step_flops = batch_size, step_flops
         self._start: float | None = None
         self._wait: float | None = None
+
+    @classmethod
+    def of(cls, config: Config, backbone: BackboneConfig) -> "Speed":
+        """Create the meter of a run; FLOPs are counted only if the device's peak is known."""
+        known = flops.peak() is not None
+        return cls(
+            config.optim.batch_size, preflight.step_flops(config, backbone) if known else None
+        )
 
     def begin(self) -> None:
         """Start the clock unless it is running."""

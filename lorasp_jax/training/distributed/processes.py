@@ -1,21 +1,16 @@
-"""Multi-process runs: startup, barriers, shared arrays and coordinated exit.
+"""Multi-process runs: startup, barriers, shared arrays and exit.
 
 All processes train; only the first one collects, evaluates, prints and writes. The runs folder must
 be on storage that they share. The functions also work in a single process.
 """
 
-import atexit
 import contextlib
-import ctypes
-import hashlib
-import importlib.metadata
-import importlib.util
+import json
 import os
-import signal
+import platform
+import socket
 import sys
 from collections.abc import Iterator, Mapping
-from pathlib import Path
-from types import TracebackType
 from typing import Any, NoReturn
 
 import jax
@@ -24,45 +19,40 @@ from jax.experimental import multihost_utils
 from rich.console import Console
 
 from lorasp_jax import _compat
-from lorasp_jax.training.distributed import peers
-from lorasp_jax.training.distributed.rendezvous import JOIN_TIMEOUT, Rendezvous
 
+_JOIN_TIMEOUT = 180  # s
+_EXIT_TIMEOUT = 60  # s; after it, JAX aborts the others if a process has died or waits to exit
 _BARRIER_TIMEOUT = 24 * 3600 * 1000  # ms; the first process may collect and evaluate for hours
 _VARIABLES = ("JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
-_PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "mujoco", "mujoco-mjx")
-_UNCAUGHT = "failed with an exception; see its output for the traceback"
-
-_peers: peers.Peers | None = None
+_MAX_FACTS = 2**16  # bytes
 
 
-def initialize(console: Console, hint: str) -> None:
+def initialize(console: Console) -> None:
     """Connect to the other processes; call this before JAX starts its backend.
 
-    From then on, if one process fails, all exit. JAX finds the address by itself under Slurm, Open
-    MPI and Kubernetes and on TPU pods. Elsewhere set JAX_COORDINATOR_ADDRESS (host:port of the
-    first process), JAX_NUM_PROCESSES and JAX_PROCESS_ID.
-
-    `hint` is a remedy, printed if another process dies.
+    From then on, if one process fails, JAX ends all within a minute. JAX finds the address by
+    itself under Slurm, Open MPI and Kubernetes and on TPU pods. Elsewhere set
+    JAX_COORDINATOR_ADDRESS (host:port of the first process), JAX_NUM_PROCESSES and JAX_PROCESS_ID.
 
     Raises:
-        ValueError: the environment does not describe the processes, they cannot be reached, or
-            their versions differ.
+        ValueError: the environment does not describe the processes, or the port is in use.
     """
-    global _peers  # noqa: PLW0603
     address, count, number = _cluster_info()
     if number == 0:
-        listener = peers.listen(address)
-        console.print(f"waiting for {count} processes at {address}", highlight=False)
-        Rendezvous(listener, address, count, hint)
-    _peers = peers.Peers(address, number, count, _say, hint)
-    _peers.agree("versions", _versions())
+        _check_port(address)
+        wait = f"waiting for {count} processes at {address}, up to {_JOIN_TIMEOUT} s"
+        console.print(wait, highlight=False, soft_wrap=True)
     if os.environ.get("JAX_PLATFORMS") == "cpu":
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
     jax.config.update("jax_enable_preemption_service", False)  # `interrupt` handles signals
-    jax.distributed.initialize(address, count, number)
-    _delay_abort()
-    atexit.register(_peers.announce_exit, 0)  # before JAX's handler, which waits for the others
-    sys.excepthook = _exit_on_exception
+    jax.distributed.initialize(
+        address,
+        count,
+        number,
+        initialization_timeout=_JOIN_TIMEOUT,
+        heartbeat_timeout_seconds=_EXIT_TIMEOUT,
+        shutdown_timeout_seconds=_EXIT_TIMEOUT,
+    )
 
 
 def _cluster_info() -> tuple[str, int, int]:
@@ -76,7 +66,7 @@ def _cluster_info() -> tuple[str, int, int]:
             int(os.environ[name]) if name in os.environ else None for name in _VARIABLES
         )
         address, count, number, _ = _compat.find_processes(
-            os.environ.get("JAX_COORDINATOR_ADDRESS"), count, number, None, None, int(JOIN_TIMEOUT)
+            os.environ.get("JAX_COORDINATOR_ADDRESS"), count, number, None, None, _JOIN_TIMEOUT
         )
         if address is None or count is None or number is None:
             raise ValueError("no coordinator address")
@@ -87,82 +77,74 @@ def _cluster_info() -> tuple[str, int, int]:
         ) from error
     if not 0 <= number < count:
         raise ValueError(f"JAX_PROCESS_ID must be between 0 and {count - 1}, got {number}")
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 2**16:
+        raise ValueError(
+            f"JAX_COORDINATOR_ADDRESS must be host:port, such as 10.0.0.1:1234, got {address!r}"
+        )
     return address, count, number
 
 
-def _versions() -> dict[str, str]:
-    """Return what must match in all processes: package versions and a hash of the source."""
-    versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
-    sources = hashlib.sha256()
-    for package in ("envs", "lorasp_jax"):
-        spec = importlib.util.find_spec(package)
-        folder = Path(str(spec and spec.origin)).parent
-        for file in sorted(folder.rglob("*.py")):
-            sources.update(f"{file.relative_to(folder)}\n".encode() + file.read_bytes())
-    return versions | {"source of lorasp_jax": sources.hexdigest()[:12]}
+def _check_port(address: str) -> None:
+    """Raise ValueError if the port of `address` is in use on this host: JAX would crash."""
+    port = int(address.rpartition(":")[2])
+    dual = socket.has_dualstack_ipv6()
+    family = socket.AF_INET6 if dual else socket.AF_INET
+    try:
+        socket.create_server(("", port), family=family, dualstack_ipv6=dual).close()
+    except OSError as error:
+        raise ValueError(
+            f"port {port} on {platform.node()} is not available ({error.strerror}): choose "
+            "another one in JAX_COORDINATOR_ADDRESS or, under Slurm, in JAX_COORDINATOR_PORT"
+        ) from error
 
 
-def _delay_abort() -> None:
-    """Delay JAX's SIGABRT after the coordinator is lost, so that the cause is reported first.
+@contextlib.contextmanager
+def together() -> Iterator[None]:
+    """Stop all processes if the block fails in one of them; that one says why.
 
-    Python signal handlers do not run during abort(), so the handler is C's `sleep`, which is
-    async-signal-safe. It is called with the signal number, 6, and therefore sleeps 6 s.
-
-    JAX's own options do not help (tested with 0.10.2 and 0.12). `jax_enable_recoverability` does
-    not cover a failure of the first process. The client's `missed_heartbeat_callback` fails with
-    std::bad_cast before it is called.
+    Raises:
+        SystemExit: the block failed in another process.
     """
-    library = ctypes.CDLL(None)
-    library.signal.argtypes = (ctypes.c_int, ctypes.c_void_p)
-    library.signal(signal.SIGABRT, ctypes.cast(library.sleep, ctypes.c_void_p))
+    failure = None
+    try:
+        yield
+    except (ValueError, OSError, SystemExit) as error:
+        failure = error
+    connected = jax.distributed.is_initialized()  # otherwise do not start JAX's backend yet
+    failed = connected and any_process(failure is not None)
+    if failure:
+        raise failure
+    if failed:
+        raise SystemExit(2)
 
 
 def agree(topic: str, facts: Mapping[str, Any]) -> None:
-    """Wait until all processes have reported equal facts (see `Peers.agree`).
+    """Stop all processes unless they have the same facts, JSON values by name.
 
     Raises:
-        ValueError: the facts of another process differ.
+        ValueError: this process has other facts than the first one.
     """
-    if _peers is not None:
-        _peers.agree(topic, facts)
-
-
-class ExitConsole(Console):
-    """Console that records what it prints as the exit reason; only the first process prints."""
-
-    def print(self, *objects: Any, **options: Any) -> None:
-        """See `rich.console.Console.print`."""
-        if _peers is not None:
-            _peers.wait_for_root_cause()
-            _peers.exit_reason = " ".join(map(str, objects))
-        if _peers is None or _peers.number == 0:
-            super().print(*objects, **options)
+    if not jax.distributed.is_initialized():
+        return
+    text = np.frombuffer(json.dumps(facts).encode().ljust(_MAX_FACTS), np.uint8)
+    first = json.loads(bytes(multihost_utils.broadcast_one_to_all(text)))
+    with together():
+        own = json.loads(bytes(text))
+        if names := [name for name in {*first, *own} if first.get(name) != own.get(name)]:
+            raise ValueError(
+                f"process {jax.process_index()} has other {topic} than the first process "
+                f"({', '.join(sorted(names))}): use the same ones in all processes"
+            )
 
 
 def exit_all(code: int) -> NoReturn:
-    """Exit without waiting for this process's threads, and make the other processes exit."""
+    """Exit without waiting for this process's threads, but for the other processes."""
     sys.stdout.flush()
     sys.stderr.flush()
-    if _peers is not None:
-        _peers.announce_exit(code)
+    if jax.distributed.is_initialized():
+        jax.distributed.shutdown()
     os._exit(code)
-
-
-def _say(text: str) -> None:
-    errors = Console(stderr=True)
-    errors.show_cursor()  # a progress bar may have hidden it
-    errors.print(text, style="red", soft_wrap=True, highlight=False, markup=False)
-
-
-def _exit_on_exception(
-    kind: type[BaseException], error: BaseException, traceback: TracebackType | None
-) -> NoReturn:
-    """Exit at once on an uncaught exception; without this, JAX waits for the other processes."""
-    if _peers is not None:
-        _peers.wait_for_root_cause()
-        _peers.exit_reason = _UNCAUGHT
-    sys.__excepthook__(kind, error, traceback)
-    exit_all(1)
 
 
 def is_first() -> bool:

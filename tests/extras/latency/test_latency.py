@@ -6,13 +6,10 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
-from flax import nnx
 
 from lorasp_jax.extras.latency import __main__ as command
 from lorasp_jax.extras.latency import curve, figure
 from lorasp_jax.extras.latency.execution import Trace
-from lorasp_jax.policies.correction import CorrectionHead
-from lorasp_jax.training.correction import files
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run_folder import read_json, to_json, write_json
 from tests.evaluation.test_programs import policy
@@ -25,12 +22,11 @@ MODEL = dataclasses.replace(policy().model, config=CHUNKS_OF_TEN)
 POLICY = dataclasses.replace(policy(), model=MODEL)
 
 
-def played(env, how, *, ranges, head):
+def played(env, how, *, ranges):
     """Stand in for a rollout: the first world succeeds, and targets grow with the delay."""
 
     def rollout(policy, key, delay):
         assert ranges is None
-        assert (head is not None) == (how.execution == "corrected")
         calls.append((env.task.name, how.execution, how.execute_steps, delay, key))
         commands = np.zeros((2, 6, 7))
         commands[..., 0] = delay * np.arange(6) ** 3
@@ -55,11 +51,6 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(curve, "delayed_rollout", played)
     played.calls = []
     return folder
-
-
-def save_head(folder, seed):
-    head = CorrectionHead(("side", "wrist"), 8, 10, nnx.Rngs(seed))
-    files.save(folder, head, POLICY, {"naive": 1.0, "corrected": 1.0})
 
 
 def refused(capsys, *arguments):
@@ -123,33 +114,6 @@ def test_what_is_measured_is_not_measured_again(folder, capsys):
     line = refused(capsys, *options, "--guidance", "3")
     assert "measured with other settings (guidance)" in line
     assert (folder / "latency.json").read_bytes() == before
-
-
-def test_corrected_execution_needs_a_correction_head(folder, capsys):
-    """It is among the executions of runs that have one; latency.json holds results of one head."""
-    options = [str(folder), "--tasks", "press", "--delays", "0"]
-    assert "has no correction head: train one with" in refused(
-        capsys, *options, "--executions", "corrected"
-    )
-    assert not played.calls
-    save_head(folder, seed=0)
-    assert command.main(options) == 0
-    assert [call[1] for call in played.calls[::2]] == [*curve.EXECUTIONS]
-    save_head(folder, seed=1)
-    assert "measured with other settings (correction)" in refused(capsys, *options)
-    assert command.main([*options, "--executions", "naive"]) == 0
-    (folder / "latency.json").unlink()
-    assert command.main(options) == 0
-
-
-def test_a_head_does_not_affect_other_executions(folder):
-    options = [str(folder), "--tasks", "press", "--delays", "0", "--executions"]
-    assert command.main([*options, "naive"]) == 0
-    save_head(folder, seed=0)
-    assert command.main([*options, "corrected"]) == 0
-    assert [call[1] for call in played.calls] == 2 * ["naive"] + 2 * ["corrected"]
-    found = read_json(folder / "latency.json", curve.SCHEMA)
-    assert found["correction"] == files.describe(folder)["sha256"]
 
 
 @pytest.mark.parametrize(

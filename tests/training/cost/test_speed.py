@@ -9,12 +9,12 @@ import pytest
 
 from lorasp_jax.base import messages
 from lorasp_jax.data.batches import flatten
+from lorasp_jax.training.batches import DrawnBatches
 from lorasp_jax.training.cost import flops, speed
 from lorasp_jax.training.cost.speed import Speed
 from lorasp_jax.training.distributed import mesh as meshes
-from lorasp_jax.training.stepper import Stepper
-from lorasp_jax.training.windows import DrawnWindows
-from tests.runs import StepCount, random_episodes
+from lorasp_jax.training.program import Program
+from tests.runs import random_episodes
 
 
 @pytest.fixture
@@ -70,10 +70,10 @@ def test_memory_if_the_device_reports_it(monkeypatch):
 def test_compilation_is_announced_once(capsys, monkeypatch):
     monkeypatch.setattr(messages, "PATIENCE", 0.0)
     steps = jax.jit(lambda frozen, batches, state, key: (state, {"loss": jnp.ones(2)}))
-    windows = DrawnWindows(flatten([random_episodes("press", 0)]), meshes.make_mesh(), 8, 2)
-    run = Stepper(steps, jnp.ones(2), windows, Speed(1, None))
+    batches = DrawnBatches(flatten([random_episodes("press", 0)]), meshes.make_mesh(), 8, 2)
+    run = Program(steps, jnp.ones(2), batches, Speed(1, None))
     for _ in range(2):
-        run(StepCount(jnp.zeros((), int)), jax.random.key(0), 2)
+        run(jnp.zeros(()), jax.random.key(0), 0, 2)
     printed = capsys.readouterr().err
     assert len(re.findall(r"compiling the training step .*\.\.\.", printed)) == 1
     assert re.search(r"compiled the training step in \d+ s", printed)

@@ -3,19 +3,17 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from lorasp_jax.adapters import adaptation
-from lorasp_jax.data.batches import encode, flatten, sample_batch
-from lorasp_jax.training import loop, windows
-from lorasp_jax.training.cost import preflight
+from lorasp_jax.data.batches import encode, flatten, nbytes, sample_batch
+from lorasp_jax.training import batches, program
+from lorasp_jax.training.batches import DrawnBatches
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.optim import make_optimizer
 from lorasp_jax.training.random_streams import StepKeys
 from lorasp_jax.training.step import init_state
-from lorasp_jax.training.windows import DrawnWindows
 from tests.runs import CONFIG, make_run, random_episodes
 
 KEY = jax.random.key(3)
@@ -28,19 +26,19 @@ def steps():
 
 @pytest.fixture(scope="module")
 def drawn(steps):
-    return DrawnWindows(jax.device_put(steps), meshes.make_mesh(1, jax.devices()[:1]), 6, 3)
+    return DrawnBatches(jax.device_put(steps), meshes.make_mesh(1, jax.devices()[:1]), 6, 3)
 
 
 def test_batches_do_not_depend_on_the_number_of_steps_per_call(drawn):
-    whole = drawn(KEY, jnp.int32(4), 3)
+    whole = drawn.take(KEY, 4, 3)
     for index in range(3):
-        single = drawn(KEY, jnp.int32(4 + index), 1)
+        single = drawn.take(KEY, 4 + index, 1)
         jax.tree.map(lambda a, b, i=index: np.testing.assert_array_equal(a[i], b[0]), whole, single)
 
 
 def test_a_batch_is_that_of_sample_batch(drawn, steps, tmp_path):
     processor = make_run(tmp_path / "run", CONFIG).policy.processor
-    raw = jax.tree.map(lambda x: x[0], drawn(KEY, jnp.int32(7), 1))
+    raw = jax.tree.map(lambda x: x[0], drawn.take(KEY, 7, 1))
     found = encode(StepKeys.of(KEY, 7).state_noise, raw, processor, state_noise=0.1)
     batch_key, _ = jax.random.split(jax.random.fold_in(KEY, 7))
     sizes = {"batch_size": 6, "chunk": 3, "state_noise": 0.1}
@@ -50,36 +48,36 @@ def test_a_batch_is_that_of_sample_batch(drawn, steps, tmp_path):
 
 def test_shapes_are_those_of_the_batches(drawn):
     for shape, array in zip(
-        jax.tree.leaves(drawn.shapes(5)), jax.tree.leaves(drawn(KEY, jnp.int32(0), 5)), strict=True
+        jax.tree.leaves(drawn.shapes(5)), jax.tree.leaves(drawn.take(KEY, 0, 5)), strict=True
     ):
         assert (shape.shape, shape.dtype) == (array.shape, array.dtype)
         assert shape.sharding.is_equivalent_to(array.sharding, array.ndim)
 
 
 @pytest.mark.parametrize(
-    ("batches", "count", "size"), [(1000, 125, 125), (30, 125, 25), (4.9, 7, 1), (0.5, 6, 1)]
+    ("most", "count", "size"), [(1000, 125, 125), (30, 125, 25), (4.9, 7, 1), (0.5, 6, 1)]
 )
-def test_calls_divide_the_interval_and_fit_into_memory(drawn, monkeypatch, batches, count, size):
-    limit = int(batches * preflight.nbytes(drawn.shapes(1)))
-    monkeypatch.setattr(windows, "MAX_BYTES", limit)
+def test_calls_divide_the_interval_and_fit_into_memory(drawn, monkeypatch, most, count, size):
+    limit = int(most * nbytes(drawn.shapes(1)))
+    monkeypatch.setattr(batches, "MAX_BYTES", limit)
     assert drawn.call_size(count) == size
 
 
 def test_other_demonstrations_have_the_same_program(tmp_path):
     """Even if the number of tasks differs."""
 
-    def program(name, *tasks):
+    def lowered(name, *tasks):
         run = make_run(tmp_path / name, dataclasses.replace(CONFIG, tasks=tasks))
         graphdef, adapters, frozen = adaptation.split(run.policy.model)
         methods = adaptation.methods(run.policy.model).values()
         optimizer = make_optimizer(run.config.optim, methods)
         mesh = meshes.make_mesh(1, run.devices)
         state = init_state(adapters, optimizer)
-        jitted = loop.jit_steps(run, graphdef, optimizer, meshes.shardings(state, mesh))
-        shapes = DrawnWindows(run.steps, mesh, 4, 2).shapes(2)
-        frozen = loop.Frozen(frozen, run.policy.processor.shared())
+        jitted = program.jit_steps(run, graphdef, optimizer, meshes.shardings(state, mesh))
+        shapes = DrawnBatches(run.steps, mesh, 4, 2).shapes(2)
+        frozen = program.Frozen(frozen, run.policy.processor.shared())
         return jitted.lower(frozen, shapes, state, KEY).as_text(), len(run.steps.end)
 
-    one, two = program("one", "press"), program("two", "press", "pour")
+    one, two = lowered("one", "press"), lowered("two", "press", "pour")
     assert one[0] == two[0]
     assert one[1] != two[1]

@@ -1,1 +1,0 @@
-"""Train the correction head of a finished run; see `policies.correction`."""
