@@ -55,7 +55,7 @@ def load_tokenizer(where: str | os.PathLike[str]) -> Tokenizer:
         ValueError: the path does not exist or contains no valid tokenizer.
     """
     from lorasp_jax.base import hub
-    from lorasp_jax.base.files import TEXT_BYTES, check_regular
+    from lorasp_jax.base.files import TEXT_BYTES, as_value_error, check_regular
     from lorasp_jax.policies.pretrained_tokenizers import SentencePiece, TokenizersFile
 
     if not os.fspath(where):
@@ -64,7 +64,8 @@ def load_tokenizer(where: str | os.PathLike[str]) -> Tokenizer:
     files = [path] if path.is_file() else [*path.glob("tokenizer.json"), *path.glob("*.model")]
     for file in files:
         if file.suffix in (".json", ".model"):
-            if check_regular(file).stat().st_size > TEXT_BYTES:
-                raise ValueError(f"{file} is larger than {TEXT_BYTES} bytes")
+            with as_value_error(file):
+                if check_regular(file).stat().st_size > TEXT_BYTES:
+                    raise ValueError(f"it is larger than {TEXT_BYTES} bytes")
             return (TokenizersFile if file.suffix == ".json" else SentencePiece)(file)
     raise ValueError(f"{where} contains neither tokenizer.json nor a SentencePiece .model file")

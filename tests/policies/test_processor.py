@@ -158,7 +158,7 @@ def test_missing_cameras_are_black_and_masked():
     assert (obs.images["right_wrist_0_rgb"] == -1).all()
     with pytest.raises(ValueError, match="wrist"):
         proc.encode({**raw, "image": {"side": raw["image"]["side"]}}, jnp.zeros(2, int))
-    with pytest.raises(ValueError, match=r"base_0_rgb.* top"):
+    with pytest.raises(ValueError, match=r"base_0_rgb.*'top'"):
         published(cameras={"top": "side"})
 
 
