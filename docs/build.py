@@ -39,6 +39,9 @@ OUTSIDE = (
     "assets/*.png",
     "notebooks/*.ipynb",
     "benchmarks/*.md",
+    "studies/*/README.md",
+    "studies/**/*.svg",
+    "studies/**/*.webp",
     "CONTRIBUTING.md",
     "LICENSE",
     "CITATION.cff",
@@ -127,7 +130,7 @@ def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
     uri = page.file.src_uri
     if uri.startswith("api/") or uri == REFERENCE_PAGE:
         return markdown
-    folder = "" if uri in ("index.md", "CONTRIBUTING.md") else posixpath.dirname(f"docs/{uri}")
+    folder = posixpath.dirname(f"docs/{uri}" if (ROOT / "docs" / uri).exists() else uri)
     pages = {"README.md": "index.md", REFERENCE: REFERENCE_PAGE}
 
     def rewrite(match: re.Match) -> str:

@@ -15,7 +15,6 @@ from lorasp_jax.extras.study.claims import Claim, Criterion
 from lorasp_jax.extras.study.statistics import Estimate
 from lorasp_jax.extras.study.study import Results
 from studies.paper import naming, published
-from studies.paper.book import Book
 from studies.paper.naming import TOWERS
 
 LESS_IS_NOTHING = "the paper states no amount, so any difference counts that the interval confirms"
@@ -122,7 +121,7 @@ def _needs_rank(make: _Maker, backbone: str) -> tuple[Criterion, ...]:
 
 def _multi_task(make: _Maker, backbone: str) -> tuple[Criterion, ...]:
     """Return criteria on LoRA of all ranks but R: [multi..., single...]."""
-    ranks = Book(make.names, {}).ranks(backbone, "multi")
+    ranks = naming.lora_ranks(make.names, backbone)
     # The paper has no rank of R/32.
     paper = [r for r in ranks if published.cell(f"{backbone}/multi/lora_r{r}", make.rank)]
     lora = [[f"{backbone}/{kind}/lora_r{r}" for r in paper] for kind in ("multi", "single")]

@@ -7,12 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import nnx
 
 from lorasp_jax.evaluation.programs import split_rollout
 from lorasp_jax.extras.latency.execution import (
     EXECUTIONS,
-    Settings,
+    Execution,
     Trace,
     check_delay,
     delayed_rollout,
@@ -20,7 +19,6 @@ from lorasp_jax.extras.latency.execution import (
 from lorasp_jax.extras.latency.smoothness import action_delta, jerk
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import Method
-from lorasp_jax.policies.correction import IMAGE_SIZE, CorrectionHead
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor
 from lorasp_jax.policies.prompt_table import PromptTable
@@ -71,19 +69,6 @@ class Numbering:
         return jnp.stack(columns, axis=-1), {}
 
 
-@jax.tree_util.register_static
-@dataclasses.dataclass(frozen=True, eq=False)
-class Witness:
-    """A correction head that adds to entry 2 the index that it is told, and to entry 3 the step of
-    the observation that it sees."""
-
-    cameras: tuple[str, ...] = ("side", "wrist")
-
-    def __call__(self, images, state, action, index):
-        assert images.shape[1:] == (IMAGE_SIZE, IMAGE_SIZE, 6)
-        return jnp.zeros_like(action).at[:, 2].set(index).at[:, 3].set(state[:, 1])
-
-
 ENV = Clock(("wait", "walk", "go"), 26)
 
 
@@ -97,8 +82,7 @@ def numbering():
 
 def executed(numbering, execution, delay):
     """Return the commands of one world as integers, one row per control step."""
-    head = Witness() if execution == "corrected" else None
-    rollout = delayed_rollout(ENV, Settings(execution, STEPS, 2, guidance=7.0), head=head)
+    rollout = delayed_rollout(ENV, Execution(execution, STEPS, 7.0), denoise_steps=2)
     trace = rollout(numbering, jax.random.key(0), delay)
     assert (trace.commands == trace.commands[:1]).all()
     assert (trace.steps >= ENV.max_steps).all()
@@ -106,7 +90,7 @@ def executed(numbering, execution, delay):
 
 
 @pytest.mark.parametrize("delay", [0, 1, 4])
-@pytest.mark.parametrize("execution", ["naive", "trained", "guided", "corrected"])
+@pytest.mark.parametrize("execution", ["naive", "trained", "guided"])
 def test_the_robot_goes_on_with_the_previous_chunk_until_the_new_one_arrives(
     numbering, execution, delay
 ):
@@ -115,35 +99,6 @@ def test_the_robot_goes_on_with_the_previous_chunk_until_the_new_one_arrives(
         late = since < delay and step >= STEPS
         assert observed == step - since - (STEPS if late else 0)
         assert index == step - observed
-
-
-@pytest.mark.parametrize("delay", [0, 1, 4])
-def test_every_action_is_corrected_with_the_latest_observation(numbering, delay):
-    naive, corrected = (executed(numbering, name, delay) for name in ("naive", "corrected"))
-    added = corrected - naive
-    assert added[:, 2].tolist() == naive[:, 1].tolist()  # the index in its chunk
-    assert added[:, 3].tolist() == list(range(ENV.max_steps))
-    assert (added[:, [0, 1, 4, 5, 6]] == 0).all()
-
-
-@pytest.mark.parametrize("delay", [0, 1, 2])
-def test_a_new_correction_head_changes_nothing(delay):
-    head = CorrectionHead(("side", "wrist"), 8, 4, nnx.Rngs(0))
-    for room in ROOMS:
-        naive, corrected = (
-            delayed_rollout(room, Settings(name, 2, 3), head=used)(
-                policy(), jax.random.key(3), delay
-            )
-            for name, used in (("naive", None), ("corrected", head))
-        )
-        for name in ("success", "steps", "commands"):
-            np.testing.assert_array_equal(getattr(naive, name), getattr(corrected, name))
-
-
-@pytest.mark.parametrize(("execution", "head"), [("corrected", None), ("naive", Witness())])
-def test_only_corrected_execution_takes_a_head(execution, head):
-    with pytest.raises(ValueError, match=r"^corrected execution, and no other, needs a correction"):
-        delayed_rollout(ENV, Settings(execution), head=head)
 
 
 def test_the_robot_waits_in_synchronous_execution(numbering):
@@ -177,7 +132,7 @@ def test_without_delay_it_is_the_ordinary_rollout(execution):
     key, steps = jax.random.key(3), {"execute_steps": 3, "denoise_steps": 2}
     for room in ROOMS:
         expected = split_rollout(room, **steps)(policy(), key)
-        found = delayed_rollout(room, Settings(execution, **steps))(policy(), key, 0)
+        found = delayed_rollout(room, Execution(execution, 3), denoise_steps=2)(policy(), key, 0)
         np.testing.assert_array_equal(found.success, expected.success)
         np.testing.assert_array_equal(found.steps, expected.steps)
         assert 0 < found.success.sum() < 16
@@ -187,12 +142,10 @@ def test_one_compilation_gives_the_whole_curve(numbering):
     env = dataclasses.replace(ENV)
     with compilations() as counts:
         for execution in EXECUTIONS:
-            head = Witness() if execution == "corrected" else None
-            rollout = delayed_rollout(env, Settings(execution, STEPS, 3), head=head)
+            rollout = delayed_rollout(env, Execution(execution, STEPS), denoise_steps=3)
             for delay in range(STEPS + 1):
                 rollout(numbering, jax.random.key(0), delay)
     assert counts.pop("predict") == 3  # plain, trained, guided
-    assert counts.pop("correct_action") == 1
     assert counts == {"_reset": 1, "_observe": 1, "_act": 1, "_hold": 1}
 
 
@@ -201,7 +154,7 @@ def test_delays_that_do_not_fit_are_refused(numbering):
         text = f"of which {steps} are executed, the delay must be from 0 to {longest} .* {delay}$"
         with pytest.raises(ValueError, match=text):
             check_delay(delay, steps, CHUNK)
-    rollout = delayed_rollout(ENV, Settings("naive", STEPS))
+    rollout = delayed_rollout(ENV, Execution("naive", STEPS))
     with pytest.raises(ValueError, match="with chunks of 10 actions"):
         rollout(numbering, jax.random.key(0), 5)
 

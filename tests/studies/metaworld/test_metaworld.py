@@ -90,7 +90,7 @@ def test_missing_package_names_the_command(monkeypatch):
 def test_recording_without_the_package_names_the_command(monkeypatch):
     monkeypatch.setitem(sys.modules, "metaworld.policies", None)
     for name in ("collect", "expert"):
-        monkeypatch.delitem(sys.modules, f"examples.metaworld.{name}", raising=False)
+        monkeypatch.delitem(sys.modules, f"studies.metaworld.{name}", raising=False)
     with pytest.raises(SystemExit, match=re.escape(INSTALL)):
         importlib.import_module("studies.metaworld.collect")
 
@@ -101,7 +101,7 @@ def test_films_are_joined_and_keep_their_last_picture(tmp_path):
         save = {"save_all": True, "append_images": rest, "lossless": True}
         first.save(tmp_path / f"{name}.webp", **save)
     out = tmp_path / "out" / "all.webp"
-    script = ROOT / "docs" / "figures" / "metaworld_films.py"
+    script = ROOT / "studies" / "metaworld" / "films.py"
     run([sys.executable, str(script), str(tmp_path), "--out", str(out), "--quality", "100"])
     with Image.open(out) as film:
         film.seek(2)
