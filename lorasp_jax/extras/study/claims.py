@@ -101,7 +101,7 @@ def _compare(test: Criterion, estimate: Estimate, easier: float = 0.0) -> Verdic
 
 
 def verdict(outcomes: Iterable[Outcome]) -> Verdict:
-    """Return the verdict on a claim from the outcomes of its tests, of which there is at least one."""
+    """Return the verdict on a claim from the outcomes of its tests."""
     found = [outcome.verdict for outcome in outcomes]
     order: tuple[Verdict, ...] = ("does not hold", "cannot be told", "holds")
     return next(name for name in order if name in found)

@@ -171,6 +171,7 @@ def run_here(
     Raises:
         ValueError: one of the cells failed, or has run with other settings.
     """
+    folder.mkdir(exist_ok=True)
     for name in names:
         progress.clear_failure(folder / name)
 

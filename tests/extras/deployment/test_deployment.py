@@ -94,7 +94,7 @@ def test_table(run, capsys):
     """Outcomes 1101 and 1001 differ by one episode of four."""
     arguments = [str(run), "--variants", "half-nf4", "--episodes", "4"]
     assert command.main(arguments) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = capsys.readouterr().out.replace("\u00a0", " ").splitlines()
     assert len(lines) == 4
     assert lines[2].startswith("| whole-bf16 | 75.0 [")
     assert lines[3].startswith("| half-nf4 | 50.0 [")
@@ -107,7 +107,7 @@ def test_table(run, capsys):
         assert 0 < cell["measures"]["loss"] < 100
     assert found["half-nf4"]["measures"]["bytes"] < found["whole-bf16"]["measures"]["bytes"]
     assert command.main(arguments) == 0  # nothing is measured again
-    assert capsys.readouterr().out.splitlines() == lines
+    assert capsys.readouterr().out.replace("\u00a0", " ").splitlines() == lines
     other = refuse(capsys, run, "--variants", "half-nf4", "--episodes", "8")
     assert "it was run with other evaluation.episodes" in other
 
