@@ -117,4 +117,4 @@ def rate(pilot: str) -> float:
 
 def best_pilot(results: Mapping[str, Any], pilots: Sequence[str]) -> str:
     """Return the pilot cell with the highest success, averaged over tasks; of equals, the first."""
-    return max(pilots, key=lambda name: outcomes(results, ((name,),)).mean())
+    return max(pilots, key=lambda name: "".join(results[name]["outcomes"].values()).count("1"))

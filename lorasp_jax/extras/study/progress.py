@@ -2,8 +2,9 @@
 
 import dataclasses
 import enum
+import functools
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from lorasp_jax.base.errors import describe
 from lorasp_jax.base.writing import TEMPORARY_SUFFIX, write_text
 from lorasp_jax.config import Config
 from lorasp_jax.extras.study.finished_run import recorded_config
-from lorasp_jax.extras.study.study import Cell, Derived, Results, Study
+from lorasp_jax.extras.study.study import Cell, Derived, Study
 from lorasp_jax.training import records
 from lorasp_jax.training.run_folder import CONFIG_FILE, changed_settings, read_json, to_json
 
@@ -69,17 +70,22 @@ class Status:
 def read(study: Study, folder: Path) -> dict[str, Status]:
     """Return the current state of every cell, in the study's order, from the study's folder."""
     statuses: dict[str, Status] = {}
+    run_config = functools.cache(recorded_config)
     for cell in study.cells:
         known = {**study.finished.get(cell.name, {})}
         try:
-            statuses[cell.name] = _status(cell, folder / cell.name, known, statuses)
+            statuses[cell.name] = _status(cell, folder / cell.name, known, statuses, run_config)
         except ValueError as error:
             statuses[cell.name] = Status(CellState.DAMAGED, str(describe(error)))
     return statuses
 
 
 def _status(
-    cell: Cell | Derived, folder: Path, known: dict[str, Any], others: Mapping[str, Status]
+    cell: Cell | Derived,
+    folder: Path,
+    known: dict[str, Any],
+    others: Mapping[str, Status],
+    run_config: Callable[[Path], Config],
 ) -> Status:
     """Return the state of a cell, given its known result and the states of the cells before it.
 
@@ -102,7 +108,7 @@ def _status(
     if result and _is_elsewhere(cell):
         return Status(CellState.FINISHED, result=result)
     try:
-        config = _config(cell, others, results_of(cell.needs, others))
+        config = _config(cell, others, run_config)
     except Exception as error:  # the study's function may raise anything
         return Status(CellState.FAILED, f"its config cannot be made: {one_line(error)}")
     if result:
@@ -124,7 +130,9 @@ def _is_elsewhere(cell: Cell | Derived) -> bool:
     return isinstance(source, Path) and not source.exists()
 
 
-def _config(cell: Cell | Derived, others: Mapping[str, Status], results: Results) -> Config:
+def _config(
+    cell: Cell | Derived, others: Mapping[str, Status], run_config: Callable[[Path], Config]
+) -> Config:
     """Return the config of a cell's run.
 
     Raises:
@@ -132,10 +140,12 @@ def _config(cell: Cell | Derived, others: Mapping[str, Status], results: Results
     """
     if isinstance(cell, Derived):
         source = cell.source
-        found = recorded_config(source) if isinstance(source, Path) else others[source].config
+        found = run_config(source) if isinstance(source, Path) else others[source].config
         assert found is not None
         return cell.config(found)
-    config = cell.config if isinstance(cell.config, Config) else cell.config(results)
+    config = cell.config
+    if not isinstance(config, Config):
+        config = config(results_of(cell.needs, others))
     return dataclasses.replace(config, name=Path(cell.name).name)
 
 
