@@ -37,24 +37,16 @@ def cut(policy: Policy, mean_rank: float) -> Policy:
     layers that come first. If there are fewer, all are kept and the mean rank is lower.
 
     Args:
-        policy: not modified. All its LoRA layers are cut.
+        policy: not modified. All its LoRA layers, whose updates start at zero, are cut.
         mean_rank: at least 0.
 
     Returns:
         A policy whose updates are stored as AdaLoRA's triplets, s A diag(e) B with orthonormal A
         and B: evaluation then reports the ranks that were kept. The arrays of a stack are as large
         as its largest rank.
-
-    Raises:
-        ValueError: `mean_rank` is negative or not finite, or the policy has no LoRA layers, or
-            some whose A B is not the whole update.
     """
-    if not (np.isfinite(mean_rank) and mean_rank >= 0):
-        raise ValueError(f"mean_rank must be at least 0, got {mean_rank}")
     root = nnx.List([nnx.clone(policy.model)])
     locations = [p for p in paths.locate(root, AdaptedLayer) if type(p.child.method) is LoRA]
-    if not locations or any(p.child.method.splits_kernel for p in locations):
-        raise ValueError("only a policy with LoRA layers whose update starts at zero can be cut")
     updates = [_decomposed(*p.child.method_and_params()) for p in locations]
     for location, update, kept in zip(
         locations, updates, _largest(updates, mean_rank), strict=True
@@ -133,9 +125,6 @@ def pruned(
         tolerance: largest fraction of tokens for which a pruned direction is active.
         batch_size: windows per batch.
         batches: batches per task.
-
-    Raises:
-        ValueError: the policy has no LoRA-SP layers, or no prompt for an instruction.
     """
     by_task = keyed_batches(policy, episodes, batch_size, batches)
     together = [pair for pairs in by_task.values() for pair in pairs]

@@ -50,8 +50,7 @@ def measures(
     - `direction_overlap`, for LoRA-SP on several tasks: "a|b" -> tower -> [index, index by chance];
       see `directions.overlap`.
     - `spectral_rank`, after full fine-tuning, if `base` is given: tower -> layer -> share of
-      singular values, per layer of a stack; see `spectra.spectral_rank`. `spectral_left_out`: the
-      matrices that it does not cover.
+      singular values, per layer of a stack; see `spectra.spectral_rank`.
     - `smaller`, if `source` is given: `bytes` of the adapters, [source, policy].
 
     Args:
@@ -112,4 +111,4 @@ def _spectra(model: nnx.Module, base: nnx.Module) -> dict[str, Any]:
         path: [None if share is None else round(share, 3) for share in row]
         for path, row in spectra.spectral_rank(model, base).items()
     }
-    return {"spectral_rank": layers.by_tower(shares), "spectral_left_out": spectra.left_out(base)}
+    return {"spectral_rank": layers.by_tower(shares)}

@@ -3,7 +3,7 @@
 import numpy as np
 from flax import nnx
 
-from lorasp_jax.adapters import adaptation, paths
+from lorasp_jax.adapters import adaptation
 from studies.paper.measures import layers
 
 ENERGY = 0.99
@@ -18,7 +18,7 @@ def spectral_rank(model: nnx.Module, base: nnx.Module) -> dict[str, list[float |
 
     The share is k / min(I, O), with the smallest k for which E(k) = Σ_{i<=k} σ_i² / Σ σ_i² >= .99
     (eq. 3). It covers dense layers only, among them SigLIP's patch embedding, which is a dense
-    layer here; see `left_out` for the rest.
+    layer here, but no embeddings.
 
     Args:
         model: fine-tuned, or with adapters that can be merged.
@@ -29,24 +29,13 @@ def spectral_rank(model: nnx.Module, base: nnx.Module) -> dict[str, list[float |
         that did not change, or was only decayed because the actions do not depend on it.
 
     Raises:
-        ValueError: the update depends on the input, or the models have different layers.
+        ValueError: the update depends on the input.
     """
     before, after = layers.kernels(base), layers.kernels(adaptation.merge(model))
-    shapes = [{path: kernel.shape for path, kernel in side.items()} for side in (before, after)]
-    if shapes[0] != shapes[1]:
-        raise ValueError("the model and its base must have the same dense layers")
     return {
         path: [_share(*pair) for pair in zip(after[path] - before[path], before[path], strict=True)]
         for path in after
     }
-
-
-def left_out(model: nnx.Module) -> list[str]:
-    """Return the paths of the matrices, such as embeddings, that `spectral_rank` does not cover."""
-    root = nnx.List([model])
-    covered = {location.path for location in paths.locate_matmul_layers(root)}
-    others = [p.path for p in paths.locate_layers(root) if p.path not in covered]
-    return sorted([*others, *(p.path for p in paths.locate_other_matrices(root))])
 
 
 def energy_rank(energies: np.ndarray, share: float) -> int:

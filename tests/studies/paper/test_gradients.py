@@ -92,8 +92,3 @@ def test_a_gradient_of_zero_has_no_direction(model):
         1,
     )
     assert found["one", "two"] == {"vision": 0, "action": 0, "all": 0}
-
-
-def test_a_frozen_model_is_refused():
-    with pytest.raises(ValueError, match="without trainable parameters"):
-        gradients.gradient_cosines(Linear(), {"one": sample([1.0] * 3)}, jax.random.key(0), 1)

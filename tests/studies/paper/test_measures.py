@@ -88,7 +88,7 @@ def test_full_fine_tuning(tmp_path):
     moved = random_backbone(Pi0Config.dummy(), seed=1)
     policy = Policy(moved, run.policy.processor)
     found = measured(policy, run.episodes, base=base)
-    assert found.keys() == {"spectral_rank", "spectral_left_out"}
+    assert found.keys() == {"spectral_rank"}
     assert found["spectral_rank"]["vision"].keys() > {"fc1", "patch_embed"}
     assert all(0 < share <= 1 for share in found["spectral_rank"]["action"]["q_proj"])
     found = measured(run.policy, run.episodes, base=base)  # nothing has learned yet

@@ -5,7 +5,6 @@ import pytest
 from flax import nnx
 
 import lorasp_jax
-from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP
 from studies.paper.measures import layers, spectra
 from tests.adapters.test_adaptation import LAYERS, WIDTH, Net
@@ -79,16 +78,6 @@ def test_adapters_are_merged(base):
     assert shares["heads/0"] == [1 / 2]
     with pytest.raises(ValueError, match="cannot be merged"):
         spectra.spectral_rank(adapted(base, LoRASP(rank=4)), base)
-
-
-def test_another_base_is_refused(base):
-    with pytest.raises(ValueError, match="same dense layers"):
-        spectra.spectral_rank(base, base.blocks)
-
-
-def test_what_is_left_out():
-    model = nnx.eval_shape(lambda: Pi0Config.dummy().create(nnx.Rngs(0)))
-    assert spectra.left_out(model) == ["language/embedding", "vision/position_embedding"]
 
 
 def test_towers():
