@@ -81,8 +81,8 @@ def _paper_lora(axes: Axes, backbone: str, ranks: list[int]) -> None:
 def _paper_lora_sp(axes: Axes, backbone: str) -> None:
     cell = published.cell(f"{backbone}/multi/lora_sp", RANK)
     rank, value = cell["active_rank"] * RANK / published.RANK, _paper(backbone, "lora_sp")
-    style = {"color": LORA_SP, "mfc": "none", "label": "LoRA-SP, paper (ranks halved)"}
-    axes.plot([rank], [value], "D", **style)
+    label = "LoRA-SP, paper (ranks halved)"
+    axes.plot([rank], [value or 0.0], "D", color=LORA_SP, mfc="none", label=label)
 
 
 def _paper(backbone: str, method: str) -> float | None:
