@@ -1,10 +1,10 @@
-"""Adapt a pretrained miniature policy to Meta-World's fifty tasks; see docs/metaworld.md.
+"""Adapt a pretrained miniature policy to Meta-World's fifty tasks; see studies/metaworld.
 
     python train.py --config configs/metaworld.py
     python train.py --config configs/metaworld.py --method lora --peft.rank 64 --name lora
 
-Needs the demonstrations in data/mt50, which the page says how to collect. The judge runs in another
-Python environment, because Meta-World pins an older MuJoCo.
+Needs the demonstrations in data/mt50, which its README says how to collect. The judge runs in
+another Python environment, because Meta-World pins an older MuJoCo.
 """
 
 import dataclasses

@@ -13,8 +13,8 @@ from tests import ROOT, test_imports
 PAGES = sorted([*ROOT.glob("docs/*.md"), *ROOT.glob("docs/methods/*.md")])
 OTHERS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("studies/*/README.md"))]
 """Pages whose links and files are checked, but not their examples."""
-WITHOUT_EXAMPLES = {"runs", "launch", "benchmarks", "architecture", "study", "libero", "metaworld"}
-"""Reference pages, and two about other packages."""
+WITHOUT_EXAMPLES = {"runs", "launch", "benchmarks", "architecture", "libero"}
+"""Reference pages, and one about another package."""
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 OPTION = re.compile(r"^\| `(\w+)` \| `([^`]+)` \| \S", re.MULTILINE)
 LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)|src(?:set)?=\"([^\":]+)\"")

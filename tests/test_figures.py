@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from lorasp_jax.evaluation.intervals import wilson_interval
-from lorasp_jax.extras.latency import figure as latency
 from studies.performance import float8
 from tests import ROOT
 
@@ -63,24 +62,6 @@ def test_short_videos_hold_their_last_image_and_success_gets_a_border(script):
     assert frames[-1].getpixel(corner)[:3] == films.SUCCESS
     above = (corner[0], films.BAR)
     assert frames[-1].getpixel(above)[:3] == (0, 0, 0)
-
-
-@pytest.mark.parametrize("run", ["SmolVLA small", "π0 small"])
-def test_the_latency_figure_and_tables_show_what_was_measured(script, tmp_path, run):
-    script("latency").main(tmp_path / "latency.svg")
-    assert (tmp_path / "latency.svg").stat().st_size > 50_000
-    curves = json.loads((ROOT / "docs/latency.json").read_text())[run]["curves"]
-    page = (ROOT / "docs/latency.md").read_text()
-    table = page.partition(f"| {run}, success")[2].partition("\n\n")[0]
-    rows = re.findall(r"^\| `(\w+)` \| (.*) \| ([\d, ]+) \|$", table, re.M)
-    assert [name for name, *_ in rows] == [*latency.COLORS]
-    for name, success, jerk in rows:
-        points = {point["delay"]: point for point in latency.average(curves, name)}
-        shown = [points[delay] for delay in (0, 2, 4, 8)]
-        assert success.split(" | ") == [
-            "{:.1f} ({:.0f}-{:.0f})".format(p["success"], *p["ci95"]) for p in shown
-        ]
-        assert jerk.split(", ") == [f"{p['jerk']:.0f}" for p in shown]
 
 
 def test_the_float8_figure_and_table_show_what_was_measured(tmp_path):

@@ -27,9 +27,9 @@ PACKAGES = [
     # The core, which is everything above, imports none of these.
     "lorasp_jax.extras.serving",
     "lorasp_jax.extras.piper",
-    "lorasp_jax.extras.latency",
     "lorasp_jax.extras.judge",
     "lorasp_jax.extras.study",
+    "lorasp_jax.extras.latency",
     "lorasp_jax.extras.deployment",
 ]
 PRIVATE = re.compile(r"(jax|flax|optax|orbax)(\..*)?\._|jaxlib\b|jax\.interpreters\b")

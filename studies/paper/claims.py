@@ -15,7 +15,6 @@ from lorasp_jax.extras.study.claims import Claim, Criterion
 from lorasp_jax.extras.study.statistics import Estimate
 from lorasp_jax.extras.study.study import Results
 from studies.paper import naming, published
-from studies.paper.book import Book
 from studies.paper.naming import TOWERS
 
 LESS_IS_NOTHING = "the paper states no amount, so any difference counts that the interval confirms"
@@ -75,6 +74,10 @@ class _Maker:
         return (Criterion(cells=naming.flat(*methods), estimate=estimate, **fields),)
 
 
+Criteria = Callable[[_Maker, str], tuple[Criterion, ...]]
+"""Makes criteria for a backbone."""
+
+
 def _outcomes(
     interval: Any, statistic: Any, methods: Sequence[naming.Seeds], results: Results
 ) -> Estimate:
@@ -85,26 +88,15 @@ def _over_seeds(values: Any, methods: Sequence[naming.Seeds], results: Results) 
     return statistics.over_seeds(values(results, *methods))
 
 
-def _beats_lora(make: _Maker, backbone: str) -> tuple[Criterion, ...]:
-    return make.difference(
-        f"{backbone}/multi/lora_sp",
-        f"{backbone}/multi/lora_r{make.rank}",
-        measure=f"LoRA-SP minus LoRA with r = {make.rank}",
-        side="above",
-        bound=0.0,
-        reason=LESS_IS_NOTHING,
-    )
+def _lead(method: str, title: str, bound: float, reason: str) -> Criteria:
+    """Return criteria on LoRA-SP's success minus that of another method."""
 
+    def criteria(make: _Maker, backbone: str) -> tuple[Criterion, ...]:
+        pair = (f"{backbone}/multi/{each}" for each in ("lora_sp", method))
+        shared: dict[str, Any] = {"side": "above", "bound": bound, "reason": reason}
+        return make.difference(*pair, measure=f"LoRA-SP minus {title}", **shared)
 
-def _near_full(make: _Maker, backbone: str) -> tuple[Criterion, ...]:
-    return make.difference(
-        f"{backbone}/multi/lora_sp",
-        f"{backbone}/multi/full",
-        measure="LoRA-SP minus full fine-tuning",
-        side="above",
-        bound=-0.03,
-        reason=THREE_POINTS,
-    )
+    return criteria
 
 
 def _needs_rank(make: _Maker, backbone: str) -> tuple[Criterion, ...]:
@@ -122,7 +114,7 @@ def _needs_rank(make: _Maker, backbone: str) -> tuple[Criterion, ...]:
 
 def _multi_task(make: _Maker, backbone: str) -> tuple[Criterion, ...]:
     """Return criteria on LoRA of all ranks but R: [multi..., single...]."""
-    ranks = Book(make.names, {}).ranks(backbone, "multi")
+    ranks = naming.lora_ranks(make.names, backbone)
     # The paper has no rank of R/32.
     paper = [r for r in ranks if published.cell(f"{backbone}/multi/lora_r{r}", make.rank)]
     lora = [[f"{backbone}/{kind}/lora_r{r}" for r in paper] for kind in ("multi", "single")]
@@ -289,27 +281,16 @@ def _others(make: _Maker, backbone: str) -> tuple[Criterion, ...]:
     )
 
 
-def _beats_cut(make: _Maker, backbone: str) -> tuple[Criterion, ...]:
-    return make.difference(
-        f"{backbone}/multi/lora_sp",
-        f"{backbone}/multi/lora_cut",
-        measure="LoRA-SP minus LoRA cut after training to the same mean rank",
-        side="above",
-        bound=0.0,
-        reason=LESS_IS_NOTHING,
-    )
-
-
-CLAIMS: tuple[tuple[str, str, Callable[[_Maker, str], tuple[Criterion, ...]]], ...] = (
+CLAIMS: tuple[tuple[str, str, Criteria], ...] = (
     (
         "Multi-task, LoRA-SP beats LoRA, r = R.",
         "Table I: 83.3 % against 60.0 % on π0, 91.7 % against 60.0 % on SmolVLA.",
-        _beats_lora,
+        _lead("lora_r64", "LoRA with r = 64", 0.0, LESS_IS_NOTHING),
     ),
     (
         "Multi-task, LoRA-SP is at most 3 points below full fine-tuning.",
         "Table I: 83.3 % against 83.3 % on π0, 91.7 % against 86.7 % on SmolVLA.",
-        _near_full,
+        _lead("full", "full fine-tuning", -0.03, THREE_POINTS),
     ),
     (
         "LoRA needs r of at least R/2 for 95 % of full fine-tuning's success.",
@@ -357,7 +338,7 @@ CLAIMS: tuple[tuple[str, str, Callable[[_Maker, str], tuple[Criterion, ...]]], .
         "LoRA-SP beats LoRA that is cut after training to the same mean rank.",
         "Not in the paper. PARA (arXiv 2604.27796) reports that such a cut, by 75 to 90 % of the "
         "parameters, costs no quality, which speaks against the claim.",
-        _beats_cut,
+        _lead("lora_cut", "LoRA cut after training to the same mean rank", 0.0, LESS_IS_NOTHING),
     ),
 )
 """Statement, the paper's evidence, and the criteria."""

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lorasp_jax.evaluation.figure_style import STYLE
-from studies.paper.book import Book
+from studies.paper.book import BACKBONES, Book
 
 INKS = {"light": "#1f2328", "dark": "#e6edf3"}
 """Color of text and lines by color scheme of the page; the background is transparent."""
@@ -42,11 +42,11 @@ def svgs(draw: Callable[[Book], Figure], book: Book) -> dict[str, str]:
     return {scheme: text.replace(ink, other) for scheme, other in INKS.items()}
 
 
-def panels(book: Book, rows: int, height: float, **subplots: Any) -> tuple[Figure, np.ndarray]:
-    """Return a figure with a column of axes `[rows, columns]` for each backbone of a book."""
+def panels(rows: int, height: float, **subplots: Any) -> tuple[Figure, np.ndarray]:
+    """Return a figure with a column of axes `[rows, columns]` for each backbone."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     options: Any = {"sharey": True, "squeeze": False, **subplots}
-    return figure, figure.subplots(rows, len(book.backbones), **options)
+    return figure, figure.subplots(rows, len(BACKBONES), **options)
 
 
 def rows(axes: Axes, labels: Sequence[str]) -> None:

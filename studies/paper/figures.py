@@ -1,4 +1,4 @@
-"""Figures 1, 3, 4 and 6 of the paper, for the backbones of a book, whose results must be there."""
+"""Figures 1, 3, 4 and 6 of the paper."""
 
 from collections.abc import Sequence
 
@@ -15,6 +15,7 @@ from studies.paper import naming, published
 from studies.paper.book import BACKBONES, Book
 from studies.paper.figure_style import FULL, LORA, LORA_SP, SINGLE, legend, panels, rows
 from studies.paper.naming import TOWERS
+from studies.paper.tables import RANK
 
 _TRAININGS = {"single": ("one policy per task", SINGLE, "s"), "multi": ("one for all", LORA, "o")}
 _ROBOTS = {"panda": "Panda (seen), new scene", "multi": "PiPER (unseen)"}
@@ -28,18 +29,18 @@ _FORWARD = (
 
 def figure_1(book: Book) -> Figure:
     """Plot multi-task success relative to full fine-tuning against rank, as in Figure 1."""
-    figure, grid = panels(book, 1, height=3.3)
-    for axes, backbone in zip(grid[0], book.backbones, strict=True):
-        ranks = book.ranks(backbone, "multi")
+    figure, grid = panels(1, height=3.3)
+    for axes, backbone in zip(grid[0], BACKBONES, strict=True):
+        ranks = book.ranks(backbone)
         lora = [_relative_success(book, backbone, f"lora_r{rank}") for rank in ranks]
         _band(axes, ranks, lora, LORA, "o", "LoRA")
-        _paper_lora(axes, book, backbone, ranks)
+        _paper_lora(axes, backbone, ranks)
         value, low, high = _relative_success(book, backbone, "lora_sp")
         errors = [[value - low], [high - value]]
         mean = book.mean(f"{backbone}/multi/lora_sp", "active_rank", "mean")
         axes.errorbar([mean or 1], [value], errors, color=LORA_SP)
         axes.plot([mean or 1], [value], "D", color=LORA_SP, label="LoRA-SP")
-        _paper_lora_sp(axes, book, backbone)
+        _paper_lora_sp(axes, backbone)
         axes.axhline(100, color=FULL, lw=1.5, ls=":", label="full fine-tuning")
         _rank_axis(axes, ranks)
         axes.set_xlabel("rank (LoRA-SP: mean active rank)")
@@ -69,43 +70,33 @@ def _band(
     axes.plot(ranks, values, f"{marker}-", color=color, ms=5, label=label)
 
 
-def _paper_lora(axes: Axes, book: Book, backbone: str, ranks: list[int]) -> None:
+def _paper_lora(axes: Axes, backbone: str, ranks: list[int]) -> None:
     """Plot the paper's LoRA at the same fractions of R."""
-    found = {r: _paper(book, backbone, f"lora_r{r}") for r in ranks}
+    found = {r: _paper(backbone, f"lora_r{r}") for r in ranks}
     points = {rank: value for rank, value in found.items() if value is not None}
-    style = {"color": LORA, "mfc": "none", "ms": 5, "label": f"LoRA, paper{_scaled(book)}"}
+    style = {"color": LORA, "mfc": "none", "ms": 5, "label": "LoRA, paper (ranks halved)"}
     axes.plot(list(points), list(points.values()), "o--", **style)
 
 
-def _paper_lora_sp(axes: Axes, book: Book, backbone: str) -> None:
-    value = _paper(book, backbone, "lora_sp")
-    if value is not None:
-        cell = published.cell(f"{backbone}/multi/lora_sp", book.rank)
-        rank = cell["active_rank"] * book.rank / published.RANK
-        label = f"LoRA-SP, paper{_scaled(book)}"
-        axes.plot([rank], [value], "D", color=LORA_SP, mfc="none", label=label)
+def _paper_lora_sp(axes: Axes, backbone: str) -> None:
+    cell = published.cell(f"{backbone}/multi/lora_sp", RANK)
+    rank, value = cell["active_rank"] * RANK / published.RANK, _paper(backbone, "lora_sp")
+    label = "LoRA-SP, paper (ranks halved)"
+    axes.plot([rank], [value or 0.0], "D", color=LORA_SP, mfc="none", label=label)
 
 
-def _paper(book: Book, backbone: str, method: str) -> float | None:
+def _paper(backbone: str, method: str) -> float | None:
     """Return the paper's success relative to full fine-tuning [%]; None if it has none."""
     prefixes = [f"{backbone}/multi/{m}" for m in (method, "full")]
-    ratio = published.compute(statistics.ratio, prefixes, book.rank)
+    ratio = published.compute(statistics.ratio, prefixes, RANK)
     return None if ratio is None else 100 * float(ratio)
-
-
-def _scaled(book: Book) -> str:
-    """Say how the paper's ranks are scaled to the size of the bank."""
-    share = published.RANK / book.rank
-    if share == 1:
-        return ""
-    return " (ranks halved)" if share == 2 else f" (ranks / {share:g})"
 
 
 def figure_3(book: Book) -> Figure:
     """Plot mean and deviation over tasks of LoRA's success against rank (Figure 3)."""
-    figure, grid = panels(book, 2, height=5.2, sharey="row")
-    for (top, bottom), backbone in zip(grid.T, book.backbones, strict=True):
-        ranks = book.ranks(backbone, "multi")
+    figure, grid = panels(2, height=5.2, sharey="row")
+    for (top, bottom), backbone in zip(grid.T, BACKBONES, strict=True):
+        ranks = book.ranks(backbone)
         for training, (title, color, marker) in _TRAININGS.items():
             found = [book.outcomes(f"{backbone}/{training}/lora_r{rank}") for rank in ranks]
             means = [_percent(statistics.success(outcomes)) for outcomes in found]
@@ -137,9 +128,9 @@ def _deviation(outcomes: np.ndarray) -> Estimate:
 
 def figure_4(book: Book) -> Figure:
     """Plot the share of singular values that full fine-tuning's updates need (Figure 4)."""
-    figure, grid = panels(book, 1, height=3.2)
+    figure, grid = panels(1, height=3.2)
     styles = {"panda": {"facecolor": "none"}, "multi": {"facecolor": FULL, "alpha": 0.8}}
-    for axes, backbone in zip(grid[0], book.backbones, strict=True):
+    for axes, backbone in zip(grid[0], BACKBONES, strict=True):
         for offset, (training, style) in zip((-0.18, 0.18), styles.items(), strict=True):
             shares = [_shares(book, f"{backbone}/{training}/full", tower) for tower in TOWERS]
             axes.boxplot(
@@ -172,11 +163,11 @@ def _shares(book: Book, prefix: str, tower: str) -> list[float]:
 
 def figure_6(book: Book) -> Figure:
     """Plot LoRA-SP's active rank over held-out tokens by kind of layer (Figure 6)."""
-    found = {b: book.rank_boxes(f"{b}/multi/lora_sp") for b in book.backbones}
+    found = {b: book.rank_boxes(f"{b}/multi/lora_sp") for b in BACKBONES}
     kinds = [_in_order([kind for boxes in found.values() for kind in boxes[t]]) for t in TOWERS]
     heights = [len(names) + 1 for names in kinds]
     figure, grid = panels(
-        book, len(TOWERS), 1.2 + 0.19 * sum(heights), sharey="row", height_ratios=heights
+        len(TOWERS), 1.2 + 0.19 * sum(heights), sharey="row", height_ratios=heights
     )
     for column, (backbone, boxes) in zip(grid.T, found.items(), strict=True):
         for axes, tower, names in zip(column, TOWERS, kinds, strict=True):
@@ -184,10 +175,10 @@ def figure_6(book: Book) -> Figure:
                 if name in boxes[tower]:
                     _layers(axes, row, boxes[tower][name], COLORS[tower])
             rows(axes, [naming.short_kind(name) for name in names])
-            axes.axvline(book.rank, color=mpl.rcParams["text.color"], lw=1, ls=":")
-            axes.set_xlim(0, 1.03 * book.rank)
+            axes.axvline(RANK, color=mpl.rcParams["text.color"], lw=1, ls=":")
+            axes.set_xlim(0, 1.03 * RANK)
             axes.set_title(f"{BACKBONES[backbone]}, {tower}", loc="left")
-        column[-1].set_xlabel(f"active rank (dotted: R = {book.rank})")
+        column[-1].set_xlabel(f"active rank (dotted: R = {RANK})")
     return figure
 
 
@@ -211,3 +202,7 @@ def _rank_axis(axes: Axes, ranks: list[int]) -> None:
     axes.set_xticks(ranks, [f"{rank}" for rank in ranks])
     axes.minorticks_off()
     axes.set_xlabel("rank")
+
+
+DRAWINGS = {"figure_1": figure_1, "figure_3": figure_3, "figure_4": figure_4, "figure_6": figure_6}
+"""Figures by the name of their files."""

@@ -27,6 +27,18 @@ def seeds(names: Iterable[str], prefix: str) -> Seeds:
     return tuple(tuple(found[seed]) for seed in sorted(found))
 
 
+def methods(names: Iterable[str], backbone: str, training: str) -> list[str]:
+    """Return the methods of a kind of training, in the order of the names."""
+    parts = [name.split("/") for name in names]
+    return list(dict.fromkeys(p[2] for p in parts if p[:2] == [backbone, training]))
+
+
+def lora_ranks(names: Iterable[str], backbone: str) -> list[int]:
+    """Return the ranks of LoRA for all tasks in ascending order."""
+    stems = methods(names, backbone, "multi")
+    return sorted(int(m.removeprefix("lora_r")) for m in stems if m.startswith("lora_r"))
+
+
 def flat(*methods: Seeds) -> tuple[str, ...]:
     """Return the names of all cells of some methods."""
     return tuple(name for method in methods for seed in method for name in seed)
@@ -105,4 +117,4 @@ def rate(pilot: str) -> float:
 
 def best_pilot(results: Mapping[str, Any], pilots: Sequence[str]) -> str:
     """Return the pilot cell with the highest success, averaged over tasks; of equals, the first."""
-    return max(pilots, key=lambda name: outcomes(results, ((name,),)).mean())
+    return max(pilots, key=lambda name: "".join(results[name]["outcomes"].values()).count("1"))

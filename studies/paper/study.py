@@ -16,18 +16,19 @@ in how much the scene varies. It trains like full fine-tuning on PiPER, at the s
 
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from envs import Episodes, Randomization
 from lorasp_jax.config import Config, DataConfig, EvaluationConfig, ModelConfig, OptimConfig
-from lorasp_jax.extras.study import Cell, Derived, Study, transforms
+from lorasp_jax.extras.study import Cell, Derived, Study
 from lorasp_jax.extras.study.study import Results
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP, Method
 from lorasp_jax.policies.policy import Policy
-from studies.paper import naming, page
+from studies.paper import naming, page, transforms
 from studies.paper.claims import make_claims
+from studies.paper.measures import measure
 
 MakeMethod = Callable[[Results], Method]
 PILOT_SEED = 1000
@@ -47,189 +48,133 @@ cameras moved and rotated, a higher table, and all objects moved and rotated on 
 still sees every object at every start."""
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What differs between scales.
-
-    Attributes:
-        config: what all cells share; its method, rate and seed are replaced.
-        backbones: those of Tables I and II.
-        ablated: the backbone of Tables III and IV; empty for none.
-        seeds: seeds of the tables.
-        rank: R, the size of LoRA-SP's bank.
-        ranks: LoRA's ranks besides R.
-        methods: methods of Table I, in order.
-        rates: learning rates to choose among.
-        single: whether to train policies for single tasks, for Table II.
-    """
-
-    config: Config
-    backbones: tuple[str, ...]
-    ablated: str
-    seeds: tuple[int, ...]
-    rank: int
-    ranks: tuple[int, ...]
-    methods: tuple[str, ...]
-    rates: tuple[float, ...]
-    single: bool
+CONFIG = Config(
+    name="paper",
+    scale="accelerator",
+    peft=LoRASP(),
+    model=ModelConfig(size="small", dtype="bfloat16"),
+    data=DataConfig(episodes=512, num_envs=256),
+    optim=OptimConfig(steps=5000, batch_size=128, warmup_steps=100),
+    evaluation=EvaluationConfig(episodes=256, num_envs=256, before=False),
+    log_every=125,
+    checkpoint_every=1250,
+)
+"""What all cells share; method, rate and seed are replaced."""
+BACKBONES = ("pi0", "smolvla")
+ABLATED = "smolvla"
+"""The backbone of Tables III and IV."""
+SEEDS = (0, 1, 2)
+RANK = 64
+"""R, the size of LoRA-SP's bank."""
+RANKS = (2, 4, 8, 16, 32)
+"""LoRA's ranks besides R."""
+METHODS = (
+    *("lora_sp", "lora_r64", "lora_moe_top1", "lora_moe_weighted", "ada_lora", "full"),
+    *("dora", "lora_same_rank", "lora_cut"),
+)
+"""Methods of Table I."""
+RATES = (3e-4, 1e-3, 3e-3)
+"""Learning rates to choose among."""
 
 
 def get_study(scale: str) -> Study:
-    """Return the study at `scale`: accelerator, or smoke for tests."""
-    plans = {"accelerator": _accelerator, "smoke": _smoke}
-    if scale not in plans:
-        raise ValueError(f"the study has the scales {' and '.join(plans)}, got {scale!r}")
-    plan = plans[scale]()
-    cells = tuple(cell for backbone in plan.backbones for cell in _cells(plan, backbone))
-    cells += tuple(cell for backbone in plan.backbones for cell in _new_scene(plan, backbone))
-    names = [cell.name for cell in cells]
-    claims = make_claims(names, plan.rank, plan.backbones)
-    name = "paper" if scale == "accelerator" else f"paper_{scale}"
-    return Study(name, cells, claims, page=page.write)
-
-
-def _accelerator() -> Plan:
-    return Plan(
-        config=Config(
-            name="paper",
-            scale="accelerator",
-            peft=LoRASP(),
-            model=ModelConfig(size="small", dtype="bfloat16"),
-            data=DataConfig(episodes=512, num_envs=256),
-            optim=OptimConfig(steps=5000, batch_size=128, warmup_steps=100),
-            evaluation=EvaluationConfig(episodes=256, num_envs=256, before=False),
-            log_every=125,
-            checkpoint_every=1250,
-        ),
-        backbones=("pi0", "smolvla"),
-        ablated="smolvla",
-        seeds=(0, 1, 2),
-        rank=64,
-        ranks=(2, 4, 8, 16, 32),
-        methods=(
-            *("lora_sp", "lora_r64", "lora_moe_top1", "lora_moe_weighted", "ada_lora", "full"),
-            *("dora", "lora_same_rank", "lora_cut"),
-        ),
-        rates=(3e-4, 1e-3, 3e-3),
-        single=True,
-    )
-
-
-def _smoke() -> Plan:
-    return Plan(
-        config=Config(
-            name="paper",
-            scale="smoke",
-            peft=LoRASP(),
-            tasks=("press", "pick_place"),
-            targets=("(q|v)_proj",),  # in every module, because claim 8 compares them
-            data=DataConfig(episodes=4, num_envs=8),
-            optim=OptimConfig(steps=4, batch_size=8, warmup_steps=1),
-            evaluation=EvaluationConfig(episodes=8, num_envs=8, before=False),
-            log_every=2,
-            checkpoint_every=2,
-        ),
-        backbones=("pi0",),
-        ablated="",
-        seeds=(0, 1),
-        rank=4,
-        ranks=(),
-        methods=("lora_sp", "lora_r4", "lora_cut"),
-        rates=(1e-3, 3e-3),
-        single=False,
-    )
+    """Return the study, which has one scale: accelerator."""
+    if scale != "accelerator":
+        raise ValueError(f"the study has the scale accelerator, got {scale!r}")
+    cells = tuple(cell for backbone in BACKBONES for cell in _cells(backbone))
+    cells += tuple(cell for backbone in BACKBONES for cell in _new_scene(backbone))
+    claims = make_claims([cell.name for cell in cells], RANK, BACKBONES)
+    return Study("paper", cells, claims, measure=measure, page=page.blocks)
 
 
 # Cells
 
 
-def _cells(plan: Plan, backbone: str) -> Iterator[Cell | Derived]:
+def _cells(backbone: str) -> Iterator[Cell | Derived]:
     """Yield all cells of a backbone, each after those that it needs."""
-    families = dict.fromkeys(_family(plan, m) for m in plan.methods)
+    families = dict.fromkeys(_family(m) for m in METHODS)
     for family in families:
-        yield from _pilots(plan, backbone, family)
+        yield from _pilots(backbone, family)
     ablations = ["lora_sp_no_spectral", *(f"lora_sp_eta_{eta}" for eta in ETAS)]
-    ablations = ablations if backbone == plan.ablated else []
-    small = [f"lora_r{rank}" for rank in plan.ranks]
-    for method in (*plan.methods, *small, *ablations):
-        yield from _multi(plan, backbone, method)
+    ablations = ablations if backbone == ABLATED else []
+    small = [f"lora_r{rank}" for rank in RANKS]
+    for method in (*METHODS, *small, *ablations):
+        yield from _multi(backbone, method)
     for method in ("lora_sp", *ablations) if ablations else ():
-        for seed in plan.seeds:
+        for seed in SEEDS:
             source = f"{backbone}/multi/{method}/s{seed}"
             name = f"{backbone}/multi/{method}_pruned/s{seed}"
             yield Derived(name, source, _pruned)
-    if plan.single:
-        for method in (*small, f"lora_r{plan.rank}", "full", "lora_sp"):
-            yield from _single(plan, backbone, method)
+    for method in (*small, f"lora_r{RANK}", "full", "lora_sp"):
+        yield from _single(backbone, method)
 
 
-def _family(plan: Plan, method: str) -> str:
+def _family(method: str) -> str:
     """Return the method whose pilot cells choose the learning rate."""
     if method.startswith("lora_sp"):
         return "lora_sp"
     is_lora = method.startswith("lora_r") or method in ("lora_same_rank", "lora_cut")
-    return f"lora_r{plan.rank}" if is_lora else method
+    return f"lora_r{RANK}" if is_lora else method
 
 
-def _pilot_names(plan: Plan, backbone: str, family: str) -> tuple[str, ...]:
-    return tuple(f"{backbone}/pilot/{family}/{rate}" for rate in plan.rates)
+def _pilot_names(backbone: str, family: str) -> tuple[str, ...]:
+    return tuple(f"{backbone}/pilot/{family}/{rate}" for rate in RATES)
 
 
-def _pilots(plan: Plan, backbone: str, family: str) -> Iterator[Cell]:
+def _pilots(backbone: str, family: str) -> Iterator[Cell]:
     """Yield a cell for each learning rate. AdaLoRA's budget comes from LoRA-SP's best pilot."""
-    needs = _pilot_names(plan, backbone, "lora_sp") if family == "ada_lora" else ()
+    needs = _pilot_names(backbone, "lora_sp") if family == "ada_lora" else ()
 
     def config(rate: float, results: Results) -> Config:
         rank = _mean_rank(results, [naming.best_pilot(results, needs)]) if needs else 0.0
-        method = _method(plan, family, rank)
-        return _config(plan, backbone, method, rate, PILOT_SEED)
+        method = _method(family, rank)
+        return _config(backbone, method, rate, PILOT_SEED)
 
-    for rate, name in zip(plan.rates, _pilot_names(plan, backbone, family), strict=True):
+    for rate, name in zip(RATES, _pilot_names(backbone, family), strict=True):
         make = functools.partial(config, rate)
         made = make if needs else make({})
         yield Cell(name, made, needs, f"{backbone}/pilot/{family}", measured=False)
 
 
-def _multi(plan: Plan, backbone: str, method: str) -> Iterator[Cell | Derived]:
+def _multi(backbone: str, method: str) -> Iterator[Cell | Derived]:
     """Yield the cells of a method that learns all tasks, one for each seed."""
     group = f"{backbone}/multi/{method}"
-    ranked = tuple(f"{backbone}/multi/lora_sp/s{seed}" for seed in plan.seeds)
-    for seed in plan.seeds:
+    ranked = tuple(f"{backbone}/multi/lora_sp/s{seed}" for seed in SEEDS)
+    for seed in SEEDS:
         name = f"{group}/s{seed}"
         if method == "lora_cut":
-            source = f"{backbone}/multi/lora_r{plan.rank}/s{seed}"
+            source = f"{backbone}/multi/lora_r{RANK}/s{seed}"
             yield Derived(name, source, functools.partial(_cut, ranked), ranked)
             continue
         needs = ranked if method in ("ada_lora", "lora_same_rank") else ()
         # The base is the same for all methods and seeds.
-        before = method == "lora_sp" and seed == plan.seeds[0]
-        yield _trained(plan, backbone, method, name, group, seed, needs=needs, before=before)
+        before = method == "lora_sp" and seed == SEEDS[0]
+        yield _trained(backbone, method, name, group, seed, needs=needs, before=before)
 
 
-def _single(plan: Plan, backbone: str, method: str) -> Iterator[Cell]:
+def _single(backbone: str, method: str) -> Iterator[Cell]:
     """Yield the cells of a method that learns single tasks, one for each seed and task."""
     group = f"{backbone}/single/{method}"
-    for task in plan.config.tasks:
-        for seed in plan.seeds:
+    for task in CONFIG.tasks:
+        for seed in SEEDS:
             name = f"{group}/{task}/s{seed}"
-            yield _trained(plan, backbone, method, name, group, seed, tasks=(task,))
+            yield _trained(backbone, method, name, group, seed, tasks=(task,))
 
 
-def _new_scene(plan: Plan, backbone: str) -> Iterator[Cell]:
+def _new_scene(backbone: str) -> Iterator[Cell]:
     """Yield the cells of full fine-tuning on the Panda, one for each seed."""
-    group, pilots = f"{backbone}/panda/full", _pilot_names(plan, backbone, "full")
+    group, pilots = f"{backbone}/panda/full", _pilot_names(backbone, "full")
 
     def config(seed: int, results: Results) -> Config:
-        rate, before = _best_rate(results, pilots), seed == plan.seeds[0]
-        made = _config(plan, backbone, FullFineTuning(), rate, seed, before=before)
+        rate, before = _best_rate(results, pilots), seed == SEEDS[0]
+        made = _config(backbone, FullFineTuning(), rate, seed, before=before)
         return replace(made, robot="panda", scene=NEW_SCENE)
 
-    for seed in plan.seeds if "full" in plan.methods else ():
+    for seed in SEEDS:
         yield Cell(f"{group}/s{seed}", functools.partial(config, seed), pilots, group)
 
 
 def _trained(
-    plan: Plan,
     backbone: str,
     method: str,
     name: str,
@@ -241,12 +186,12 @@ def _trained(
     before: bool = False,
 ) -> Cell:
     """Return a cell with the best learning rate, and LoRA-SP's mean rank if it needs that."""
-    pilots = _pilot_names(plan, backbone, _family(plan, method))
+    pilots = _pilot_names(backbone, _family(method))
 
     def config(results: Results) -> Config:
         rate = _best_rate(results, pilots)
-        peft = _method(plan, method, _mean_rank(results, needs) if needs else 0.0)
-        made = _config(plan, backbone, peft, rate, seed, tasks or plan.config.tasks, before=before)
+        peft = _method(method, _mean_rank(results, needs) if needs else 0.0)
+        made = _config(backbone, peft, rate, seed, tasks or CONFIG.tasks, before=before)
         if method != "lora_sp_no_spectral":
             return made
         return replace(made, auxiliary=replace(made.auxiliary, spectral=0.0))
@@ -256,7 +201,6 @@ def _trained(
 
 
 def _config(
-    plan: Plan,
     backbone: str,
     method: Method,
     rate: float,
@@ -266,24 +210,24 @@ def _config(
     before: bool = False,
 ) -> Config:
     """Return the config of a cell; steps are in proportion to the number of tasks."""
-    shared, tasks = plan.config, tasks or plan.config.tasks
-    share = len(tasks) / len(shared.tasks)
-    optim = shared.optim
+    tasks = tasks or CONFIG.tasks
+    share = len(tasks) / len(CONFIG.tasks)
+    optim = CONFIG.optim
     steps, warmup = round(optim.steps * share), round(optim.warmup_steps * share)
     return replace(
-        shared,
+        CONFIG,
         peft=method,
-        model=replace(shared.model, backbone=backbone),
+        model=replace(CONFIG.model, backbone=backbone),
         tasks=tasks,
         optim=replace(optim, learning_rate=rate, steps=steps, warmup_steps=warmup),
-        evaluation=replace(shared.evaluation, before=before),
+        evaluation=replace(CONFIG.evaluation, before=before),
         seed=seed,
     )
 
 
-def _method(plan: Plan, name: str, mean_rank: float) -> Method:
+def _method(name: str, mean_rank: float) -> Method:
     """Return a method by name; `mean_rank` is LoRA-SP's, for those that have the same."""
-    rank, whole = plan.rank, max(round(mean_rank), 1)
+    rank, whole = RANK, max(round(mean_rank), 1)
     if name.startswith("lora_sp_eta_"):
         return LoRASP(rank=rank, energy_target=float(name.removeprefix("lora_sp_eta_")))
     if name.startswith("lora_r"):

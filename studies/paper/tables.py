@@ -1,17 +1,58 @@
 """Tables of the study of the paper, in Markdown, beside the paper's numbers."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from lorasp_jax.extras.study import statistics
+from lorasp_jax.extras.study import page, statistics
+from lorasp_jax.extras.study.page import NONE
 from lorasp_jax.peft import LoRASP
 from studies.paper import naming, published
-from studies.paper.book import BACKBONES, NONE, TASKS, Book, markdown, percent
+from studies.paper.book import BACKBONES, TASKS, Book
 from studies.paper.naming import TOWERS
 
 Column = tuple[str, Callable[[str], str]]
-"""Title of a column, and its text for a method that is finished."""
+"""Title of a column, and its text for a method."""
+RANK = 64
+"""R, LoRA's highest rank and the size of LoRA-SP's bank."""
+
+
+def blocks(book: Book) -> dict[str, str]:
+    """Return all tables by the names of their places in the page."""
+    by_backbone = {
+        "table I": table_1,
+        "table II by task": table_2_by_task,
+        "table III": table_3,
+        "table IV": table_4,
+        "pruning": pruning,
+        "costs": costs,
+    }
+    whole = {"main result": main_result, "rates": rates, "table II": table_2, "robots": robots}
+    return {name: make(book) for name, make in whole.items()} | {
+        name: "\n".join(filter(None, (make(book, backbone) for backbone in BACKBONES)))
+        for name, make in by_backbone.items()
+    }
+
+
+def main_result(book: Book) -> str:
+    """Return LoRA-SP's success minus that of LoRA of three ranks."""
+    rows = []
+    titles = {
+        f"lora_r{RANK}": f"r = R = {RANK}",
+        "lora_same_rank": "r = LoRA-SP's mean active rank",
+        f"lora_r{RANK // 2}": f"r = R/2 = {RANK // 2}",
+    }
+    for method, title in titles.items():
+        row = [title]
+        for backbone in BACKBONES:
+            pair = [f"{backbone}/multi/{m}" for m in ("lora_sp", method)]
+            lead = statistics.difference(*map(book.outcomes, pair))
+            theirs = published.compute(statistics.minus, pair, RANK)
+            paper = NONE if theirs is None else page.signed(100 * float(theirs))
+            row += [page.points(lead), paper]
+        rows.append(row)
+    titles = [t for name in BACKBONES.values() for t in (name, f"{name} in the paper")]
+    return page.table(["LoRA-SP minus LoRA with", *titles], rows)
 
 
 def success_table(
@@ -25,8 +66,6 @@ def success_table(
 ) -> str:
     """Return success by method and task, the paper's numbers in brackets, after other columns.
 
-    If no method is finished, return only how many runs there are.
-
     Args:
         book: the results.
         backbone: shown in the table, like `training`.
@@ -35,29 +74,25 @@ def success_table(
         columns: further columns.
         with_base: whether to begin with the base before adaptation.
     """
-    prefixes = [f"{backbone}/{training}/{method}" for method in labels]
-    if all(book.missing(prefix) for prefix in prefixes):
-        return f"{book.missing(*prefixes)}.\n"
-    headers = ["method", *(t for t, _ in columns), *TASKS.values(), "mean [95 % interval]"]
     rows = [_base(book, backbone, len(columns))] if with_base else []
-    for prefix, name in zip(prefixes, labels.values(), strict=True):
-        paper = published.cell(prefix, book.rank).get("success", {})
-        if missing := book.missing(prefix):
-            cells = [NONE for _ in columns] + [_with("", paper.get(task)) for task in TASKS]
-            rows.append([name, *cells, _with(missing, _mean(paper))])
-            continue
-        rates = dict(zip(book.tasks(prefix), book.outcomes(prefix).mean((0, 2)), strict=True))
-        cells = [text(prefix) for _, text in columns]
-        for task in TASKS:
-            ours = f"{100 * rates[task]:.1f}" if task in rates else ""
-            cells.append(_with(ours, paper.get(task)))
-        rows.append([name, *cells, _with(_success(book, prefix), _mean(paper))])
-    return markdown(headers, rows)
+    for method, name in labels.items():
+        prefix = f"{backbone}/{training}/{method}"
+        paper = published.cell(prefix, RANK).get("success", {})
+        ours = book.rates(prefix)
+        cells = [_with(f"{100 * ours[task]:.1f}", paper.get(task)) for task in TASKS]
+        cells.append(_with(_success(book, prefix), _mean(paper)))
+        rows.append([name, *(text(prefix) for _, text in columns), *cells])
+    headers = ["method", *(t for t, _ in columns), *TASKS.values(), "mean [95 % interval]"]
+    return page.table(headers, rows)
+
+
+def _titled(title: str, table: str) -> str:
+    return f"**{title}**\n\n{table}"
 
 
 def _success(book: Book, prefix: str) -> str:
-    """Return a method's mean success and its interval, or how many of its runs there are."""
-    return book.missing(prefix) or percent(statistics.success(book.outcomes(prefix)))
+    """Return a method's mean success and its interval."""
+    return page.percent(statistics.success(book.outcomes(prefix)))
 
 
 def _with(ours: str, paper: float | None, digits: int = 1) -> str:
@@ -72,59 +107,52 @@ def _mean(paper: Mapping[str, float]) -> float | None:
 
 def table_1(book: Book, backbone: str) -> str:
     """Return Table I: methods, their size, active rank and multi-task success, after the base's."""
-    methods = _labels(book, book.table_1_methods(backbone))
     columns = [("trainable %", _trainable(book)), ("active rank", _rank(book))]
-    return success_table(book, backbone, "multi", methods, columns, with_base=True)
+    labels = _labels(book.table_1_methods(backbone))
+    table = success_table(book, backbone, "multi", labels, columns, with_base=True)
+    return _titled(BACKBONES[backbone], table)
 
 
 def _base(book: Book, backbone: str, columns: int) -> list[str]:
-    """Return the row of the base before adaptation, from the cell that evaluates it."""
-    rates = book.base(f"{backbone}/multi/")
-    tasks = (f"{100 * rates[task]:.1f}" if task in rates else NONE for task in TASKS)
+    """Return the row of the base before adaptation."""
+    rates = book.base(f"{backbone}/multi")
+    tasks = (f"{100 * rates[task]:.1f}" for task in TASKS)
     return ["base, not adapted", *[NONE] * columns, *tasks, _base_success(rates)]
 
 
 def _base_success(rates: Mapping[str, float]) -> str:
-    """Return the base's mean success."""
-    return f"{100 * np.mean([*rates.values()]):.1f}" if rates else "0 of 1 runs so far"
+    return f"{100 * np.mean([*rates.values()]):.1f}"
 
 
 def table_2(book: Book) -> str:
     """Return the mean success of Table II's methods by backbone and kind of training."""
-    kinds = {
-        (backbone, training): title
-        for backbone in book.backbones
-        for training, title in (("single", "one per task"), ("multi", "all tasks"))
-        if book.methods(backbone, "single")
-    }
-    if not kinds:
-        return ""
-    methods = dict.fromkeys(m for backbone, _ in kinds for m in _table_2_methods(book, backbone))
-    headers = [f"{BACKBONES[backbone]}, {title}" for (backbone, _), title in kinds.items()]
+    kinds = [(b, t) for b in BACKBONES for t in ("single", "multi")]
     rows = []
-    for method in methods:
-        row = [naming.label(method, book.rank)]
+    for method, label in _table_2_methods(book).items():
+        row = [label]
         for backbone, training in kinds:
             prefix = f"{backbone}/{training}/{method}"
-            paper = published.cell(prefix, book.rank).get("success", {})
+            paper = published.cell(prefix, RANK).get("success", {})
             row.append(_with(_success(book, prefix), _mean(paper)))
         rows.append(row)
-    return markdown(["method", *headers], rows)
+    titles = {"single": "one per task", "multi": "all tasks"}
+    return page.table(["method", *(f"{BACKBONES[b]}, {titles[t]}" for b, t in kinds)], rows)
 
 
 def table_2_by_task(book: Book, backbone: str) -> str:
     """Return Table II: LoRA of all ranks, full fine-tuning and LoRA-SP, both ways of training."""
-    parts = []
-    for training, title in (("single", "one policy per task"), ("multi", "one for all tasks")):
-        if book.methods(backbone, "single"):
-            methods = _labels(book, _table_2_methods(book, backbone))
-            rows = success_table(book, backbone, training, methods)
-            parts.append(f"**{BACKBONES[backbone]}, {title}**\n\n{rows}")
-    return "\n".join(parts)
+    titles = {"single": "one policy per task", "multi": "one for all tasks"}
+    return "\n".join(
+        _titled(
+            f"{BACKBONES[backbone]}, {title}",
+            success_table(book, backbone, training, _table_2_methods(book)),
+        )
+        for training, title in titles.items()
+    )
 
 
-def _table_2_methods(book: Book, backbone: str) -> list[str]:
-    return [*(f"lora_r{rank}" for rank in book.ranks(backbone, "multi")), "full", "lora_sp"]
+def _table_2_methods(book: Book) -> dict[str, str]:
+    return _labels([*(f"lora_r{rank}" for rank in book.ranks("pi0")), "full", "lora_sp"])
 
 
 def table_3(book: Book, backbone: str) -> str:
@@ -133,7 +161,8 @@ def table_3(book: Book, backbone: str) -> str:
     if methods[0] not in book.methods(backbone, "multi"):
         return ""
     columns = [(tower, _tower(book, index)) for index, tower in enumerate(TOWERS)]
-    return success_table(book, backbone, "multi", _labels(book, methods), columns)
+    table = success_table(book, backbone, "multi", _labels(methods), columns)
+    return _titled(BACKBONES[backbone], table)
 
 
 def table_4(book: Book, backbone: str) -> str:
@@ -143,99 +172,81 @@ def table_4(book: Book, backbone: str) -> str:
     if not methods:
         return ""
     methods.insert(-1, "lora_sp")  # .9 comes before .99
-    labels = _labels(book, methods) | {"lora_sp": f"LoRA-SP, η = {LoRASP().energy_target:g}"}
-    return success_table(book, backbone, "multi", labels, [("active rank", _rank(book))])
+    labels = _labels(methods) | {"lora_sp": f"LoRA-SP, η = {LoRASP().energy_target:g}"}
+    table = success_table(book, backbone, "multi", labels, [("active rank", _rank(book))])
+    return _titled(BACKBONES[backbone], table)
 
 
 def pruning(book: Book, backbone: str) -> str:
     """Return what pruning after training saves and costs."""
-    headers = ["method", "adapters [MB]", "success", "after pruning"]
     rows = []
     methods = [m for m in book.methods(backbone, "multi") if m.endswith("_pruned")]
     for method in methods:
         prefix = f"{backbone}/multi/{method}"
         source = prefix.removesuffix("_pruned")
-        name = naming.label(method.removesuffix("_pruned"), book.rank)
-        if missing := book.missing(prefix, source):
-            rows.append([name, NONE, NONE, missing])
-            continue
         sizes = np.mean([s["bytes"] for s in book.measures(prefix, "smaller")], axis=0) / 1e6
-        rows.append([name, _arrow(sizes), _success(book, source), _success(book, prefix)])
-    return markdown(headers, rows) if rows else ""
+        arrow = " → ".join(f"{size:#.3g}" for size in sizes)
+        name = naming.label(method.removesuffix("_pruned"), RANK)
+        rows.append([name, arrow, _success(book, source), _success(book, prefix)])
+    headers = ["method", "adapters [MB]", "success", "after pruning"]
+    return _titled(BACKBONES[backbone], page.table(headers, rows)) if rows else ""
 
 
 def robots(book: Book) -> str:
     """Return success before and after full fine-tuning, on the robots of Figure 4."""
     rows = []
-    for backbone in (b for b in book.backbones if book.methods(b, "panda")):
+    for backbone in BACKBONES:
         for training, robot in (("panda", "Panda, seen"), ("multi", "PiPER, unseen")):
-            prefix = f"{backbone}/{training}/"
-            success = _base_success(book.base(prefix)), _success(book, f"{prefix}full")
+            prefix = f"{backbone}/{training}"
+            success = _base_success(book.base(prefix)), _success(book, f"{prefix}/full")
             rows.append([f"{BACKBONES[backbone]}, {robot}", *success])
-    return markdown(["", "base", "after full fine-tuning"], rows) if rows else ""
+    return page.table(["", "base", "after full fine-tuning"], rows)
 
 
 def costs(book: Book, backbone: str) -> str:
     """Return what each method of Table I costs, without times: runs shared GPUs."""
-    headers = ["method", "trainable", "GFLOP per sample", "memory [GiB]"]
     fields = (
         (("trainable_parameters",), 1e-6, " M"),
         (("speed", "flops_per_sample"), 1e-9, ""),
         (("speed", "peak_bytes"), 2**-30, ""),
     )
     rows = []
-    for method in book.table_1_methods(backbone):
-        if method == "lora_cut":  # it is not trained
-            continue
-        prefix = f"{backbone}/multi/{method}"
-        name = naming.label(method, book.rank)
-        if missing := book.missing(prefix):
-            rows.append([name, missing, *[NONE] * (len(fields) - 1)])
-            continue
-        values = [(book.mean(prefix, *path), scale, unit) for path, scale, unit in fields]
-        rows.append(
-            [
-                name,
-                *(NONE if v is None else f"{float(f'{v * s:.3g}'):,g}{u}" for v, s, u in values),
-            ]
-        )
-    return markdown(headers, rows)
+    for method in book.table_1_methods(backbone)[:-1]:  # lora_cut is not trained
+        row = [naming.label(method, RANK)]
+        for path, scale, unit in fields:
+            value = book.mean(f"{backbone}/multi/{method}", *path) or 0.0
+            row.append(f"{float(f'{value * scale:.3g}'):,g}{unit}")
+        rows.append(row)
+    headers = ["method", "trainable", "GFLOP per sample", "memory [GiB]"]
+    return _titled(BACKBONES[backbone], page.table(headers, rows))
 
 
 def rates(book: Book) -> str:
     """Return the success of each method's pilot cells, the chosen learning rate in bold."""
-    names = [name.split("/") for name in book.names]
-    values = list(dict.fromkeys(name[3] for name in names if name[1] == "pilot"))
-    methods = dict.fromkeys(name[2] for name in names if name[1] == "pilot")
-    headers = [f"{BACKBONES[b]}, {float(v):g}" for b in book.backbones for v in values]
+    methods = book.methods("pi0", "pilot")
+    pilots = [n for (n,) in book.cells(f"pi0/pilot/{methods[0]}")]
+    headers = [f"{n}, {naming.rate(pilot):g}" for n in BACKBONES.values() for pilot in pilots]
     rows = []
     for method in methods:
-        row = [naming.label(method, book.rank)]
-        for backbone in book.backbones:
-            row += _rates(book, f"{backbone}/pilot/{method}", len(values))
+        row = [naming.label(method, RANK)]
+        for backbone in BACKBONES:
+            names = naming.flat(book.cells(f"{backbone}/pilot/{method}"))
+            best = naming.best_pilot(book.results, names)
+            for name in names:
+                text = f"{100 * naming.outcomes(book.results, ((name,),)).mean():.1f}"
+                row.append(f"**{text}**" if name == best else text)
         rows.append(row)
-    return markdown(["method", *headers], rows)
+    return page.table(["method", *headers], rows)
 
 
-def _rates(book: Book, prefix: str, count: int) -> list[str]:
-    """Return the success of one method's pilot cells."""
-    if missing := book.missing(prefix):
-        return [missing, *[NONE] * (count - 1)]
-    names = naming.flat(book.cells(prefix))
-    best = naming.best_pilot(book.results, names)
-    means = {n: f"{100 * naming.outcomes(book.results, ((n,),)).mean():.1f}" for n in names}
-    return [f"**{means[n]}**" if n == best else means[n] for n in names]
-
-
-def _labels(book: Book, methods: Iterable[str]) -> dict[str, str]:
-    return {method: naming.label(method, book.rank) for method in methods}
+def _labels(methods: Sequence[str]) -> dict[str, str]:
+    return {method: naming.label(method, RANK) for method in methods}
 
 
 def _trainable(book: Book) -> Callable[[str], str]:
     def text(prefix: str) -> str:
-        parts = [book.mean(prefix, f"{k}_parameters") for k in ("trainable", "total")]
-        ours = "" if None in parts else f"{100 * parts[0] / parts[1]:.1f}"  # pyright: ignore
-        return _with(ours, published.cell(prefix, book.rank).get("trainable"))
+        own, total = (book.mean(prefix, f"{k}_parameters") or 1 for k in ("trainable", "total"))
+        return _with(f"{100 * own / total:.1f}", published.cell(prefix, RANK).get("trainable"))
 
     return text
 
@@ -243,7 +254,7 @@ def _trainable(book: Book) -> Callable[[str], str]:
 def _rank(book: Book) -> Callable[[str], str]:
     def text(prefix: str) -> str:
         mean = book.mean(prefix, "active_rank", "mean")
-        paper = published.cell(prefix, book.rank).get("active_rank")
+        paper = published.cell(prefix, RANK).get("active_rank")
         return _with("" if mean is None else f"{mean:.1f}", paper, 0)
 
     return text
@@ -251,12 +262,8 @@ def _rank(book: Book) -> Callable[[str], str]:
 
 def _tower(book: Book, index: int) -> Callable[[str], str]:
     def text(prefix: str) -> str:
-        mean = book.mean(prefix, "active_rank", TOWERS[index])
-        paper = published.cell(prefix, book.rank).get("towers")
-        return _with("" if mean is None else f"{mean:.1f}", paper and paper[index], 0)
+        paper = published.cell(prefix, RANK).get("towers")
+        ours = f"{book.mean(prefix, 'active_rank', TOWERS[index]):.1f}"
+        return _with(ours, paper and paper[index], 0)
 
     return text
-
-
-def _arrow(pair: Sequence[float]) -> str:
-    return " → ".join(f"{value:#.3g}" for value in pair)

@@ -12,6 +12,7 @@ from studies.paper import naming
 from studies.paper.book import BACKBONES, TASKS, Book
 from studies.paper.figure_style import FULL, LORA_SP, legend, panels, rows
 from studies.paper.naming import TOWERS
+from studies.paper.tables import RANK
 
 _ROW = 0.26
 """Height of a row [inches]."""
@@ -19,8 +20,8 @@ _ROW = 0.26
 
 def shared_directions(book: Book) -> Figure:
     """Plot how far each pair of tasks uses the same directions, by tower, and what chance gives."""
-    overlaps = {b: book.measures(f"{b}/multi/lora_sp", "direction_overlap") for b in book.backbones}
-    figure, grid = panels(book, 1, 1.0 + 2 * _ROW * max(len(o[0]) for o in overlaps.values()))
+    overlaps = {b: book.measures(f"{b}/multi/lora_sp", "direction_overlap") for b in BACKBONES}
+    figure, grid = panels(1, 1.0 + 2 * _ROW * max(len(o[0]) for o in overlaps.values()))
     for axes, (backbone, cells) in zip(grid[0], overlaps.items(), strict=True):
         pairs = _in_order(cells[0])
         for offset, tower in zip((-0.22, 0, 0.22), TOWERS, strict=True):
@@ -40,14 +41,14 @@ def shared_directions(book: Book) -> Figure:
 
 def gradients(book: Book) -> Figure:
     """Plot by method whether gradients of different tasks point the same way."""
-    methods = {b: [p.split("/")[2] for p in gradient_methods(book, b)] for b in book.backbones}
-    figure, grid = panels(book, 1, 1.0 + 1.2 * _ROW * max(map(len, methods.values())), sharex=True)
-    for axes, backbone in zip(grid[0], book.backbones, strict=True):
+    methods = {b: book.table_1_methods(b)[:-1] for b in BACKBONES}  # lora_cut is not trained
+    figure, grid = panels(1, 1.0 + 1.2 * _ROW * max(map(len, methods.values())), sharex=True)
+    for axes, backbone in zip(grid[0], BACKBONES, strict=True):
         for row, method in enumerate(methods[backbone]):
             two, one = book.cosines(f"{backbone}/multi/{method}")
             color = LORA_SP if method == "lora_sp" else mpl.rcParams["text.color"]
             _dots(axes, row, two, one, color)
-        rows(axes, [naming.label(method, book.rank) for method in methods[backbone]])
+        rows(axes, [naming.label(method, RANK) for method in methods[backbone]])
         axes.axvline(0, color="gray", lw=1)
         axes.set_title(BACKBONES[backbone], loc="left")
         axes.set_xlabel("cosine of two gradients")
@@ -57,12 +58,6 @@ def gradients(book: Book) -> Figure:
     axes.plot([], [], "o", mfc="none", color=FULL, label="two batches of one task")
     legend(figure, axes, columns=3)
     return figure
-
-
-def gradient_methods(book: Book, backbone: str) -> list[str]:
-    """Return the methods of Table I that were trained, such as "pi0/multi/lora_sp"."""
-    methods = book.table_1_methods(backbone)
-    return [f"{backbone}/multi/{method}" for method in methods if method != "lora_cut"]
 
 
 def _dots(
@@ -80,8 +75,12 @@ def _dots(
 def _in_order(pairs: Iterable[str]) -> list[str]:
     """Return pairs of tasks, such as "pour|press", in the paper's order of tasks."""
     order = [*TASKS]
-    return sorted(pairs, key=lambda pair: sorted(order.index(task) for task in pair.split("|")))
+    return sorted(pairs, key=lambda pair: sorted(map(order.index, pair.split("|"))))
 
 
 def _title(pair: str) -> str:
     return " + ".join(TASKS[task] for task in pair.split("|"))
+
+
+DRAWINGS = {"directions": shared_directions, "gradients": gradients}
+"""Figures by the name of their files."""

@@ -35,22 +35,26 @@ def parser(program: str) -> argparse.ArgumentParser:
 
 
 def _run(options: argparse.Namespace) -> None:
-    from lorasp_jax.base import compilation_cache as cache
-    from lorasp_jax.extras.deployment import measurement, saving
+    from lorasp_jax.extras.deployment import measurement, saving, variants
 
     if bool(options.save) != bool(options.out):
         raise ValueError("--save and --out must be given together")
     if options.save and (options.variants or options.episodes):
         raise ValueError("--variants and --episodes are for measuring: leave out --save")
-    cache.enable()
+    saving.check_run(options.run)
     if options.save:
         saving.save(options.run, options.save, options.out)
         print(f"written: {options.out}")
         return
-    say = lambda name: print(f"measuring {name}", file=sys.stderr, flush=True)  # noqa: E731
-    found = measurement.measure(options.run, options.variants, options.episodes, progress=say)
-    print(measurement.table(found), end="")
-    print(f"written: {options.run / measurement.FILE}", file=sys.stderr)
+    from lorasp_jax.extras.study import Study
+    from lorasp_jax.extras.study.workers import run_here
+
+    chosen = dict.fromkeys((variants.WHOLE, *map(variants.check, options.variants)))
+    cells = measurement.cells(options.run, options.episodes)
+    study = Study("deployment", cells, measure=measurement.measure)
+    names = chosen if options.variants else variants.VARIANTS
+    results = run_here(study, options.run / study.name, names, Console(stderr=True))
+    print(measurement.table(results), end="")
 
 
 if __name__ == "__main__":

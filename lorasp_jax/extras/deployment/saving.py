@@ -2,9 +2,20 @@
 
 from pathlib import Path
 
+from lorasp_jax.base import compilation_cache as cache
 from lorasp_jax.base.files import check_local
-from lorasp_jax.extras.deployment import measurement, variants
+from lorasp_jax.extras.deployment import variants
+from lorasp_jax.extras.study.finished_run import recorded_config
+from lorasp_jax.extras.study.held_out import held_out_demonstrations
 from lorasp_jax.training import export
+
+
+def check_run(run: Path) -> None:
+    """Raise ValueError unless a run is finished, can be simulated, and was trained with LoRA-SP."""
+    method = recorded_config(run).peft
+    if not variants.is_bank(method):
+        name = type(method).__name__
+        raise ValueError(f"{run} was trained with {name}: only LoRA-SP runs have variants")
 
 
 def save(run: Path, name: str, out: Path) -> None:
@@ -14,13 +25,15 @@ def save(run: Path, name: str, out: Path) -> None:
     int8 or nf4 is quantized whenever the folder is loaded.
 
     Raises:
-        ValueError: the variant is unknown, the folder exists, or see `measurement.load`.
+        ValueError: the variant is unknown, or the folder exists.
     """
-    variant = variants.find(name)
+    form, base = variants.check(name).split("-")
     check_local(out)
     if out.exists():
         raise ValueError(f"{out} exists already: choose another --out")
-    policy, _, settings = measurement.load(run)
-    calibration = measurement.calibration_episodes(settings)
-    deployed = variants.in_form(policy, variant.form, calibration)
-    export.write_variant(out, deployed, run, quantized=variants.BASES[variant.base])
+    cache.enable()
+    policy = export.load_policy(run)
+    # Those on which `measurement` calibrates.
+    episodes = held_out_demonstrations(run / "deployment", recorded_config(run))
+    deployed = variants.in_form(policy, form, episodes)
+    export.write_variant(out, deployed, run, quantized=variants.BASES[base])

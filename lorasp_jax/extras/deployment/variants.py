@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +11,8 @@ from flax import nnx
 import lorasp_jax
 from envs.datasets.episodes import Episodes
 from lorasp_jax.adapters import adaptation
-from lorasp_jax.data.batches import Batch
 from lorasp_jax.dense import AdapterParam
-from lorasp_jax.extras.study.held_out import keyed_batches
+from lorasp_jax.extras.study.held_out import Keyed, forward, keyed_batches
 from lorasp_jax.kernels.quantized_weights import Kind, QuantizedKernel
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.peft.lora_sp.bank import BankMethod
@@ -23,7 +22,7 @@ from lorasp_jax.training.base import quantized
 BATCH_SIZE, BATCHES = 64, 8
 """Windows per batch, and batches per task, for calibration and for the loss."""
 
-Batches = Sequence[tuple[jax.Array, Batch]]
+Batches = Sequence[Keyed]
 """Batches with the keys of their losses."""
 
 
@@ -57,28 +56,26 @@ BASES: dict[str, Kind | None] = {"bf16": None, "int8": "int8", "nf4": "nf4"}
 """How the base is stored."""
 
 
-class Variant(NamedTuple):
-    """A form of the adapters on a base."""
-
-    form: str
-    base: str
-
-    def __str__(self) -> str:
-        return f"{self.form}-{self.base}"
+WHOLE = "whole-bf16"
+"""The variant that others are compared with."""
+VARIANTS = (WHOLE, *(f"{f}-{b}" for f in FORMS for b in BASES if f"{f}-{b}" != WHOLE))
 
 
-VARIANTS = {str(v): v for v in (Variant(form, base) for form in FORMS for base in BASES)}
+def transform(name: str, policy: Policy, episodes: Mapping[str, Episodes]) -> Policy:
+    """Return a variant of a LoRA-SP policy, calibrated on episodes by task; all count alike."""
+    form, base = name.split("-")
+    return on_base(in_form(policy, form, episodes), base)
 
 
-def find(name: str) -> Variant:
-    """Return a variant by name.
+def check(name: str) -> str:
+    """Return the name of a variant.
 
     Raises:
         ValueError: unknown variant.
     """
     if name not in VARIANTS:
         raise ValueError(f"unknown variant {name!r}: choose one of {', '.join(VARIANTS)}")
-    return VARIANTS[name]
+    return name
 
 
 def is_bank(method: Any) -> bool:
@@ -114,9 +111,3 @@ def in_bf16(model: Backbone) -> Backbone:
     model = nnx.merge(graphdef, frozen, rest)
     model.config = dataclasses.replace(model.config, param_dtype="bfloat16")
     return model
-
-
-def forward(model: Any, keyed: tuple[jax.Array, Batch]) -> Any:
-    """Return the model's loss on a batch, for calibration."""
-    key, batch = keyed
-    return model.loss(key, batch.observation, batch.actions, action_mask=batch.action_mask)

@@ -1,25 +1,32 @@
 """Evaluate runs under latency: `python -m lorasp_jax.extras.latency --help`."""
 
 import argparse
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 
-from lorasp_jax.base import compilation_cache as cache
-from lorasp_jax.base.bars import bars
 from lorasp_jax.base.errors import parse_arguments, run_command
 from lorasp_jax.base.files import check_local
-from lorasp_jax.extras.latency import figure
-from lorasp_jax.extras.latency.curve import FILE, MAX_DELAY, Options, extrapolated, measure
-from lorasp_jax.extras.latency.execution import EXECUTIONS
+from lorasp_jax.config import Config
+from lorasp_jax.extras.latency import curve, figure
+from lorasp_jax.extras.latency.execution import EXECUTIONS, Execution, check_delay
+from lorasp_jax.extras.study import Study
+from lorasp_jax.extras.study.finished_run import recorded_config
+from lorasp_jax.extras.study.study import Results
+from lorasp_jax.extras.study.workers import run_here
+from lorasp_jax.training.export import describe
+
+MAX_DELAY = 8
+"""Largest delay measured by default [control steps], if chunks are long enough."""
 
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.latency") -> int:
     """Measure runs and draw the figure; return the exit code, one of `lorasp_jax.base.errors`."""
     options = parse_arguments(parser(program), arguments)
-    interrupted = f"interrupted; {FILE} has what was measured, and the same command continues"
+    interrupted = "interrupted; the same command continues"
     return run_command(lambda: _measure(options), Console(stderr=True), interrupted)
 
 
@@ -27,27 +34,59 @@ def _measure(options: argparse.Namespace) -> None:
     """Measure every run; write the figure of all."""
     path = options.figure or options.runs[0] / "latency.svg"
     check_local(path)
-    cache.enable()
-    names = ("executions", "delays", "tasks", "episodes", "execute_steps", "guidance")
-    chosen = Options(**{name: getattr(options, name) for name in names})
-    curves = []
-    for run in options.runs:
-        with bars(Console(stderr=True), "points") as progress:
-            curves.append((run.name, measure(run, chosen, progress)))
-        if beyond := extrapolated(run, curves[-1][1]):
-            text = ", ".join(map(str, beyond))
-            print(f"{run}: trained execution at d = {text} is beyond its --optim.rtc-max-delay")
+    studies = [_study(run, options) for run in options.runs]
+    curves = list[tuple[str, Results]]()
+    for run, study in zip(options.runs, studies, strict=True):
+        names = [cell.name for cell in study.cells]
+        results = run_here(study, run / study.name, names, Console(stderr=True))
+        curves.append((run.name, results))
+        print(f"written: {run / study.name}")
     figure.write(path, curves)
-    for written in (*(run / FILE for run in options.runs), path):
-        print(f"written: {written}")
+    print(f"written: {path}")
+
+
+def _study(run: Path, options: argparse.Namespace) -> Study:
+    """Return the study of a run's points.
+
+    Raises:
+        ValueError: the run is unfinished or cannot be simulated, or the options do not fit it.
+    """
+    config = recorded_config(run)
+    if unknown := [task for task in options.tasks if task not in config.tasks]:
+        raise ValueError(f"the tasks of {run} are {', '.join(config.tasks)}, got {unknown[0]!r}")
+    if options.episodes < 0 or not 0 < options.guidance < math.inf:
+        raise ValueError("--episodes must be at least 0, and --guidance above 0")
+    chunk = describe(run)["policy"]["config"]["chunk"]
+    steps = options.execute_steps or math.ceil(chunk / 2)
+    if not 1 <= steps <= chunk:
+        raise ValueError(f"execute_steps must be from 1 to the chunk length ({chunk}), got {steps}")
+    delays = options.delays or range(min(MAX_DELAY, steps, chunk - steps) + 1)
+    for delay in delays:
+        check_delay(delay, steps, chunk)
+    names = _executions(run, config, options.executions)
+    if "trained" in names and max(delays) > config.optim.rtc_max_delay:
+        limit = config.optim.rtc_max_delay
+        print(f"{run}: trained execution beyond d = {limit} is beyond its --optim.rtc-max-delay")
+    executions = [Execution(name, steps, options.guidance) for name in names]
+    tasks = options.tasks or config.tasks
+    return Study("latency", curve.cells(run, tasks, executions, delays, options.episodes))
+
+
+def _executions(run: Path, config: Config, chosen: Sequence[str]) -> Sequence[str]:
+    """Return the executions to measure."""
+    trained = config.optim.rtc_max_delay > 0
+    if "trained" in chosen and not trained:
+        raise ValueError(f"{run} was not trained for execution trained: --optim.rtc-max-delay is 0")
+    return chosen or [name for name in EXECUTIONS if trained or name != "trained"]
 
 
 def parser(program: str) -> argparse.ArgumentParser:
     """Define the options."""
     parser = argparse.ArgumentParser(
         prog=program,
-        description=f"Measure success and smoothness of runs whose chunks arrive late. Writes "
-        f"{FILE} into each run's folder, and a figure. Continues where an earlier command stopped.",
+        description="Measure success and smoothness of runs whose chunks arrive late. Writes "
+        "latency/results.json into each run's folder, and a figure. Continues where an earlier "
+        "command stopped.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog="executions:\n" + "\n".join(f"  {k:12} {v}" for k, v in EXECUTIONS.items()),
     )
@@ -63,7 +102,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     text = "control steps between observations (default: half of the chunk)"
     add("--execute-steps", type=int, default=0, metavar="N", help=text)
     text = "limit of the guidance weight (default: %(default)s)"
-    add("--guidance", type=float, default=Options.guidance, metavar="BETA", help=text)
+    add("--guidance", type=float, default=Execution.guidance, metavar="BETA", help=text)
     text = "file to draw (default: latency.svg in the first run's folder)"
     add("--figure", type=Path, metavar="FILE", help=text)
     return parser

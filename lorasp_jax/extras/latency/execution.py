@@ -35,19 +35,17 @@ EXECUTIONS = {
 
 
 @dataclass(frozen=True)
-class Settings:
+class Execution:
     """How a robot executes chunks.
 
     Attributes:
-        execution: one of `EXECUTIONS`.
+        name: one of `EXECUTIONS`.
         execute_steps: s, control steps between observations.
-        denoise_steps: Euler steps of the flow.
         guidance: β of guided execution, see `real_time_chunking.sample`.
     """
 
-    execution: str
+    name: str
     execute_steps: int = 5
-    denoise_steps: int = 10
     guidance: float = 10.0
 
 
@@ -82,10 +80,7 @@ def check_delay(delay: int, execute_steps: int, chunk: int) -> None:
 
 
 def delayed_rollout(
-    env: Env,
-    settings: Settings,
-    *,
-    ranges: Randomization | None = None,
+    env: Env, execution: Execution, *, denoise_steps: int = 10, ranges: Randomization | None = None
 ) -> Callable[[Policy, jax.Array, int], Trace]:
     """Create a function (policy, key, d) that runs `env.num_envs` episodes with a delay of d steps.
 
@@ -93,47 +88,42 @@ def delayed_rollout(
     `programs.split_rollout`, bit for bit.
 
     Raises:
-        ValueError: see `check_delay`; raised by the function that is returned.
+        ValueError: see `check_delay`, by the function that is returned.
     """
-    steps, denoise = settings.execute_steps, settings.denoise_steps
-    waits = settings.execution == "synchronous"
+    steps, waits = execution.execute_steps, execution.name == "synchronous"
 
     def rollout(policy: Policy, key: jax.Array, delay: int) -> Trace:
         check_delay(delay, steps, policy.model.config.chunk)
         worlds = Worlds(env, policy, key, ranges)
-        chunk, _ = worlds.predict(0, denoise_steps=denoise)
-        commands = [_execute(worlds, chunk, steps)]
+        chunk, _ = worlds.predict(0, denoise_steps=denoise_steps)
+        worlds.act(chunk, steps)
+        commands = [chunk[:, :steps]]
         period = steps + delay if waits else steps
         for call in range(1, 1 + math.ceil((env.max_steps - steps) / period)):
             previous = chunk[:, steps:]
-            condition = _condition(settings, previous, delay)
-            chunk, _ = worlds.predict(call, denoise_steps=denoise, **condition)
+            condition = _condition(execution, previous, delay)
+            chunk, _ = worlds.predict(call, denoise_steps=denoise_steps, **condition)
             if waits:
                 last = commands[-1][:, -1:]
                 worlds.hold(last[:, 0], delay)
                 commands += [last] * delay
             else:
                 chunk = _switch(previous, chunk, np.int32(delay))
-            commands.append(_execute(worlds, chunk, steps))
+            worlds.act(chunk, steps)
+            commands.append(chunk[:, :steps])
         info, commands = jax.device_get((worlds.state.info, commands))
         return Trace(info["success"], info["steps"], np.concatenate(commands, axis=1))
 
     return rollout
 
 
-def _execute(worlds: Worlds, chunk: jax.Array, steps: int) -> jax.Array:
-    """Execute the first s actions of `chunk` `[W, C, J+1]` and return them."""
-    worlds.act(chunk, steps)
-    return chunk[:, :steps]
-
-
-def _condition(settings: Settings, previous: jax.Array, delay: int) -> dict[str, Any]:
+def _condition(execution: Execution, previous: jax.Array, delay: int) -> dict[str, Any]:
     """Return the options of `Policy.sample` with which a chunk continues the previous one."""
-    if settings.execution not in ("trained", "guided"):
+    if execution.name not in ("trained", "guided"):
         return {}
     condition: dict[str, Any] = {"previous": previous, "prefix_length": np.int32(delay)}
-    guided = settings.execution == "guided"
-    return condition | ({"guidance": np.float32(settings.guidance)} if guided else {})
+    guided = execution.name == "guided"
+    return condition | ({"guidance": np.float32(execution.guidance)} if guided else {})
 
 
 @jax.jit

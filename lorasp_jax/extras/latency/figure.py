@@ -1,6 +1,6 @@
 """Figure of success and smoothness against delay."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.evaluation.figure_style import STYLE
 from lorasp_jax.evaluation.intervals import wilson_interval
+from lorasp_jax.extras.study.study import Results
 
 COLORS = {
     "synchronous": "#9498a0",
@@ -26,21 +27,22 @@ ROWS = {
 
 
 @mpl.rc_context(STYLE)
-def write(path: Path, runs: Sequence[tuple[str, dict[str, Any]]]) -> None:
+def write(path: Path, runs: Sequence[tuple[str, Results]]) -> None:
     """Draw success and smoothness, averaged over tasks, and write them as SVG.
 
     Args:
         path: file to write.
-        runs: name and content of latency.json of each run, which gets one column.
+        runs: name of each run, which gets one column, and results of its cells, see `curve.cells`.
     """
     figure = Figure(figsize=(1.2 + 3.4 * len(runs), 6.4), layout="constrained")
     axes = figure.subplots(len(ROWS), len(runs), sharex="col", sharey="row", squeeze=False)
     entries: dict[str, Any] = {}
     for column, (name, found) in enumerate(runs):
         axes[0, column].set_title(name, loc="left")
-        axes[-1, column].set_xlabel(f"delay [control steps of {1e3 * found['control_dt']:g} ms]")
+        period = next(iter(found.values()))["config"]["control_dt"]
+        axes[-1, column].set_xlabel(f"delay [control steps of {1e3 * period:g} ms]")
         for execution, color in COLORS.items():
-            points = average(found["curves"], execution)
+            points = average(found, execution)
             for row, field in enumerate(ROWS):
                 _line(axes[row, column], points, field, execution, color)
         lines, labels = axes[0, column].get_legend_handles_labels()
@@ -55,24 +57,36 @@ def write(path: Path, runs: Sequence[tuple[str, dict[str, Any]]]) -> None:
         figure.savefig(unfinished, format="svg", metadata={"Date": None})
 
 
-def average(
-    curves: Mapping[str, Mapping[str, list[dict[str, Any]]]], execution: str
-) -> list[dict[str, Any]]:
+def average(results: Results, execution: str) -> list[dict[str, Any]]:
     """Average an execution over tasks, at the delays at which all of them were measured.
 
     Returns:
         Points with `delay`, `success` and its 95 % interval `ci95` in percent, `action_delta` and
         `jerk`.
     """
-    tasks = [{p["delay"]: p for p in task.get(execution, [])} for task in curves.values()]
+    by_delay, tasks = dict[int, list[Any]](), set[str]()
+    for result in results.values():
+        if result["config"]["execution"] == execution:
+            by_delay.setdefault(result["config"]["delay"], []).append(result)
+            tasks |= result["outcomes"].keys()
     averages = []
-    for delay in sorted(set.intersection(*map(set, tasks)) if tasks else ()):
-        points = [task[delay] for task in tasks]
-        outcomes = "".join(point["outcomes"] for point in points)
-        interval = wilson_interval(outcomes.count("1"), len(outcomes))
-        means = {name: float(np.mean([p[name] for p in points])) for name in ROWS}
-        means["success"] *= 100
-        averages.append({"delay": delay, "ci95": [100 * bound for bound in interval], **means})
+    for delay, points in sorted(by_delay.items()):
+        if len(points) < len(tasks):
+            continue
+        outcomes = "".join(text for point in points for text in point["outcomes"].values())
+        successes, episodes = outcomes.count("1"), len(outcomes)
+        averages.append(
+            {
+                "delay": delay,
+                "success": 100 * successes / episodes,
+                "ci95": [100 * bound for bound in wilson_interval(successes, episodes)],
+                **{
+                    n: float(np.mean([p["motion"][n] for p in points]))
+                    for n in ROWS
+                    if n != "success"
+                },
+            }
+        )
     return averages
 
 

@@ -4,24 +4,18 @@ import argparse
 import functools
 import os
 import sys
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
+from rich.table import Table
 
 from lorasp_jax.base.arguments import positive
 from lorasp_jax.base.errors import REFUSED, parse_arguments, run_command
-from lorasp_jax.extras.study import listing, results
-from lorasp_jax.extras.study.status import (
-    BROKEN,
-    Board,
-    State,
-    Status,
-    clear_failure,
-    results_of,
-    tidy,
-)
-from lorasp_jax.extras.study.study import Study, select
+from lorasp_jax.extras.study import page, progress, results
+from lorasp_jax.extras.study.progress import BROKEN, CellState, Status
+from lorasp_jax.extras.study.study import Derived, Study, select
 
 SCALES = ("smoke", "accelerator")
 _SHARED_MEMORY = 0.9
@@ -52,14 +46,14 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--jobs", type=positive, default=1, metavar="N", help="processes that share the device")
     add("--shard", type=_shard, default=(1, 1), metavar="I/N", help="run the I-th of N parts")
     add("--dry-run", action="store_true", help="list the cells, then exit")
-    add("--no-run", action="store_true", help="run no cell, but write results and page")
+    add("--no-run", action="store_true", help="run no cell, but write the results")
     add(
         "--out",
         type=Path,
         default=Path("runs"),
         help="parent of the study's folder (default: runs)",
     )
-    text = "results to start from; all results are written there, and the page beside it"
+    text = "results to start from, and to add to; its README.md gets the new tables and figures"
     add("--results", type=Path, metavar="FILE", help=text)
     return parser
 
@@ -68,55 +62,78 @@ def _execute(options: argparse.Namespace, console: Console) -> int:
     """List or run the selected cells, then write the results of all finished ones."""
     study = results.load_study(options.config, options.scale, options.results)
     folder, names = options.out / study.name, select(study, options.only, options.shard)
-    board = Board(study, folder)
     if options.dry_run:
-        statuses = board.read()
-        console.print(listing.dry_run_table(study, names, statuses))
-        _print(console, listing.totals(study, names, statuses))
+        statuses = progress.read(study, folder)
+        console.print(_table(study, names, statuses))
+        _print(console, _totals(study, names, statuses))
         return 0
     if not options.no_run:
-        _run(options, board, folder, names, console)
-    statuses = board.read()
+        _run(options, study, folder, names, console)
+    statuses = progress.read(study, folder)
     # Only after a run is it news that a cell still waits.
-    _print(console, *listing.problems(names, statuses, waiting=not options.no_run))
-    path = _write(study, options.results or folder / results.RESULTS_FILE, statuses)
-    _print(console, listing.totals(study, names, statuses), f"see {path}")
+    reported = BROKEN if options.no_run else {*BROKEN, CellState.WAITING}
+    for name in names:
+        if statuses[name].state in reported:
+            _print(console, f"{name}: {statuses[name].state} {statuses[name].reason}")
+    _write(study, options.results or folder / results.RESULTS_FILE, statuses, console)
+    _print(console, _totals(study, names, statuses))
     return REFUSED if any(statuses[name].state in BROKEN for name in names) else 0
 
 
-def _write(study: Study, path: Path, statuses: dict[str, Status]) -> Path:
-    """Write the results of all finished cells and, if the study has claims, the page on them.
+def _write(study: Study, path: Path, statuses: dict[str, Status], console: Console) -> None:
+    """Write the results of all finished cells; if all are, also the README.md beside the file.
 
     Raises:
         ValueError: results that the study started from would be lost.
     """
-    found = results_of(statuses, statuses)
+    found = progress.results_of(statuses, statuses)
     for name in sorted(study.finished.keys() - found.keys()):
         why = f"is {statuses[name].state}" if name in statuses else "is not in the study"
         raise ValueError(f"{path} is left as it is: it has results of {name}, which {why}")
     path.parent.mkdir(parents=True, exist_ok=True)
     results.write(path, study.name, found)
-    if study.page is not None:
-        study.page(study, results.load(path), path.parent)
-    return path
+    _print(console, f"written: {path}")
+    readme = path.with_name("README.md")
+    if study.page and readme.exists() and len(found) == len(study.cells):
+        page.fill(readme, study.page(study, results.load(path), path.parent))
+        _print(console, f"written: {readme}")
 
 
-def _print(console: Console, *lines: str) -> None:
-    for line in lines:
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+def _table(study: Study, names: Collection[str], statuses: Mapping[str, Status]) -> Table:
+    """Tabulate method, steps and state of the named cells; "?" depends on missing results."""
+    table = Table("cell", "method", "steps", "state", title=f"study {study.name}")
+    for cell in (cell for cell in study.cells if cell.name in names):
+        config, method, steps = statuses[cell.name].config, "?", "?"
+        if isinstance(cell, Derived):
+            method, steps = f"from {cell.source}", "0"
+        elif config:
+            method, steps = type(config.peft).__name__, f"{config.optim.steps:,}"
+        table.add_row(cell.name, method, steps, str(statuses[cell.name].state))
+    return table
+
+
+def _totals(study: Study, names: Collection[str], statuses: Mapping[str, Status]) -> str:
+    """Count the named cells by state on one line."""
+    counts = Counter(statuses[name].state for name in names)
+    parts = [f"{counts[state]} {state}" for state in CellState if counts[state]]
+    return f"{study.name}: {', '.join(parts)}"
+
+
+def _print(console: Console, line: str) -> None:
+    console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def _run(
-    options: argparse.Namespace, board: Board, folder: Path, names: list[str], console: Console
+    options: argparse.Namespace, study: Study, folder: Path, names: list[str], console: Console
 ) -> None:
     """Run cells in worker processes, failed ones once more."""
     for name in names:
-        clear_failure(folder / name)
-    statuses = board.read()
+        progress.clear_failure(folder / name)
+    statuses = progress.read(study, folder)
     for name in names:
-        if statuses[name].state is State.FINISHED:
-            tidy(folder / name)  # the last process may have been killed before it did
-    if all(statuses[name].state is not State.RUNNABLE for name in names):
+        if statuses[name].state is CellState.FINISHED:
+            progress.tidy(folder / name)  # the last process may have been killed before it did
+    if all(statuses[name].state is not CellState.RUNNABLE for name in names):
         return
     from lorasp_jax.extras.study.workers import Workers
 

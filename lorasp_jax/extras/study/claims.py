@@ -14,7 +14,7 @@ from typing import Literal
 from lorasp_jax.extras.study.statistics import Estimate
 from lorasp_jax.extras.study.study import Results
 
-Verdict = Literal["holds", "does not hold", "cannot be told", "not yet run"]
+Verdict = Literal["holds", "does not hold", "cannot be told"]
 MARGIN = 0.005
 """By what share of a number's maximum a bound is moved to see whether a verdict is weak."""
 
@@ -49,19 +49,10 @@ class Criterion:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the results say about a test.
-
-    Attributes:
-        verdict: see the module; "not yet run" while cells are missing.
-        estimate: the number; None while cells are missing.
-        missing: number of cells that have not run.
-        cells: number of cells that the test reads.
-    """
+    """What the results say about a test: a verdict, see the module, and the number."""
 
     verdict: Verdict
-    estimate: Estimate | None
-    missing: int
-    cells: int
+    estimate: Estimate
 
 
 @dataclass(frozen=True)
@@ -96,11 +87,8 @@ def judge_all(claims: Iterable[Claim], results: Results) -> Judged:
 
 def judge(test: Criterion, results: Results) -> Outcome:
     """Compare a test's interval with its bound."""
-    missing = sum(name not in results for name in test.cells)
-    if missing:
-        return Outcome("not yet run", None, missing, len(test.cells))
     estimate = test.estimate(results)
-    return Outcome(_compare(test, estimate), estimate, 0, len(test.cells))
+    return Outcome(_compare(test, estimate), estimate)
 
 
 def _compare(test: Criterion, estimate: Estimate, easier: float = 0.0) -> Verdict:
@@ -113,12 +101,9 @@ def _compare(test: Criterion, estimate: Estimate, easier: float = 0.0) -> Verdic
 
 
 def verdict(outcomes: Iterable[Outcome]) -> Verdict:
-    """Return the verdict on a claim from the outcomes of its tests, of which there is at least one.
-
-    One test that does not hold decides, even if others have not been run.
-    """
+    """Return the verdict on a claim from the outcomes of its tests."""
     found = [outcome.verdict for outcome in outcomes]
-    order: tuple[Verdict, ...] = ("does not hold", "not yet run", "cannot be told", "holds")
+    order: tuple[Verdict, ...] = ("does not hold", "cannot be told", "holds")
     return next(name for name in order if name in found)
 
 
@@ -126,10 +111,7 @@ def is_weak(tests: Iterable[Criterion], outcomes: Sequence[Outcome]) -> bool:
     """Return whether bounds that are easier or harder to meet by `MARGIN` change a verdict."""
     pairs = [*zip(tests, outcomes, strict=True)]
     moved = [
-        [
-            dataclasses.replace(o, verdict=_compare(t, o.estimate, easier)) if o.estimate else o
-            for t, o in pairs
-        ]
+        [dataclasses.replace(o, verdict=_compare(t, o.estimate, easier)) for t, o in pairs]
         for easier in (MARGIN, -MARGIN)
     ]
     return any(verdict(found) != verdict(outcomes) for found in moved)

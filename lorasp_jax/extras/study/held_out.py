@@ -1,16 +1,23 @@
-"""Held-out observations: demonstrations that no cell trains on."""
+"""Demonstrations that cells share: those to train on, and held-out ones that no cell trains on."""
 
+import contextlib
 import dataclasses
 import functools
+import hashlib
+import json
 from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 
 from envs.datasets.episodes import Episodes
+from lorasp_jax.base.locks import locked
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Batch, encode, flatten, gather
 from lorasp_jax.policies.policy import Policy
+from lorasp_jax.training.demonstrations import Progress, demonstrations, map_threads
 
 EPISODES = 32
 """Held-out episodes per task."""
@@ -19,8 +26,27 @@ SEED = 2**32 - 1
 
 Sample = Callable[[jax.Array], Batch]
 """Returns the batch of a random key."""
+Keyed = tuple[jax.Array, Batch]
+"""A batch with the key of its loss."""
 
 _encode = functools.partial(jax.jit, static_argnames="state_noise")(encode)
+
+
+def shared_demonstrations(
+    study_folder: Path, config: Config, _folder: Path, progress: Progress
+) -> dict[str, Episodes]:
+    """Load the demonstrations that cells with the same robot, scene and data settings share.
+
+    They do not depend on the seed, and a task has the same ones whatever tasks it is trained with.
+    The first cell that needs them collects them.
+    """
+    shared = dataclasses.replace(config, seed=0)
+    return _shared(study_folder / "demonstrations", shared, progress)
+
+
+def held_out_demonstrations(study_folder: Path, config: Config) -> dict[str, Episodes]:
+    """Load the held-out demonstrations (see `settings`), shared in the same way."""
+    return _shared(study_folder / "held_out", settings(config))
 
 
 def settings(config: Config) -> Config:
@@ -58,7 +84,7 @@ def sampler(policy: Policy, episodes: Episodes, batch_size: int) -> Sample:
 
 def keyed_batches(
     policy: Policy, episodes: Mapping[str, Episodes], batch_size: int, batches: int
-) -> dict[str, list[tuple[jax.Array, Batch]]]:
+) -> dict[str, list[Keyed]]:
     """Return a fixed number of batches by task, each with a key for the noise of its loss.
 
     All tasks have the same keys.
@@ -69,3 +95,37 @@ def keyed_batches(
         sample = sampler(policy, group, batch_size)
         found[task] = [(loss_key, sample(batch_key)) for batch_key, loss_key in keys]
     return found
+
+
+def forward(model: Any, keyed: Keyed) -> Any:
+    """Return the model's loss per action element and its auxiliary values on a batch."""
+    key, batch = keyed
+    return model.loss(key, batch.observation, batch.actions, action_mask=batch.action_mask)
+
+
+def _shared(
+    root: Path, config: Config, progress: Progress = lambda *_: None
+) -> dict[str, Episodes]:
+    """Load each task's episodes from a folder named after the settings, or collect them there."""
+    settings = {
+        "robot": config.robot,
+        "data": dataclasses.asdict(config.data),
+        "image_size": config.image_size,
+        "control_dt": config.control_dt,
+    }
+    if ranges := config.scene.changed():
+        settings["scene"] = ranges
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
+    folder = root / f"{Path(config.robot).stem}_{digest}"
+
+    def one(task: str) -> Episodes:
+        single = dataclasses.replace(config, tasks=(task,))
+        with _alone(folder / "cache" / f"{task}.npz"):
+            return demonstrations(single, folder, progress)[task]
+
+    return dict(zip(config.tasks, map_threads(one, config.tasks), strict=True))
+
+
+def _alone(file: Path) -> contextlib.AbstractContextManager[None]:
+    """Let one process at a time make a file; nobody waits once it exists."""
+    return contextlib.nullcontext() if file.exists() else locked(file, waiting=lambda: None)

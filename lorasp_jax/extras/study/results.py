@@ -11,44 +11,28 @@ from lorasp_jax.base.digest import verify_digest, with_digest
 from lorasp_jax.base.files import as_value_error, read_bytes
 from lorasp_jax.base.json_values import check
 from lorasp_jax.base.writing import write_text
-from lorasp_jax.extras.study.status import SCHEMA
-from lorasp_jax.extras.study.study import Study
+from lorasp_jax.extras.study.progress import SCHEMA
+from lorasp_jax.extras.study.study import Results, Study
 from lorasp_jax.extras.study.study import load as load_file
 
 RESULTS_FILE = "results.json"
-MAX_BYTES = 2_000_000
-"""Largest size of the file, which is committed."""
-DIGITS = 5
-"""Significant digits of the floats in the file."""
 
 
-def write(path: Path, study: str, results: Mapping[str, Mapping[str, Any]]) -> None:
+def write(path: Path, study: str, results: Results) -> None:
     """Write the content of cell.json of all finished cells, by cell name, atomically.
 
-    The same results give the same bytes. Floats are rounded to `DIGITS` digits. Settings that most
-    cells share are stored once.
-
-    Raises:
-        ValueError: the file would be larger than `MAX_BYTES`.
+    The same results give the same bytes. Settings that most cells share are stored once.
     """
     settings = {name: dict(_flat(result["config"])) for name, result in results.items()}
     common = _most_common(list(settings.values()))
     cells = {
-        name: rounded(result) | {"config": _changes(settings[name], common)}
+        name: {**result, "config": _changes(settings[name], common)}
         for name, result in sorted(results.items())
     }
     lines = [f"{json.dumps(name)}:{_dump(cell)}" for name, cell in cells.items()]
     digest = with_digest({"study": study, "common": common, "cells": cells})["digest"]
     rest = {"common": common, "digest": digest, "study": study}
-    text = '{"cells":{\n' + ",\n".join(lines) + f"\n}},\n{_dump(rest)[1:]}\n"
-    if len(text.encode()) > MAX_BYTES:
-        largest = max(lines, key=len)
-        raise ValueError(
-            f"the results of {study} take {len(text.encode()) / 1e6:.2f} MB, more than "
-            f"{MAX_BYTES / 1e6:g} MB: the largest cell, {largest.partition(':')[0]}, takes "
-            f"{len(largest) / 1e3:.1f} kB"
-        )
-    write_text(path, text)
+    write_text(path, '{"cells":{\n' + ",\n".join(lines) + f"\n}},\n{_dump(rest)[1:]}\n")
 
 
 def load_study(config: Path, scale: str, path: Path | None) -> Study:
@@ -83,16 +67,6 @@ def load(path: Path, study: str = "") -> dict[str, dict[str, Any]]:
 
 def _dump(value: Any) -> str:
     return json.dumps(value, sort_keys=True, separators=(",", ":"))
-
-
-def rounded(value: Any) -> Any:
-    """Round the floats in JSON values to `DIGITS` digits."""
-    if isinstance(value, float):
-        number = float(f"{value:.{DIGITS}g}")
-        return int(number) if number.is_integer() and abs(number) < 10**DIGITS else number
-    if isinstance(value, Mapping):
-        return {str(key): rounded(item) for key, item in value.items()}
-    return [*map(rounded, value)] if isinstance(value, list | tuple) else value
 
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -19,12 +19,12 @@ import filelock
 
 from lorasp_jax.base.locks import acquire
 from lorasp_jax.config import Config
-from lorasp_jax.extras.study import status
-from lorasp_jax.extras.study.status import Board, State, Status
-from lorasp_jax.extras.study.study import Cell, Derived, Results, Study
+from lorasp_jax.extras.study import progress
+from lorasp_jax.extras.study.progress import CellState, Status
+from lorasp_jax.extras.study.study import Cell, Derived, Measure, Results, Study
 from lorasp_jax.training.run_folder import write_json
 
-POLL = 2.0
+POLL = 5.0
 """Time between two looks at the cells of other workers [s]."""
 
 
@@ -34,15 +34,17 @@ class Job:
 
     Attributes:
         cell: the cell.
-        config: config of its run; that of the source's run for a derived cell.
+        config: config of its run.
         study_folder: the study's folder.
         results: results of the cells that it needs.
+        measure: measures its policy further, if given.
     """
 
     cell: Cell | Derived
     config: Config
     study_folder: Path
     results: Results
+    measure: Measure | None = None
 
     @property
     def folder(self) -> Path:
@@ -68,17 +70,17 @@ def work(
 
     While another worker runs one, this one waits: the cell may enable others, or be left behind.
     """
-    board, last = Board(study, folder), ""
+    last = ""
     while True:
-        statuses = board.read()
+        statuses = progress.read(study, folder)
         runnable = [
             cell.name
             for cell in study.cells
-            if cell.name in names and statuses[cell.name].state is State.RUNNABLE
+            if cell.name in names and statuses[cell.name].state is CellState.RUNNABLE
         ]
         if not runnable:
             return
-        run = functools.partial(_run_claimed, study, board, folder, run_cell, report)
+        run = functools.partial(_run_claimed, study, folder, run_cell, report)
         # The best cell that is free; then look again, because it may have enabled better ones.
         ran = next((name for name in _by_urgency(study, statuses, runnable, last) if run(name)), "")
         if not ran:
@@ -94,7 +96,7 @@ def _by_urgency(
     First come those that most cells wait for, then those of the last cell's group, whose programs
     are compiled, then the first of each other group, since other workers may go on with the rest.
     """
-    waiting = [c for c in study.cells if statuses[c.name].state is State.WAITING]
+    waiting = [c for c in study.cells if statuses[c.name].state is CellState.WAITING]
     dependents = collections.Counter(need for cell in waiting for need in cell.needs)
     group_of = {c.name: group for group, cells in study.groups.items() for c in cells}
     before = collections.Counter[str]()  # runnable cells of a group before this one
@@ -107,39 +109,39 @@ def _by_urgency(
     return sorted(names, key=urgency)
 
 
-def _run_claimed(
-    study: Study, board: Board, folder: Path, run_cell: RunCell, report: Report, name: str
-) -> bool:
+def _run_claimed(study: Study, folder: Path, run_cell: RunCell, report: Report, name: str) -> bool:
     """Run a cell, after those of `_due`; return False if another worker has claimed one of them."""
     for due in _due(study, folder, study[name]):
         with _claimed(folder, due.name) as claimed:
             if not claimed:
                 return False
-            statuses = board.read()
+            statuses = progress.read(study, folder)
             config = statuses[due.name].config
             if due.name == name:
-                is_due = statuses[name].state is State.RUNNABLE
+                is_due = statuses[name].state is CellState.RUNNABLE
             else:
                 is_due = not _is_here(folder, due.name)
             if is_due and config:  # no other worker has run the cell meanwhile
-                results = status.results_of(due.needs, statuses)
-                run_one(Job(due, config, folder, results), run_cell, report)
+                results = progress.results_of(due.needs, statuses)
+                measure = study.measure if due.measured else None
+                run_one(Job(due, config, folder, results, measure), run_cell, report)
     return True
 
 
 def _due(study: Study, folder: Path, cell: Cell | Derived) -> list[Cell | Derived]:
-    """Return a cell, after the sources that must run again because no policy of theirs is here.
+    """Return a cell, after the sources that must run again because their folders are not here.
 
     That is so if the study started from a file of results.
     """
-    if not isinstance(cell, Derived) or _is_here(folder, cell.source):
+    source = cell.source
+    if not source or isinstance(source, Path) or _is_here(folder, source):
         return [cell]
-    return [*_due(study, folder, study[cell.source]), cell]
+    return [*_due(study, folder, study[source]), cell]
 
 
 def _is_here(folder: Path, name: str) -> bool:
     """Say whether a cell has run in this folder, so that its policy is here."""
-    return (folder / name / status.CELL_FILE).exists()
+    return (folder / name / progress.CELL_FILE).exists()
 
 
 def run_one(job: Job, run_cell: RunCell, report: Report) -> None:
@@ -148,13 +150,13 @@ def run_one(job: Job, run_cell: RunCell, report: Report) -> None:
     try:
         job.folder.mkdir(parents=True, exist_ok=True)
         result = run_cell(job)
-        settings = status.describe_config(job.cell, job.config)
-        write_json(job.folder / status.CELL_FILE, {"config": settings, **result})
+        settings = progress.describe_config(job.cell, job.config)
+        write_json(job.folder / progress.CELL_FILE, {"config": settings, **result})
     except Exception as error:
-        status.record_failure(job.folder, status.one_line(error), traceback.format_exc())
+        progress.record_failure(job.folder, progress.one_line(error), traceback.format_exc())
         report("fail", job.cell.name)
     else:
-        status.tidy(job.folder)
+        progress.tidy(job.folder)
         report("end", job.cell.name)
 
 

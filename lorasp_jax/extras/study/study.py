@@ -10,16 +10,19 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from lorasp_jax.config import MAX_NAME_BYTES, Config
 from lorasp_jax.training.experiment_file import call
 
-if TYPE_CHECKING:  # a run of a finished study should load no model code
+if TYPE_CHECKING:  # a finished study should load no model code
     from envs.datasets.episodes import Episodes
     from lorasp_jax.policies.policy import Policy
+    from lorasp_jax.training.run import Run
 
 Results: TypeAlias = Mapping[str, Mapping[str, Any]]
 """The content of cell.json by cell name."""
-RESERVED = (
-    *("demonstrations", "held_out", "locks", "logs"),
-    *("results.json", "study.md", "figures"),
-)
+Evaluate: TypeAlias = Callable[["Run"], dict[str, Any]]
+"""Evaluates the policy of a cell's run; returns what cell.json records: `outcomes`, and more."""
+Measure: TypeAlias = Callable[["Run", Mapping[str, "Episodes"], "Policy | None"], dict[str, Any]]
+"""Maps a cell's run, held-out demonstrations by task, and the source's policy if the cell is
+derived, to further entries of cell.json."""
+RESERVED = ("demonstrations", "held_out", "locks", "logs", "results.json")
 """What a study's folder contains besides the folders of cells."""
 _PART = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._+=-]*")
 
@@ -35,8 +38,9 @@ class Cell:
         after: names of the cells that must be finished first.
         group: cells of one group share compiled programs, so a process that has run one prefers the
             others; by default, each cell is its own group.
-        measured: whether to record the costs of training and the measures on held-out data, which
-            take programs of their own to compile; otherwise only success and active ranks.
+        measured: whether to call the study's `measure`.
+        evaluate: evaluates the trained policy; by default, in simulation.
+        source: name of a cell whose folder the run needs, such as one whose base it starts from.
     """
 
     name: str
@@ -44,36 +48,51 @@ class Cell:
     after: tuple[str, ...] = ()
     group: str = ""
     measured: bool = True
+    evaluate: Evaluate | None = None
+    source: str = ""
 
     @property
     def needs(self) -> tuple[str, ...]:
         """Names of all cells that must be finished first."""
-        return self.after
+        return (self.source, *self.after) if self.source else self.after
 
 
 @dataclass(frozen=True)
 class Derived:
-    """A policy made from that of another cell without training, then evaluated as that cell was.
+    """A policy made from that of another cell without training, then evaluated.
 
     It belongs to the group of `source`.
 
     Attributes:
         name: path of the folder in the study's folder.
-        source: name of the cell whose policy is transformed.
+        source: name of the cell whose policy is transformed, or the folder of a finished run.
         transform: makes the policy to evaluate from the source's policy, the results of `source`
-            and of the cells in `after`, and held-out demonstrations by task.
+            and of the cells in `after`, and held-out demonstrations by task; None: the source's.
         after: names of further cells that must be finished first.
+        config: changes the source's config, such as the number of episodes.
+        settings: what else the results depend on, recorded with the config.
+        evaluate: evaluates the policy; by default, as the source was in simulation.
+        measured: whether to call the study's `measure`.
     """
 
     name: str
-    source: str
-    transform: Callable[["Policy", Results, Mapping[str, "Episodes"]], "Policy"]
+    source: str | Path
+    transform: Callable[["Policy", Results, Mapping[str, "Episodes"]], "Policy"] | None = None
     after: tuple[str, ...] = ()
+    config: Callable[[Config], Config] = lambda config: config
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    evaluate: Evaluate | None = None
+    measured: bool = True
 
     @property
     def needs(self) -> tuple[str, ...]:
         """Names of all cells that must be finished first."""
-        return self.source, *self.after
+        return self.after if isinstance(self.source, Path) else (self.source, *self.after)
+
+    @property
+    def group(self) -> str:
+        """Cells that are made from one run are a group."""
+        return str(self.source)
 
 
 @dataclass(frozen=True)
@@ -86,14 +105,17 @@ class Study:
         claims: the claims to test, decided before the cells run (see `study.claims`).
         finished: results that the study starts from; these cells run only if a derived cell needs
             their policies.
-        page: writes a page with figures into a folder, from the results of the finished cells.
+        measure: measures the policies of cells further.
+        page: returns the generated parts of the README.md in a folder from the results of all cells
+            (see `page.fill`), and writes its figures.
     """
 
     name: str
     cells: tuple[Cell | Derived, ...]
     claims: tuple[Any, ...] = ()
     finished: Results = field(default_factory=dict)
-    page: Callable[["Study", Results, Path], None] | None = None
+    measure: Measure | None = None
+    page: Callable[["Study", Results, Path], dict[str, str]] | None = None
 
     def __post_init__(self) -> None:
         """Validate names and order.
@@ -114,8 +136,6 @@ class Study:
             if parents := [str(path) for path in PurePosixPath(name).parents if str(path) in names]:
                 raise ValueError(f"cell {name!r} lies in the folder of cell {parents[0]!r}")
         _check_order(self.cells)
-        for group in self.groups:
-            _check_path(group)
 
     def __getitem__(self, name: str) -> Cell | Derived:
         """Return a cell by name."""
@@ -127,8 +147,8 @@ class Study:
         group_of: dict[str, str] = {}
         groups: dict[str, tuple[Cell | Derived, ...]] = {}
         for cell in self.cells:
-            own = group_of[cell.source] if isinstance(cell, Derived) else cell.group or cell.name
-            group_of[cell.name] = own
+            own = group_of.get(cell.group, cell.group) if isinstance(cell, Derived) else cell.group
+            group_of[cell.name] = own = own or cell.name
             groups[own] = (*groups.get(own, ()), cell)
         return groups
 

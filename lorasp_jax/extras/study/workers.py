@@ -1,28 +1,27 @@
 """Run a study in several processes on one device, with one progress bar over all cells."""
 
 import contextlib
+import functools
 import multiprocessing
 import os
 import signal
 import sys
 import threading
-import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from multiprocessing import connection, context
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from lorasp_jax.base.errors import INTERRUPTED
-from lorasp_jax.extras.study import forecast, status
+from lorasp_jax.extras.study import progress, results
+from lorasp_jax.extras.study.progress import CellState, Status
 from lorasp_jax.extras.study.runner import Job, RunCell, work
-from lorasp_jax.extras.study.status import Board, State, Status
 from lorasp_jax.extras.study.study import Study
 from lorasp_jax.training.interrupt import sigterm_as_interrupt
 
-_REFRESH = 1.0  # s
 _SPAWN = multiprocessing.get_context("spawn")  # JAX must not be forked
 
 
@@ -59,11 +58,8 @@ class Workers:
         """
         self._arguments = load, folder, frozenset(names), run_cell
         self._study, self._folder, self._names = load(), folder, names
-        self._board, self._console = Board(self._study, folder), console
+        self._console = console
         self._running: dict[context.SpawnProcess, tuple[connection.Connection, list[str]]] = {}
-        self._started: dict[str, float] = {}
-        self._finished: set[str] = set()
-        self._finish_time: float | None = None
 
     def run(self, count: int) -> None:
         """Run `count` workers until they have nothing left to do.
@@ -72,20 +68,20 @@ class Workers:
             ValueError: a worker died outside a cell.
             KeyboardInterrupt: a signal arrived; the workers were told to save and stop.
         """
-        columns = "{task.description}", BarColumn(), MofNCompleteColumn(), "{task.fields[left]}"
-        columns = [TextColumn(c) if isinstance(c, str) else c for c in columns]
+        columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
         for _ in range(count):
             self._start()
-        with self._stopping(), Progress(*columns, console=self._console) as progress:
-            bar = progress.add_task("cells", total=len(self._names), left="")
-            self._show(progress, bar)
+        with self._stopping(), Progress(*columns, console=self._console) as shown:
+            bar = shown.add_task("cells", total=len(self._names))
             while self._running:
+                statuses = progress.read(self._study, self._folder)
+                done = [n for n in self._names if statuses[n].state is CellState.FINISHED]
+                now = [name for _, cells in self._running.values() for name in cells]
+                shown.update(bar, completed=len(done), description=", ".join(now) or "cells")
                 pipes = {pipe: worker for worker, (pipe, _) in self._running.items()}
-                for pipe in connection.wait(list(pipes), timeout=_REFRESH):
+                for pipe in connection.wait(list(pipes)):
                     assert isinstance(pipe, connection.Connection)
                     self._receive(pipes[pipe], pipe)
-                    self._show(progress, bar)
-                progress.update(bar, left=self._time_left())
 
     def _start(self) -> None:
         """Start a worker."""
@@ -107,11 +103,8 @@ class Workers:
             return
         if event == "start":
             cells.append(name)
-            self._started[name] = time.monotonic()
             return
         cells.remove(name)
-        del self._started[name]
-        self._finished.add(name)
         self._print(name)
 
     def _handle_exit(self, code: int | None, cells: list[str]) -> None:
@@ -122,48 +115,14 @@ class Workers:
             raise ValueError(f"a worker stopped {_how(code)} outside of a cell")
         for name in cells:
             reason = f"the worker stopped {_how(code or 0)}"
-            status.record_failure(self._folder / name, reason, "")
-            del self._started[name]
+            progress.record_failure(self._folder / name, reason, "")
             self._print(name)
             self._start()
 
     def _print(self, name: str) -> None:
         """Print on one line how a cell ended."""
-        current = self._board.read()[name]
-        text = f"{name}: {current.state} {current.reason}"
-        if current.result:
-            text = f"{name}: {forecast.summary(current.result)}"
-        style = "red" if current.state in status.BROKEN else None
+        text, style = line(name, progress.read(self._study, self._folder)[name])
         self._console.print(text, style=style, highlight=False, markup=False, soft_wrap=True)
-
-    def _show(self, progress: Progress, bar: TaskID) -> None:
-        """Count the finished cells and estimate when the others will be."""
-        statuses = self._board.read()
-        done = [name for name in self._names if statuses[name].state is State.FINISHED]
-        now = time.monotonic()
-        ages = {name: now - start for name, start in self._started.items()}
-        seconds = self._expected_seconds(statuses, ages)
-        self._finish_time = None if seconds is None else now + seconds
-        progress.update(bar, completed=len(done), description=", ".join(ages) or "cells")
-
-    def _expected_seconds(
-        self, statuses: Mapping[str, Status], ages: Mapping[str, float]
-    ) -> float | None:
-        """Estimate the time until all cells that can run are finished [s]; None if unknown.
-
-        `ages` has the times for which cells have been running.
-        """
-        jobs = max(len(self._running), 1)
-        times = forecast.seconds(self._study, statuses, self._finished, jobs)
-        left = {*forecast.left(self._study, self._names, statuses)} & times.keys()
-        rest = [max(times[name] - ages.get(name, 0.0), 0.0) for name in left]
-        return max(sum(rest) / jobs, *rest) if left else None
-
-    def _time_left(self) -> str:
-        """Return the estimated time until all cells are finished."""
-        if self._finish_time is None:
-            return ""
-        return f"about {forecast.duration(max(self._finish_time - time.monotonic(), 0.0))} left"
 
     @contextlib.contextmanager
     def _stopping(self) -> Iterator[None]:
@@ -185,6 +144,57 @@ class Workers:
                 worker.kill()
 
 
+def line(name: str, status: Status) -> tuple[str, str | None]:
+    """Return how a cell ended, on one line, and the line's style."""
+    if not status.result:
+        style = "red" if status.state in progress.BROKEN else None
+        return f"{name}: {status.state} {status.reason}", style
+    rates = [
+        f"{task} {outcomes.count('1') / len(outcomes):.1%}"
+        for task, outcomes in status.result["outcomes"].items()
+    ]
+    seconds = status.result["seconds"]["total"]
+    return f"{name}: {', '.join(rates)} in {seconds:.0f} s", None
+
+
+def run_here(
+    study: Study,
+    folder: Path,
+    names: Collection[str],
+    console: Console,
+    run_cell: RunCell = _run_cell,
+) -> dict[str, dict[str, Any]]:
+    """Run some cells in this process; write and return the results of all that are finished.
+
+    What the cells print goes to files.
+
+    Raises:
+        ValueError: one of the cells failed, or has run with other settings.
+    """
+    folder.mkdir(exist_ok=True)
+    for name in names:
+        progress.clear_failure(folder / name)
+
+    def report(event: str, name: str) -> None:
+        if event == "start":
+            console.print(f"measuring {name}", highlight=False)
+
+    work(study, folder, names, functools.partial(_logged, folder, run_cell), report)
+    statuses = progress.read(study, folder)
+    found = progress.results_of(statuses, statuses)
+    results.write(folder / results.RESULTS_FILE, study.name, found)
+    for name in names:
+        if statuses[name].state is not CellState.FINISHED:
+            raise ValueError(f"{folder / name}: {statuses[name].state} {statuses[name].reason}")
+    return found
+
+
+def _logged(folder: Path, run_cell: RunCell, job: Job) -> dict[str, Any]:
+    """Run a cell; append what it prints to a file."""
+    with _output_to(folder / "logs" / f"{job.cell.name}.txt"):
+        return run_cell(job)
+
+
 def _how(code: int) -> str:
     """Describe the exit code of a process."""
     return f"with exit code {code}" if code >= 0 else f"by {signal.Signals(-code).name}"
@@ -200,11 +210,7 @@ def _worker(
     """Run cells in a process of its own, which ends when the pipe to the parent closes."""
     os.setpgid(0, 0)  # Ctrl-C reaches only the parent, which then sends SIGTERM
     threading.Thread(target=_exit_with_parent, args=(pipe,), daemon=True).start()
-
-    def logged(job: Job) -> dict:
-        with _output_to(folder / "logs" / f"{job.cell.name}.txt"):
-            return run_cell(job)
-
+    logged = functools.partial(_logged, folder, run_cell)
     try:
         with sigterm_as_interrupt():
             work(load(), folder, names, logged, lambda *event: pipe.send(event))

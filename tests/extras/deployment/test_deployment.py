@@ -1,7 +1,6 @@
 """Test variants, their table and the command on a run with a tiny backbone, without simulation."""
 
 import dataclasses
-import json
 from typing import Any, cast
 
 import jax
@@ -15,17 +14,19 @@ from lorasp_jax.adapters.compress import quantization
 from lorasp_jax.extras.deployment import __main__ as command
 from lorasp_jax.extras.deployment import measurement, variants
 from lorasp_jax.extras.serving import loading
+from lorasp_jax.extras.study import held_out, results, run_cell
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import LoRA
 from lorasp_jax.training import export
-from lorasp_jax.training.run_folder import read_json, to_json, write_json
-from tests import ROOT
+from lorasp_jax.training.run_folder import to_json, write_json
 from tests.cases import mostly_slow
-from tests.extras.study.updates import add_noise
 from tests.models.random_models import random_backbone
 from tests.runs import CONFIG, RESULTS, make_run, random_episodes
+from tests.studies.paper.updates import add_noise
 
 RANK = CONFIG.peft.rank
+HELD_OUT = random_episodes("press", 0)
+EPISODES = {"press": HELD_OUT}
 
 
 def finished_run(folder, base, method=CONFIG.peft):
@@ -59,6 +60,17 @@ def episodes(monkeypatch):
     monkeypatch.setattr(measurement, "BATCHES", 1)
     fake = lambda config, generation: {t: random_episodes(t, generation) for t in config.tasks}  # noqa: E731
     monkeypatch.setattr(measurement, "fresh_demonstrations", fake)
+    monkeypatch.setattr(
+        held_out, "demonstrations", lambda config, *_: {t: HELD_OUT for t in config.tasks}
+    )
+    outcomes = iter(["1101", "1001"] * 6)
+
+    def play(_, run):
+        """Stand in for an evaluation, in episodes of one task."""
+        after = {"success": 0.5, "episodes": 4, "ci95": [0, 1], "outcomes": next(outcomes)}
+        write_json(run.folder / "results.json", RESULTS | {"tasks": {"press": {"after": after}}})
+
+    monkeypatch.setattr(run_cell.Evaluation, "on_end", play)
 
 
 def actions(policy):
@@ -70,10 +82,6 @@ def actions(policy):
     return np.asarray(sample(policy))
 
 
-def outcome(text):
-    return {"success": text.count("1") / len(text), "outcomes": text}
-
-
 def refuse(capsys, *arguments):
     assert command.main([str(argument) for argument in arguments]) == 2
     printed = capsys.readouterr()
@@ -82,47 +90,31 @@ def refuse(capsys, *arguments):
     return " ".join(printed.err.split())
 
 
-def test_table(run, monkeypatch):
+def test_table(run, capsys):
     """Outcomes 1101 and 1001 differ by one episode of four."""
-    monkeypatch.setattr(measurement.cost, "call_milliseconds", lambda *_: 1.5)
-    outcomes, episodes = iter(["1101", "1001"]), []
-
-    def evaluate(policy, config, task, count):
-        episodes.append((task, count))
-        return outcome(next(outcomes))
-
-    found = measurement.measure(run, ["half-nf4"], 4, evaluate=evaluate)
-    assert found == read_json(run / measurement.FILE)
-    assert episodes == [("press", 4)] * 2
-    whole, half = (found["variants"][name] for name in ("whole-bf16", "half-nf4"))
-    assert whole["difference"] == [0, 0, 0]
-    assert half["difference"][0] == -0.25
-    assert half["difference"][1] < -0.25 < half["difference"][2]
-    assert 0 < whole["loss"] != half["loss"] > 0
-    text = measurement.table(found).splitlines()
-    assert len(text) == 4
-    assert text[3].startswith("| half-nf4 | 50.0 % (")
-    assert "| -25.0 (" in text[3]
-    assert text[3].endswith("| 1.5 ms |")
-
-
-@pytest.mark.slow
-def test_table_of_all_variants(run):
-    found = measurement.measure(run, episodes=4, evaluate=lambda *_: outcome("1101"))
-    assert list(found["variants"]) == list(variants.VARIANTS)
-    rows = found["variants"]
-    size = {name: row["bytes"] for name, row in rows.items()}
-    assert size["merged-bf16"] < size["half-bf16"] < size["whole-bf16"]
-    assert size["whole-nf4"] < size["whole-int8"] < size["whole-bf16"]
-    assert all(row["milliseconds"] > 0 and 0 < row["loss"] < 100 for row in rows.values())
-    assert rows["whole-bf16"]["loss"] == pytest.approx(rows["whole-int8"]["loss"], rel=0.1)
-    assert len({row["loss"] for row in rows.values()}) > 4
+    arguments = [str(run), "--variants", "half-nf4", "--episodes", "4"]
+    assert command.main(arguments) == 0
+    lines = capsys.readouterr().out.replace("\u00a0", " ").splitlines()
+    assert len(lines) == 4
+    assert lines[2].startswith("| whole-bf16 | 75.0 [")
+    assert lines[3].startswith("| half-nf4 | 50.0 [")
+    assert "| −25.0 [" in lines[3]
+    found = results.load(run / "deployment/results.json")
+    assert found.keys() == {"whole-bf16", "half-nf4"}
+    for cell in found.values():
+        assert cell["config"]["evaluation"]["episodes"] == 4
+        assert cell["measures"]["milliseconds"] > 0
+        assert 0 < cell["measures"]["loss"] < 100
+    assert found["half-nf4"]["measures"]["bytes"] < found["whole-bf16"]["measures"]["bytes"]
+    assert command.main(arguments) == 0  # nothing is measured again
+    assert capsys.readouterr().out.replace("\u00a0", " ").splitlines() == lines
+    other = refuse(capsys, run, "--variants", "half-nf4", "--episodes", "8")
+    assert "it was run with other evaluation.episodes" in other
 
 
 def test_forms(run):
-    policy, _, settings = measurement.load(run)
-    calibration = measurement.calibration_episodes(settings)
-    forms = {form: variants.in_form(policy, form, calibration) for form in variants.FORMS}
+    policy = export.load_policy(run)
+    forms = {form: variants.in_form(policy, form, EPISODES) for form in variants.FORMS}
     ranks = {
         form: {method.rank for method in adaptation.methods(forms[form].model).values()}
         for form in forms
@@ -134,6 +126,13 @@ def test_forms(run):
     }
     np.testing.assert_allclose(actions(forms["whole"]), actions(policy), atol=1e-2)
     assert not quantization.is_quantized(forms["whole"].model)
+    sizes = {
+        (form, base): measurement.weight_bytes(variants.on_base(forms[form], base))
+        for form in forms
+        for base in variants.BASES
+    }
+    assert sizes["merged", "bf16"] < sizes["half", "bf16"] < sizes["whole", "bf16"]
+    assert sizes["whole", "nf4"] < sizes["whole", "int8"] < sizes["whole", "bf16"]
 
 
 @pytest.mark.parametrize(
@@ -146,10 +145,8 @@ def test_a_saved_variant_is_served(run, tmp_path, capsys, name):
     loaded = loading.load_run(str(out))
     assert loaded.metadata == {"robot": "piper", "control_dt": 0.1}
     served = loaded.policy
-    policy, _, settings = measurement.load(run)
-    form, kind = name.split("-")
-    made = variants.in_form(policy, form, measurement.calibration_episodes(settings))
-    made = variants.on_base(made, kind)
+    policy, kind = export.load_policy(run), name.split("-")[1]
+    made = variants.transform(name, policy, EPISODES)
     assert quantization.is_quantized(served.model) == (kind != "bf16")
     assert measurement.weight_bytes(served) == measurement.weight_bytes(made)
     np.testing.assert_allclose(actions(served), actions(made), atol=1e-5)
@@ -167,7 +164,7 @@ def test_refusals(run, base, tmp_path, capsys):
     assert "--save and --out must be given together" in refuse(capsys, run, "--save", "half-bf16")
     assert "are for measuring" in refuse(capsys, *save, out, "--episodes", "4")
     unfinished = refuse(capsys, tmp_path, *save[1:], out)
-    assert f"{tmp_path} contains no policy: no run has finished there" in unfinished
+    assert f"{tmp_path} is not a finished run" in unfinished
     lora = finished_run(tmp_path / "lora", base, LoRA(rank=2))
     error = refuse(capsys, lora, *save[1:], out)
     assert "was trained with LoRA: only LoRA-SP runs have variants" in error
@@ -182,24 +179,8 @@ def test_a_run_needs_its_config_and_results(base, tmp_path, capsys):
     assert f"{run} is not a finished run" in refuse(capsys, run)
 
 
-def test_wrong_episodes_are_refused(run):
-    def evaluate(*_):
-        return outcome("10" * 64)
-
-    with pytest.raises(ValueError, match="success depends on bit 0"):
-        measurement.measure(run, ["whole-bf16"], evaluate=evaluate)
-
-
 def test_quantized_base_of_a_policy_is_checked(run, tmp_path):
-    (policy, *_), kind = measurement.load(run), cast(Any, "int2")
+    policy, kind = export.load_policy(run), cast(Any, "int2")
     export.write_variant(tmp_path / "x", policy, run, quantized=kind)
     with pytest.raises(ValueError, match="'int8' or 'nf4'"):
         export.load_policy(tmp_path / "x")
-
-
-def test_docs_show_the_committed_tables():
-    found = json.loads((ROOT / "docs" / "deployment.json").read_text())
-    page = (ROOT / "docs" / "deployment.md").read_text()
-    assert len(found) == 2
-    for each in found.values():
-        assert measurement.table(each) in page

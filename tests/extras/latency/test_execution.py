@@ -11,7 +11,7 @@ import pytest
 from lorasp_jax.evaluation.programs import split_rollout
 from lorasp_jax.extras.latency.execution import (
     EXECUTIONS,
-    Settings,
+    Execution,
     Trace,
     check_delay,
     delayed_rollout,
@@ -82,7 +82,7 @@ def numbering():
 
 def executed(numbering, execution, delay):
     """Return the commands of one world as integers, one row per control step."""
-    rollout = delayed_rollout(ENV, Settings(execution, STEPS, 2, guidance=7.0))
+    rollout = delayed_rollout(ENV, Execution(execution, STEPS, 7.0), denoise_steps=2)
     trace = rollout(numbering, jax.random.key(0), delay)
     assert (trace.commands == trace.commands[:1]).all()
     assert (trace.steps >= ENV.max_steps).all()
@@ -132,7 +132,7 @@ def test_without_delay_it_is_the_ordinary_rollout(execution):
     key, steps = jax.random.key(3), {"execute_steps": 3, "denoise_steps": 2}
     for room in ROOMS:
         expected = split_rollout(room, **steps)(policy(), key)
-        found = delayed_rollout(room, Settings(execution, **steps))(policy(), key, 0)
+        found = delayed_rollout(room, Execution(execution, 3), denoise_steps=2)(policy(), key, 0)
         np.testing.assert_array_equal(found.success, expected.success)
         np.testing.assert_array_equal(found.steps, expected.steps)
         assert 0 < found.success.sum() < 16
@@ -142,7 +142,7 @@ def test_one_compilation_gives_the_whole_curve(numbering):
     env = dataclasses.replace(ENV)
     with compilations() as counts:
         for execution in EXECUTIONS:
-            rollout = delayed_rollout(env, Settings(execution, STEPS, 3))
+            rollout = delayed_rollout(env, Execution(execution, STEPS), denoise_steps=3)
             for delay in range(STEPS + 1):
                 rollout(numbering, jax.random.key(0), delay)
     assert counts.pop("predict") == 3  # plain, trained, guided
@@ -154,7 +154,7 @@ def test_delays_that_do_not_fit_are_refused(numbering):
         text = f"of which {steps} are executed, the delay must be from 0 to {longest} .* {delay}$"
         with pytest.raises(ValueError, match=text):
             check_delay(delay, steps, CHUNK)
-    rollout = delayed_rollout(ENV, Settings("naive", STEPS))
+    rollout = delayed_rollout(ENV, Execution("naive", STEPS))
     with pytest.raises(ValueError, match="with chunks of 10 actions"):
         rollout(numbering, jax.random.key(0), 5)
 

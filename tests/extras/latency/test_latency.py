@@ -7,27 +7,25 @@ import jax
 import numpy as np
 import pytest
 
+from lorasp_jax.evaluation.intervals import wilson_interval
 from lorasp_jax.extras.latency import __main__ as command
 from lorasp_jax.extras.latency import curve, figure
-from lorasp_jax.extras.latency.execution import Trace
+from lorasp_jax.extras.latency.execution import EXECUTIONS, Trace
+from lorasp_jax.extras.study import results, run_cell
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run_folder import read_json, to_json, write_json
-from tests.evaluation.test_programs import policy
-from tests.extras.latency.test_execution import CONFIG as CHUNKS_OF_TEN
 from tests.runs import CONFIG, RESULTS, finish
 
 SETTINGS = dataclasses.replace(CONFIG.evaluation, episodes=4, num_envs=2, denoise_steps=3)
 TASK = RESULTS["tasks"]["press"]
-MODEL = dataclasses.replace(policy().model, config=CHUNKS_OF_TEN)
-POLICY = dataclasses.replace(policy(), model=MODEL)
 
 
-def played(env, how, *, ranges):
+def played(env, execution, *, denoise_steps, ranges):
     """Stand in for a rollout: the first world succeeds, and targets grow with the delay."""
 
     def rollout(policy, key, delay):
-        assert ranges is None
-        calls.append((env.task.name, how.execution, how.execute_steps, delay, key))
+        assert (ranges, denoise_steps) == (None, 3)
+        calls.append((env.task.name, execution.name, execution.execute_steps, delay, key))
         commands = np.zeros((2, 6, 7))
         commands[..., 0] = delay * np.arange(6) ** 3
         return Trace(np.array([True, False]), np.array([6, 6]), commands)
@@ -45,10 +43,10 @@ def folder(tmp_path, monkeypatch):
     optim = dataclasses.replace(CONFIG.optim, rtc_max_delay=2)
     config = dataclasses.replace(CONFIG, evaluation=SETTINGS, optim=optim)
     write_json(folder / "config.json", to_json(config))
-    monkeypatch.setattr(curve, "load_policy", lambda run: POLICY)
+    monkeypatch.setattr(run_cell, "_source", lambda run: None)
     monkeypatch.setattr(curve, "prepared", lambda policy: policy)
-    monkeypatch.setattr(curve, "describe", lambda run: {"robot": "panda"})
     monkeypatch.setattr(curve, "delayed_rollout", played)
+    monkeypatch.setattr(command, "describe", lambda run: {"policy": {"config": {"chunk": 10}}})
     played.calls = []
     return folder
 
@@ -61,21 +59,27 @@ def refused(capsys, *arguments):
     return printed
 
 
+def measured(folder):
+    return results.load(folder / "latency/results.json")
+
+
 def test_every_execution_is_measured_at_every_delay(folder, capsys):
     assert command.main([str(folder), "--episodes", "4"]) == 0
     beyond, *written = capsys.readouterr().out.splitlines()
-    assert beyond.endswith("trained execution at d = 3, 4, 5 is beyond its --optim.rtc-max-delay")
-    assert written == [f"written: {folder / name}" for name in ("latency.json", "latency.svg")]
-    found = read_json(folder / "latency.json", curve.SCHEMA)
-    assert (found["chunk"], found["execute_steps"], found["denoise_steps"]) == (10, 5, 3)
-    assert {(t, e) for t, curves in found["curves"].items() for e in curves} == {
-        (t, e) for t in ("press", "pour") for e in ("synchronous", "naive", "trained", "guided")
+    assert beyond.endswith("beyond d = 2 is beyond its --optim.rtc-max-delay")
+    assert written == [f"written: {folder / name}" for name in ("latency", "latency.svg")]
+    found = measured(folder)
+    assert found.keys() == {
+        f"{task}/{execution}/d{delay}"
+        for task in ("press", "pour")
+        for execution in EXECUTIONS
+        for delay in range(6)
     }
-    points = found["curves"]["pour"]["trained"]
-    assert [point["delay"] for point in points] == [0, 1, 2, 3, 4, 5]
-    assert (points[1]["success"], points[1]["outcomes"], points[1]["steps"]) == (0.5, "1010", 6)
-    np.testing.assert_allclose(points[2]["action_delta"], 2 * 125 / 5)
-    np.testing.assert_allclose(points[2]["jerk"], 2 * 6 / 0.1**3)
+    point = found["pour/trained/d1"]
+    assert (point["outcomes"], point["motion"]["steps"]) == ({"pour": "1010"}, 6)
+    assert point["config"]["evaluation"]["execute_steps"] == 5
+    np.testing.assert_allclose(found["pour/naive/d2"]["motion"]["action_delta"], 2 * 125 / 5)
+    np.testing.assert_allclose(found["pour/naive/d2"]["motion"]["jerk"], 2 * 6 / 0.1**3)
     assert "<svg" in (folder / "latency.svg").read_text()
 
 
@@ -103,17 +107,14 @@ def test_the_episodes_are_those_of_the_final_evaluation(folder):
 
 
 def test_what_is_measured_is_not_measured_again(folder, capsys):
-    options = [str(folder), "--tasks", "press", "--executions", "naive"]
+    options = [str(folder), "--tasks", "press", "--executions", "guided"]
     command.main([*options, "--delays", "3"])
     first = len(played.calls)
     command.main([*options, "--delays", "1", "3"])
     assert [call[3] for call in played.calls[first:]] == [1, 1]
-    points = read_json(folder / "latency.json")["curves"]["press"]["naive"]
-    assert [point["delay"] for point in points] == [1, 3]
-    before = (folder / "latency.json").read_bytes()
-    line = refused(capsys, *options, "--guidance", "3")
-    assert "measured with other settings (guidance)" in line
-    assert (folder / "latency.json").read_bytes() == before
+    assert measured(folder).keys() == {"press/guided/d1", "press/guided/d3"}
+    line = refused(capsys, *options, "--delays", "1", "--guidance", "3")
+    assert "it was run with other guidance" in line
 
 
 @pytest.mark.parametrize(
@@ -122,14 +123,13 @@ def test_what_is_measured_is_not_measured_again(folder, capsys):
         (["--delays", "6"], "must be from 0 to 5 control steps, got 6"),
         (["--delays", "-1"], "control steps, got -1"),
         (["--tasks", "pres"], "are press, pour, got 'pres'"),
-        (["--episodes", "3"], "episodes must be a positive multiple of 2, got 3"),
+        (["--episodes", "3"], "episodes must be a multiple of num_envs, got 3 and 2"),
         (["--execute-steps", "11"], "from 1 to the chunk length (10), got 11"),
-        (["--guidance", "nan"], "guidance must be above 0, got nan"),
+        (["--guidance", "nan"], "--guidance above 0"),
     ],
 )
 def test_bad_options_are_refused_before_anything_runs(options, reason, folder, capsys):
     assert reason in refused(capsys, folder, *options)
-    assert not (folder / "latency.json").exists()
     assert not played.calls
 
 
@@ -142,7 +142,7 @@ def test_runs_that_cannot_be_measured(folder, capsys):
     write_json(folder / "results.json", RESULTS | {"tasks": {}})
     assert "cannot be simulated" in refused(capsys, folder)
     (folder / "results.json").unlink()
-    assert "no finished run in" in refused(capsys, folder)
+    assert "is not a finished run" in refused(capsys, folder)
 
 
 def test_results_of_a_miscompiled_program_are_refused():
@@ -154,20 +154,26 @@ def test_results_of_a_miscompiled_program_are_refused():
     with pytest.raises(ValueError, match="success depends on bit 0 of an episode's index"):
         curve.measure_point(*arguments)
     trace = dataclasses.replace(trace, success=np.ones(128, bool))
-    assert curve.measure_point(*arguments)["success"] == 1
+    assert curve.measure_point(*arguments)["outcomes"] == 256 * "1"
 
 
 def test_the_figure_averages_over_tasks():
     """Only delays that all tasks have; the interval pools their episodes."""
-    point = {"success": 0.5, "outcomes": "10", "action_delta": 1.0, "jerk": 4.0}
-    other = {"success": 1.0, "outcomes": "11", "action_delta": 3.0, "jerk": 2.0}
-    press = [{"delay": 0, **point}, {"delay": 1, **point}]
-    curves = {"press": {"naive": press}, "pour": {"naive": [{"delay": 1, **other}]}}
-    (mean,) = figure.average(curves, "naive")
+
+    def point(task, delay, outcomes, action_delta, jerk):
+        config = {"execution": "naive", "delay": delay}
+        motion = {"action_delta": action_delta, "jerk": jerk}
+        return {"config": config, "outcomes": {task: outcomes}, "motion": motion}
+
+    points = [point("press", d, "10", 1.0, 4.0) for d in (0, 1)] + [
+        point("pour", 1, "11", 3.0, 2.0)
+    ]
+    found = dict(enumerate(points))
+    (mean,) = figure.average(found, "naive")
     assert (mean["delay"], mean["success"], mean["action_delta"], mean["jerk"]) == (1, 75, 2, 3)
-    assert mean["ci95"] == [100 * bound for bound in curve.wilson_interval(3, 4)]
-    assert figure.average(curves, "guided") == figure.average({}, "naive") == []
+    assert mean["ci95"] == [100 * bound for bound in wilson_interval(3, 4)]
+    assert figure.average(found, "guided") == figure.average({}, "naive") == []
 
 
 def test_every_execution_has_a_color():
-    assert list(figure.COLORS) == list(curve.EXECUTIONS)
+    assert list(figure.COLORS) == list(EXECUTIONS)

@@ -7,8 +7,7 @@ import time
 from pathlib import Path
 
 from lorasp_jax.config import Config, OptimConfig
-from lorasp_jax.extras.study import Cell, Derived, Study
-from lorasp_jax.extras.study.status import Board, results_of
+from lorasp_jax.extras.study import Cell, Derived, Study, progress
 from lorasp_jax.peft import LoRA, LoRASP
 from lorasp_jax.training.run_folder import to_json, write_json
 
@@ -97,12 +96,13 @@ def ran(folder: Path) -> list[str]:
 
 
 def states(folder: Path, of: Study | None = None) -> dict[str, str]:
-    return {name: str(status.state) for name, status in Board(of or study(), folder).read().items()}
+    statuses = progress.read(of or study(), folder)
+    return {name: str(status.state) for name, status in statuses.items()}
 
 
 def results(folder: Path) -> dict:
-    statuses = Board(study(), folder).read()
-    return results_of(statuses, statuses)
+    statuses = progress.read(study(), folder)
+    return progress.results_of(statuses, statuses)
 
 
 def begin(folder: Path, config: Config) -> None:

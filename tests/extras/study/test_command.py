@@ -98,13 +98,13 @@ def test_a_damaged_cell_is_reported(start, folder):
 def test_dry_run(start, folder):
     code, text = start("--dry-run", "--only", "lora/*", "s*")
     assert code == 0
-    assert re.search(r"sp/s0 │ LoRASP │ 2,000 │ [\d,]+ │ runnable │ \?", text)
-    assert re.search(r"lora/s0 │ LoRA │ 2,000 │ \? │ waiting │ \?", text)
+    assert re.search(r"sp/s0 │ LoRASP │ 2,000 │ runnable", text)
+    assert re.search(r"lora/s0 │ \? │ \? │ waiting", text)
     assert not folder.exists()
     start()
     code, text = start("--dry-run")
-    assert re.search(r"lora/s1 │ LoRA │ 2,000 │ [\d,]+ │ finished │ \d s", text)
-    assert re.search(r"cut/s0 │ from lora/s0 │ 0 │ │ finished │ \d s", text)
+    assert re.search(r"lora/s1 │ LoRA │ 2,000 │ finished", text)
+    assert re.search(r"cut/s0 │ from lora/s0 │ 0 │ finished", text)
 
 
 @pytest.mark.parametrize(
@@ -242,3 +242,21 @@ def test_results_of_another_study_are_refused(start, committed):
     assert "has the results of other, not of fake" in text
     committed.unlink()
     assert "study.json is missing" in start("--results", str(committed))[1]
+
+
+def test_the_readme_beside_the_results_gets_the_tables(start, committed, tmp_path):
+    page = 'page=lambda study, results, folder: {"count": f"{len(results)} cells"}'
+    code = f"import dataclasses\n{FILE}".replace("study()", f"dataclasses.replace(study(), {page})")
+    (tmp_path / "study.py").write_text(code)
+    readme = committed.with_name("README.md")
+    start("--results", str(committed), "--no-run")
+    assert not readme.exists()
+    text = "Before.\n<!-- begin: count -->\n{}<!-- end -->\nAfter.\n"
+    readme.write_text(text.format("old\n"))
+    without(committed, "lr")
+    start("--results", str(committed), "--no-run")  # not all cells are finished
+    assert readme.read_text() == text.format("old\n")
+    start("--results", str(committed))
+    assert readme.read_text() == text.format("\n6 cells\n")
+    readme.write_text(text.format("").replace("count", "other"))
+    assert "different parts" in start("--results", str(committed))[1]

@@ -16,17 +16,7 @@ def test_results_are_read_as_written(tmp_path, found):
     path = tmp_path / "compact.json"
     results.write(path, "fake", found)
     loaded = results.load(path)
-    assert sorted(loaded) == sorted(fakes.NAMES)
-    for name, result in loaded.items():
-        assert {**result, "speed": 0, "layer_active_rank": 0} == {
-            **found[name],
-            "speed": 0,
-            "layer_active_rank": 0,
-        }
-        assert result["speed"] == {"samples_per_second": 123.46}
-        assert result["layer_active_rank"]["action"]["q_proj"] == pytest.approx(
-            found[name]["layer_active_rank"]["action"]["q_proj"], rel=1e-4
-        )
+    assert loaded == found
 
 
 def test_the_file_depends_only_on_the_results(tmp_path, found):
@@ -51,7 +41,7 @@ def test_no_results(tmp_path):
 def test_a_damaged_file_is_refused(tmp_path, found):
     path = tmp_path / "a.json"
     results.write(path, "fake", found)
-    path.write_text(path.read_text().replace("123.46", "123.47"))
+    path.write_text(path.read_text().replace("123.456", "123.457"))
     with pytest.raises(ValueError, match=r"a\.json.*digest does not match"):
         results.load(path)
 
@@ -59,13 +49,6 @@ def test_a_damaged_file_is_refused(tmp_path, found):
 def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"a\.json is missing"):
         results.load(tmp_path / "a.json")
-
-
-def test_a_file_that_is_too_large_is_refused(tmp_path, found):
-    found["lr"]["measures"] = {"x": [0.123456] * 300_000}
-    with pytest.raises(ValueError, match=r'take 2\.\d+ MB, .* the largest cell, "lr", takes'):
-        results.write(tmp_path / "a.json", "fake", found)
-    assert not (tmp_path / "a.json").exists()
 
 
 def test_settings_of_all_kinds_survive(tmp_path, found):

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from envs.datasets.episodes import Episodes
 from envs.scene.ranges import Randomization
-from lorasp_jax.extras.study import results, run_cell
+from lorasp_jax.extras.study import held_out, results, run_cell
 from lorasp_jax.extras.study.held_out import EPISODES, SEED
 from lorasp_jax.extras.study.runner import Job
 from lorasp_jax.extras.study.study import Cell
@@ -42,13 +42,13 @@ def collected(monkeypatch):
         random_episodes(task, len(configs)).save(path)
         return {task: Episodes.load(path, control_dt=config.control_dt)}
 
-    monkeypatch.setattr(run_cell, "demonstrations", demonstrations)
+    monkeypatch.setattr(held_out, "demonstrations", demonstrations)
     return configs
 
 
 def load(folder, **changes):
     config = dataclasses.replace(CONFIG, **changes)
-    return run_cell.shared_demonstrations(folder, config, folder, lambda *_: None)
+    return held_out.shared_demonstrations(folder, config, folder, lambda *_: None)
 
 
 def test_cells_share_demonstrations(tmp_path, collected):
@@ -61,19 +61,18 @@ def test_cells_share_demonstrations(tmp_path, collected):
 
 
 @pytest.mark.parametrize("measured", [True, False])
-def test_only_measured_cells_have_costs_and_measures(tmp_path, monkeypatch, measured):
-    run = Run(CONFIG, tmp_path, Console(quiet=True), "")
+def test_what_a_study_measures_and_how_a_cell_is_evaluated(tmp_path, monkeypatch, measured):
+    run, callbacks = Run(CONFIG, tmp_path, Console(quiet=True), ""), []
     monkeypatch.setattr(run_cell.setup, "prepare", lambda *_, **__: run)
-    monkeypatch.setattr(run_cell.loop, "train", lambda *_, **__: None)
-    monkeypatch.setattr(run_cell, "_results", lambda _: {"outcomes": {}})
-    monkeypatch.setattr(
-        run_cell, "_measure", lambda *_: {"speed": {"x": 1.0}, "measures": {"y": 2}}
-    )
-    cell = Cell("a", CONFIG, measured=measured)
-    found = run_cell.run_cell(Job(cell, CONFIG, tmp_path, {}))
-    assert found["speed"] == ({"x": 1.0} if measured else {})
-    assert found["measures"] == ({"y": 2} if measured else {})
-    assert ("measure" in run.seconds) == measured
+    monkeypatch.setattr(run_cell.loop, "train", lambda _, used, **__: callbacks.extend(used))
+    monkeypatch.setattr(run_cell, "held_out_demonstrations", lambda *_: {"press": 1})
+    measure = lambda run, episodes, source: {"measures": [episodes, source]}  # noqa: E731
+    cell = Cell("a", CONFIG, evaluate=lambda run: {"outcomes": {"press": "01"}})
+    found = run_cell.run_cell(Job(cell, CONFIG, tmp_path, {}, measure if measured else None))
+    assert found.pop("seconds").keys() >= {"evaluate", "total"}
+    expected = {"measures": [{"press": 1}, None]} if measured else {}
+    assert found == {"outcomes": {"press": "01"}} | expected
+    assert [type(callback).__name__ for callback in callbacks] == ["Export"]
 
 
 def test_rows_that_the_device_computes_wrongly_fail_the_cell(tmp_path):
@@ -86,7 +85,7 @@ def test_rows_that_the_device_computes_wrongly_fail_the_cell(tmp_path):
     }
     write_json(tmp_path / "results.json", tree)
     with pytest.raises(ValueError, match="success depends on bit 0 of an episode's index"):
-        run_cell._results(run)
+        run_cell._simulated(run)
 
 
 @pytest.mark.parametrize(
@@ -125,7 +124,7 @@ def test_cells_at_the_same_time_collect_once(tmp_path, collected):
 
 
 def test_held_out_demonstrations_are_others(tmp_path, collected):
-    run_cell.held_out_demonstrations(tmp_path, dataclasses.replace(CONFIG, tasks=("press",)))
+    held_out.held_out_demonstrations(tmp_path, dataclasses.replace(CONFIG, tasks=("press",)))
     load(tmp_path, tasks=("press",))
     assert [config.seed for config in collected] == [SEED, 0]
     assert [config.data.episodes for config in collected] == [EPISODES, CONFIG.data.episodes]
@@ -157,7 +156,6 @@ def repeatable(folder):
     found = {}
     for name, cell in results.load(folder / "results.json").items():
         found[name] = {key: value for key, value in cell.items() if key not in UNREPEATABLE}
-        found[name]["measures"].pop("smaller", None)  # milliseconds
         if (file := folder / name / "adapter.safetensors").exists():
             found[name]["policy"] = hashlib.sha256(file.read_bytes()).hexdigest()
     return found

@@ -5,8 +5,8 @@ import threading
 
 import pytest
 
-from lorasp_jax.extras.study import results, runner
-from lorasp_jax.extras.study.status import Board, State, clear_failure
+from lorasp_jax.extras.study import progress, results, runner
+from lorasp_jax.extras.study.progress import CellState, clear_failure
 from lorasp_jax.extras.study.study import Derived
 from tests.extras.study import fakes
 from tests.extras.study.fakes import NAMES, ran, run, states, study
@@ -27,7 +27,7 @@ def test_cells_run_once_in_order(folder):
     assert ran(folder) == ["sp/s0", "sp/s1", "lora/s0", "lora/s1", "cut/s0", "lr"]
     work(folder)
     assert len(ran(folder)) == 6
-    assert set(states(folder).values()) == {State.FINISHED}
+    assert set(states(folder).values()) == {CellState.FINISHED}
 
 
 def test_configs_and_transformations_get_the_results_they_name(folder):
@@ -48,9 +48,9 @@ def test_a_failed_cell_does_not_stop_the_others(folder):
 
     work(folder, run_cell=fail)
     assert ran(folder) == ["sp/s0", "lr"]
-    statuses = Board(study(), folder).read()
+    statuses = progress.read(study(), folder)
     assert (statuses["sp/s1"].state, statuses["sp/s1"].reason) == (
-        State.FAILED,
+        CellState.FAILED,
         "RuntimeError: boom bang",
     )
     assert statuses["cut/s0"].reason == "for lora/s0 (waiting)"
@@ -65,7 +65,7 @@ def test_a_failed_cell_does_not_stop_the_others(folder):
 def test_shards_are_merged(folder):
     first = ["sp/s0", "sp/s1"]
     work(folder, first)
-    assert states(folder)["lora/s0"] == State.RUNNABLE
+    assert states(folder)["lora/s0"] == CellState.RUNNABLE
     work(folder, set(NAMES) - {*first})
     assert sorted(ran(folder)) == sorted(NAMES)
 
@@ -73,7 +73,7 @@ def test_shards_are_merged(folder):
 def test_a_cell_of_another_shard_is_waited_for(folder):
     work(folder, ["lora/s0", "cut/s0"])
     assert ran(folder) == []
-    assert states(folder)["lora/s0"] == State.WAITING
+    assert states(folder)["lora/s0"] == CellState.WAITING
 
 
 def test_several_workers_run_every_cell_once(folder):
@@ -86,7 +86,7 @@ def test_several_workers_run_every_cell_once(folder):
     for thread in threads:
         thread.join()
     assert sorted(ran(folder)) == sorted(NAMES)
-    assert set(states(folder).values()) == {State.FINISHED}
+    assert set(states(folder).values()) == {CellState.FINISHED}
 
 
 def test_workers_share_a_group_that_others_wait_for(folder):
@@ -106,12 +106,12 @@ def test_workers_share_a_group_that_others_wait_for(folder):
     for thread in threads:
         thread.join()
     assert {*ran(folder)[:2]} == {"sp/s0", "sp/s1"}
-    assert set(states(folder).values()) == {State.FINISHED}
+    assert set(states(folder).values()) == {CellState.FINISHED}
 
 
 def test_a_worker_goes_on_with_the_group_that_it_has_compiled(folder):
     work(folder, ["sp/s0", "sp/s1"])
-    statuses = Board(study(), folder).read()
+    statuses = progress.read(study(), folder)
     names = ["lora/s0", "lora/s1", "lr"]
 
     def order(last):

@@ -3,8 +3,8 @@ import io
 import pytest
 from rich.console import Console
 
-from lorasp_jax.extras.study import runner, workers
-from lorasp_jax.extras.study.status import Board, clear_failure, record_failure
+from lorasp_jax.extras.study import results, workers
+from lorasp_jax.extras.study.progress import clear_failure
 from tests.extras.study import fakes
 from tests.extras.study.fakes import NAMES, ran, states
 
@@ -59,26 +59,6 @@ def test_one_of_four_workers_is_killed(folder):
     assert sorted(ran(folder)) == sorted(names)
 
 
-def time_left(folder, statuses, started, running):
-    """Return the expected time [s]; `started` are the ages of the cells that run."""
-    console = Console(file=io.StringIO())
-    pool = workers.Workers(fakes.study, folder, NAMES, console, fakes.run)
-    pool._running = dict.fromkeys(range(running))
-    return pool._expected_seconds(statuses, started)
-
-
-def test_the_time_left(folder):
-    assert time_left(folder, Board(fakes.study(), folder).read(), {}, running=1) is None
-    runner.work(fakes.study(), folder, ["lr"], fakes.run)  # takes 1 s
-    statuses = Board(fakes.study(), folder).read()
-    assert time_left(folder, statuses, {}, running=1) == 5
-    assert time_left(folder, statuses, {"sp/s0": 0.5}, running=1) == 4.5
-    # Jobs that share a device are assumed to be as slow as one after the other.
-    assert time_left(folder, statuses, {}, running=2) == 5
-    record_failure(folder / "sp/s1", "boom", "")
-    assert time_left(folder, Board(fakes.study(), folder).read(), {}, running=1) == 1
-
-
 @pytest.mark.slow
 def test_interrupted_workers_stop(folder):
     with pytest.raises(KeyboardInterrupt):
@@ -93,3 +73,15 @@ def test_workers_that_cannot_start(folder):
     pool._arguments = (fakes.no_study, *pool._arguments[1:])
     with pytest.raises(ValueError, match="a worker stopped with exit code 1 outside of a cell"):
         pool.run(1)
+
+
+def test_a_small_study_runs_here(folder):
+    console = Console(file=io.StringIO())
+    found = workers.run_here(fakes.study(), folder, ["sp/s0", "lr"], console, fakes.run)
+    assert sorted(found) == ["lr", "sp/s0"] == sorted(ran(folder))
+    assert results.load(folder / "results.json") == found
+    assert console.file.getvalue().split() == ["measuring", "sp/s0", "measuring", "lr"]
+    again = workers.run_here(fakes.study(), folder, ["lr"], console, fakes.run)
+    assert (again, len(ran(folder))) == (found, 2)
+    with pytest.raises(ValueError, match="lora/s0: waiting for sp/s1"):
+        workers.run_here(fakes.study(), folder, ["lora/s0"], console, fakes.run)

@@ -10,7 +10,6 @@ import venv
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from lorasp_jax.data import open_source
 from lorasp_jax.extras.judge.task import load_tasks
@@ -90,24 +89,9 @@ def test_missing_package_names_the_command(monkeypatch):
 def test_recording_without_the_package_names_the_command(monkeypatch):
     monkeypatch.setitem(sys.modules, "metaworld.policies", None)
     for name in ("collect", "expert"):
-        monkeypatch.delitem(sys.modules, f"examples.metaworld.{name}", raising=False)
+        monkeypatch.delitem(sys.modules, f"studies.metaworld.{name}", raising=False)
     with pytest.raises(SystemExit, match=re.escape(INSTALL)):
         importlib.import_module("studies.metaworld.collect")
-
-
-def test_films_are_joined_and_keep_their_last_picture(tmp_path):
-    for name, shades in (("push", (50, 250)), ("reach", (50, 100, 200))):
-        first, *rest = (Image.new("RGB", (64, 64), (shade,) * 3) for shade in shades)
-        save = {"save_all": True, "append_images": rest, "lossless": True}
-        first.save(tmp_path / f"{name}.webp", **save)
-    out = tmp_path / "out" / "all.webp"
-    script = ROOT / "docs" / "figures" / "metaworld_films.py"
-    run([sys.executable, str(script), str(tmp_path), "--out", str(out), "--quality", "100"])
-    with Image.open(out) as film:
-        film.seek(2)
-        joined = np.asarray(film.convert("RGB"))
-    assert abs(joined[50, 30].mean() - 250) < 10
-    assert abs(joined[50, 100].mean() - 200) < 10
 
 
 @pytest.mark.slow

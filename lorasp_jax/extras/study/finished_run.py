@@ -1,0 +1,57 @@
+"""Read a finished run, from which derived cells start."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from lorasp_jax import peft
+from lorasp_jax.config import (
+    AuxiliaryConfig,
+    Config,
+    DataConfig,
+    EvaluationConfig,
+    ModelConfig,
+    OptimConfig,
+)
+from lorasp_jax.training import records
+from lorasp_jax.training.run_folder import CONFIG_FILE, read_json, recorded_ranges
+
+_GROUPS: dict[str, Any] = {
+    "model": ModelConfig,
+    "data": DataConfig,
+    "optim": OptimConfig,
+    "auxiliary": AuxiliaryConfig,
+    "evaluation": EvaluationConfig,
+}
+
+
+def recorded_config(run: Path) -> Config:
+    """Return the config of a finished run.
+
+    Raises:
+        ValueError: the run is not finished, its tasks cannot be simulated, or its config has
+            settings that this version lacks.
+    """
+    recorded = read_json(run / CONFIG_FILE, records.CONFIG)
+    finished = read_json(run / "results.json", records.RESULTS)
+    if not recorded or not finished:
+        raise ValueError(f"{run} is not a finished run: it needs {CONFIG_FILE} and results.json")
+    if not finished["tasks"]:
+        raise ValueError(f"the tasks of {run} cannot be simulated")
+    try:
+        return _from_json(recorded, tuple(finished["tasks"]))
+    except TypeError as error:
+        raise ValueError(f"{run / CONFIG_FILE} has settings of another version: {error}") from error
+
+
+def _from_json(recorded: Mapping[str, Any], tasks: tuple[str, ...]) -> Config:
+    """Undo `run_folder.to_json`."""
+    fields = {name: value for name, value in recorded.items() if name not in ("scene", "digest")}
+    for name, group in _GROUPS.items():
+        fields[name] = group(**fields[name])
+    settings = fields["peft"]
+    names = (name for name in peft.names() if peft.find(name).__name__ == settings["method"])
+    fields["peft"] = peft.from_settings({**settings, "method": next(names, "")})
+    if scene := recorded_ranges(recorded):
+        fields["scene"] = scene
+    return Config(**fields | {"tasks": tasks, "targets": tuple(fields["targets"])})

@@ -1,0 +1,1 @@
+"""Forms in which LoRA-SP runs can be deployed, compared."""

@@ -1,0 +1,1 @@
+"""Execution under latency, compared."""

@@ -1,0 +1,134 @@
+"""The policies that studies/metaworld compares: which method adapts best to Meta-World's tasks?
+
+    lorasp-jax study --config studies/metaworld/study.py --results studies/metaworld/results.json
+
+Needs the demonstrations of `python -m studies.metaworld.collect` in data/mt50, data/ml45 and
+data/ml5, and another Python environment for the judge; see the README.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from configs.metaworld import get_config
+from lorasp_jax.config import Config
+from lorasp_jax.extras.study import Cell, Study
+from lorasp_jax.extras.study.study import Results
+from lorasp_jax.peft import AdaLoRA, FullFineTuning, LoRA, LoRASP, Method
+from studies.metaworld import page
+from studies.metaworld.judge import judge
+
+SEEDS, PILOT_SEED = (0, 1, 2), 1000
+METHODS: Mapping[str, Method] = {
+    "lora_sp": LoRASP(rank=64),
+    "lora_r64": LoRA(rank=64),
+    "lora_r16": LoRA(rank=16),
+    "ada_lora": AdaLoRA(rank=64, target_rank=16),
+    "full": FullFineTuning(),
+}
+RATES = (3e-4, 1e-3, 3e-3)
+"""Learning rates, of which short pilots choose one per backbone and method."""
+TUNED_AS = {"lora_r16": "lora_r64"}
+"""Method -> the method whose rate it takes."""
+NAME = "metaworld"
+
+
+@dataclass(frozen=True)
+class Stage:
+    """How the policies of one kind are trained and judged.
+
+    Attributes:
+        tasks: what they learn and are judged on, a key of `tasks.SETS`.
+        steps: training steps.
+        episodes: judged episodes per task; 0: the policy is only a base.
+        first_seed: seed of the first episode.
+    """
+
+    tasks: str
+    steps: int
+    episodes: int
+    first_seed: int = 0
+
+
+STAGES = {
+    "pilot": Stage("mt50", 2_000, 5, 10_000),
+    "mt50": Stage("mt50", 6_000, 10),
+    "ml45": Stage("ml45", 10_000, 0),
+    "ml5": Stage("ml5", 2_000, 10),
+}
+
+
+def get_study(scale: str) -> Study:
+    """Return the study, which has one scale: accelerator."""
+    if scale != "accelerator":
+        raise ValueError(f"the study has the scale accelerator, got {scale!r}")
+    cells = [cell for backbone in page.BACKBONES for cell in _cells(backbone)]
+    return Study(NAME, tuple(cells), page=lambda _, results, __: page.blocks(results))
+
+
+def _cells(backbone: str) -> Iterator[Cell]:
+    """Yield all policies of a backbone, each after those that it needs."""
+    for method in METHODS:
+        if method not in TUNED_AS:
+            for rate in RATES:
+                name = f"{backbone}/pilot/{method}/{rate}"
+                yield _cell(name, _config(name, PILOT_SEED, rate))
+    for name in (f"{backbone}/ml45/full/s0", *_compared(backbone)):
+        pilots = _pilots(name)
+        base = f"{backbone}/ml45/full/s0" if "/ml5/" in name else ""
+        seed = int(name.rpartition("/s")[2])
+
+        def config(results: Results, name: str = name, seed: int = seed) -> Config:
+            return _config(name, seed, best_rate(results, _pilots(name)))
+
+        yield _cell(name, config, pilots, base)
+
+
+def _compared(backbone: str) -> Iterator[str]:
+    for stage in ("mt50", "ml5"):
+        for method in METHODS:
+            for seed in SEEDS:
+                yield f"{backbone}/{stage}/{method}/s{seed}"
+
+
+def _cell(name: str, config: Any, after: tuple[str, ...] = (), base: str = "") -> Cell:
+    stage = STAGES[name.split("/")[1]]
+    evaluate = functools.partial(judge, stage.tasks, stage.episodes, stage.first_seed)
+    return Cell(name, config, after, name.rpartition("/")[0], evaluate=evaluate, source=base)
+
+
+def _pilots(name: str) -> tuple[str, ...]:
+    """Return the policies whose success decides a policy's learning rate."""
+    backbone, _, method, _ = name.split("/")
+    return tuple(f"{backbone}/pilot/{TUNED_AS.get(method, method)}/{rate}" for rate in RATES)
+
+
+def best_rate(results: Results, pilots: tuple[str, ...]) -> float:
+    """Return the learning rate of the pilot with the highest success; of equals, the first."""
+
+    def success(name: str) -> float:
+        digits = "".join(results[name]["outcomes"].values())
+        return digits.count("1") / len(digits)
+
+    return float(max(pilots, key=success).rpartition("/")[2])
+
+
+def _config(name: str, seed: int, rate: float) -> Config:
+    """Return the config of a policy's run."""
+    backbone, kind, method, _ = name.split("/")
+    stage, config = STAGES[kind], get_config("accelerator")
+    model = dataclasses.replace(config.model, backbone=backbone)
+    if kind == "ml5":  # it starts from a fully fine-tuned policy
+        base = Path("runs") / NAME / backbone / "ml45/full/s0/base"
+        model = dataclasses.replace(model, checkpoint=str(base))
+    return dataclasses.replace(
+        config,
+        peft=METHODS[method],
+        model=model,
+        data=dataclasses.replace(config.data, source=f"data/{stage.tasks}"),
+        optim=dataclasses.replace(config.optim, steps=stage.steps, learning_rate=rate),
+        seed=seed,
+    )
