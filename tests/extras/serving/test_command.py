@@ -78,7 +78,7 @@ def test_checkpoints_that_do_not_say_enough(base):
         loading.load_checkpoint(Checkpoint(str(base), size="huge"))
     with pytest.raises(ValueError, match="no statistics in"):
         loading.load_checkpoint(Checkpoint(str(base), statistics=str(ROOT / "tests" / "models")))
-    with pytest.raises(ValueError, match="cameras must map some of"):
+    with pytest.raises(ValueError, match="keys of cameras must be one or more of"):
         loading.load_checkpoint(Checkpoint(str(base), cameras={"top": "front"}))
 
 
