@@ -165,7 +165,7 @@ class Episodes:
             time = getattr(self, name)
             valid = isinstance(time, numbers.Real) and 0 <= float(time) < math.inf
             yield (
-                valid and (time > 0 or name == "physics_dt"),
+                valid and (float(time) > 0 or name == "physics_dt"),
                 f"{name} is {time!r}, not a time in s",
             )
         yield self.state.ndim == 3 and self.state.size > 0, "state must have shape [E, T, J + 1]"

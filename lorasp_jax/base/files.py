@@ -41,10 +41,11 @@ def join_inside(folder: Path, name: object) -> Path:
     Raises:
         RefusedError: the name is not a relative path that stays in the folder.
     """
-    valid = isinstance(name, str) and name and "\0" not in name and not _URL.match(name)
-    if not valid or os.path.isabs(name) or ".." in re.split(r"[/\\]", name):
+    text = name if isinstance(name, str) else "\0"
+    leaves = _URL.match(text) or os.path.isabs(text) or ".." in re.split(r"[/\\]", text)
+    if not text or "\0" in text or leaves:
         raise RefusedError(f"{folder} refers to {name!r}: names must stay in the folder")
-    return folder / name
+    return folder / text
 
 
 def check_local(path: Path) -> None:

@@ -54,7 +54,7 @@ def camera_slots(
     """
     unknown = sorted(robot.keys() - set(cameras))
     if unknown or not robot:
-        raise ValueError(f"cameras must map some of {cameras} to the robot's, got {robot}")
+        raise ValueError(f"keys of cameras must be among {cameras}, got {robot}")
     return tuple((name, robot.get(name)) for name in cameras)
 
 
