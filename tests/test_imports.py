@@ -9,7 +9,6 @@ import pytest
 from tests import ROOT
 
 PACKAGES = [
-    "lorasp_jax._compat",
     "lorasp_jax.base",
     "envs",
     "lorasp_jax.kernels",

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from lorasp_jax import _compat
+from lorasp_jax.adapters import _compat
 from lorasp_jax.adapters.adaptation import init_stack, over_stack
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.adapters.layers.einsum import to_matrices

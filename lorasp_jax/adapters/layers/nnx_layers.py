@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen, nnx
 
-from lorasp_jax import _compat
+from lorasp_jax.adapters import _compat
 from lorasp_jax.adapters.layers import einsum
 from lorasp_jax.dense import AdaptedLayer, Dense, cast_input, reject_out_sharding, with_value
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from lorasp_jax import _compat
+from lorasp_jax.training import _compat
 
 PEAK = {"NVIDIA H200": 989e12, "NVIDIA H100": 989e12, "NVIDIA A100": 312e12, "TPU v5p": 459e12}
 """Dense bf16 FLOP/s by prefix of the device name (NVIDIA's and Google's data sheets; SXM variants,

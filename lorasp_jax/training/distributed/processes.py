@@ -18,7 +18,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from rich.console import Console
 
-from lorasp_jax import _compat
+from lorasp_jax.training import _compat
 
 _JOIN_TIMEOUT = 180  # s
 _EXIT_TIMEOUT = 60  # s; after it, JAX aborts the others if a process has died or waits to exit
