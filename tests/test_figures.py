@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from lorasp_jax.evaluation.intervals import wilson_interval
+from lorasp_jax.base.intervals import wilson_interval
 from studies.performance import float8
 from tests import ROOT
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from lorasp_jax.evaluation.intervals import wilson_interval
+from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.extras.serving.client import PolicyClient, PolicyError, ServerGone
 from lorasp_jax.extras.serving.pictures import to_square
 

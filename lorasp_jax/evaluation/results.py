@@ -10,8 +10,8 @@ import numpy as np
 from envs.env import Env
 from envs.scene.randomization import Draw
 from envs.state import Poses
+from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.evaluation import metrics
-from lorasp_jax.evaluation.intervals import wilson_interval
 from lorasp_jax.evaluation.programs import split_rollout
 from lorasp_jax.evaluation.rollout import RECORDED_WORLDS, Rollout
 from lorasp_jax.policies.policy import Policy

@@ -11,7 +11,6 @@ from lorasp_jax import models
 from lorasp_jax.adapters.compress import quantization
 from lorasp_jax.base import hub
 from lorasp_jax.config import Config
-from lorasp_jax.kernels.quantized_weights import Kind
 from lorasp_jax.models import backbone
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.checkpoints import loading
@@ -71,7 +70,7 @@ def with_config(model: Backbone, **changes: Any) -> Backbone:
     return nnx.merge(nnx.graphdef(abstract), nnx.state(model))
 
 
-def quantized(model: Any, kind: Kind | Literal[""] | None) -> Any:
+def quantized(model: Any, kind: quantization.Kind | Literal[""] | None) -> Any:
     """Return the model with the layers of its three towers quantized, or unchanged if no `kind`."""
     return quantization.quantize(model, [(_TOWERS, kind)]).model if kind else model
 

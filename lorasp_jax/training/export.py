@@ -12,10 +12,10 @@ import jax.numpy as jnp
 
 from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.compress.quantization import Kind
 from lorasp_jax.adapters.io import native
 from lorasp_jax.base import hub
 from lorasp_jax.base.digest import digest
-from lorasp_jax.kernels.quantized_weights import Kind
 from lorasp_jax.models import backbone
 from lorasp_jax.policies import tokenizer
 from lorasp_jax.policies.policy import Policy

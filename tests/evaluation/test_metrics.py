@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lorasp_jax.evaluation.intervals import wilson_interval
+from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.evaluation.metrics import (
     layer_ranks,
     position_bias,

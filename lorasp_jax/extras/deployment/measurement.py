@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 
 from envs.datasets.episodes import Episodes
+from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.config import Config
-from lorasp_jax.evaluation.intervals import wilson_interval
 from lorasp_jax.extras.deployment import variants
 from lorasp_jax.extras.deployment.variants import BATCH_SIZE, BATCHES, VARIANTS, WHOLE
 from lorasp_jax.extras.study import Derived, held_out, page, statistics

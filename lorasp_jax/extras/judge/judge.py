@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lorasp_jax.evaluation.intervals import wilson_interval
+from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.extras.judge.actors import Actor
 from lorasp_jax.extras.judge.task import GymTask
 

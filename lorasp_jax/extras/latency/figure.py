@@ -8,9 +8,9 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
+from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.evaluation.figure_style import STYLE
-from lorasp_jax.evaluation.intervals import wilson_interval
 from lorasp_jax.extras.study.study import Results
 
 COLORS = {

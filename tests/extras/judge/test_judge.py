@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lorasp_jax.evaluation.intervals import wilson_interval
+from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.extras.judge.__main__ import main
 from lorasp_jax.extras.judge.actors import RunActor
 from lorasp_jax.extras.judge.judge import judge

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from lorasp_jax.evaluation.intervals import wilson_interval
+from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.extras.latency import __main__ as command
 from lorasp_jax.extras.latency import curve, figure
 from lorasp_jax.extras.latency.execution import EXECUTIONS, Trace

@@ -14,8 +14,8 @@ from rich.console import Console
 from envs.rendering.video import side_by_side, write_video
 from lorasp_jax.base import compilation_cache as cache
 from lorasp_jax.base.errors import parse_arguments, run_command
+from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.base.locks import locked
-from lorasp_jax.evaluation.intervals import wilson_interval
 from lorasp_jax.extras.piper import options as shared
 from lorasp_jax.extras.piper.arm import PiperArm
 from lorasp_jax.extras.piper.asking import InThread, InTurn
