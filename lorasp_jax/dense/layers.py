@@ -15,7 +15,7 @@ from lorasp_jax.dense.functional import DenseLayer, apply_layer, cast_input
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import Aux, Method
 from lorasp_jax.peft.fields import short
-from lorasp_jax.peft.method import Params
+from lorasp_jax.peft.method import Params, check_params
 
 AUX_NAME = "stored_aux"
 KERNEL_INIT = jax.nn.initializers.lecun_normal()  # same as nnx.Linear and nn.Dense
@@ -198,7 +198,13 @@ class Dense(AdaptedLayer):
         return y
 
     def arrays(self) -> DenseLayer:
-        """The layer's arguments for `dense` and `dense_shared_input`."""
-        bias = None if self.bias is None else self.bias.get_value()
+        """The layer's arguments for `dense` and `dense_shared_input`.
+
+        Raises:
+          ValueError: the adapter's parameters, which a caller may replace, do not fit its method.
+        """
+        kernel, bias = self.kernel.get_value(), None if self.bias is None else self.bias.get_value()
         params = None if self.adapter is None else self.adapter.get_value()
-        return DenseLayer(self.kernel.get_value(), bias, params, self.method, self.dropout_key)
+        if params is not None and self.method is not None:
+            check_params(self.method, params, kernel.shape)
+        return DenseLayer(kernel, bias, params, self.method, self.dropout_key)

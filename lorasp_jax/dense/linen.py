@@ -11,7 +11,7 @@ from lorasp_jax.dense import validate
 from lorasp_jax.dense.functional import DenseLayer, apply_layer, cast_input
 from lorasp_jax.dense.layers import AUX_NAME, KERNEL_INIT
 from lorasp_jax.peft import Method
-from lorasp_jax.peft.method import Params, dropout_rate
+from lorasp_jax.peft.method import Params, check_params, dropout_rate
 
 
 class LinenDense(nn.Module):
@@ -53,7 +53,7 @@ class LinenDense(nn.Module):
         params = None
         if self.method is not None and not self.method.trains_base:
             params = self.variable("adapters", "adapter", self._init_adapter, kernel).value
-            validate.params(self.method, params, shape)
+            check_params(self.method, params, shape)
         x = cast_input(self.dtype, x, kernel, token_mask)
         use_dropout = params is not None and dropout_rate(self.method) and self.has_rng("dropout")
         key = self.make_rng("dropout") if use_dropout else None

@@ -1,6 +1,5 @@
 """Validate arguments before any computation."""
 
-import functools
 import math
 import os
 import pathlib
@@ -14,7 +13,7 @@ from flax import linen, nnx
 
 from lorasp_jax.peft import Method
 from lorasp_jax.peft.fields import checked_key, positive_int, short
-from lorasp_jax.peft.method import MAX_SIZE, Shapes
+from lorasp_jax.peft.method import MAX_SIZE, check_params
 
 MAX_NAME_BYTES = 255
 """Maximum length of a file or folder name [bytes]."""
@@ -80,36 +79,9 @@ def layer(arrays: Any) -> None:
     if (arrays.params is None) != (adapter_method is None or adapter_method.trains_base):
         raise ValueError("params and method must be given together")
     if arrays.params is not None:
-        params(adapter_method, arrays.params, (shape[0], math.prod(shape[1:])))
+        check_params(arrays.method, arrays.params, (shape[0], math.prod(shape[1:])))
     if arrays.dropout_key is not None:
         checked_key(arrays.dropout_key)
-
-
-def params(method: Any, values: Any, shape: tuple[int, ...]) -> None:
-    """Raise ValueError if the parameters do not fit the method and a kernel [I, O].
-
-    Without this check, parameters of a different rank could silently get the wrong scale.
-    """
-    actual = _shapes(values)
-    for name, expected in method.shapes(_initial_shapes(method, shape), actual).items():
-        if actual.get(name) != expected:
-            raise ValueError(
-                f"{method.name} for a kernel {list(shape)} needs {name} {list(expected)}, got "
-                f"{list(actual[name]) if name in actual else 'none'}"
-            )
-
-
-@functools.lru_cache(maxsize=1024)  # a model's layers share shapes and are traced repeatedly
-def _initial_shapes(method: Any, shape: tuple[int, ...]) -> Shapes:
-    return _shapes(jax.eval_shape(lambda: method.init_params(jax.random.key(0), *shape)))
-
-
-def _shapes(params: Any) -> Shapes:
-    leaves = jax.tree_util.tree_leaves_with_path(params)
-    return {
-        jax.tree_util.keystr(path, simple=True, separator="/"): jnp.shape(leaf)
-        for path, leaf in leaves
-    }
 
 
 def module(model: Any) -> Any:

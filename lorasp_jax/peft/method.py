@@ -6,6 +6,7 @@ pytree; everything else is a pure function of it. The NNX and Linen wrappers are
 """
 
 import dataclasses
+import functools
 from typing import Any, ClassVar, Protocol, TypeAlias
 
 import jax
@@ -169,12 +170,17 @@ class Method(Bottleneck):
           token_mask: bool [...tokens]; False marks padding, excluded from losses and statistics.
 
         Raises:
-          ValueError: the method is not additive.
+          ValueError: the method is not additive, x is not floating point, or the parameters belong
+            to another method.
         """
         if not self.additive:
             raise ValueError(f"{type(self).__name__} is not additive and has no delta; use apply")
+        if not jnp.issubdtype(x.dtype, jnp.floating):
+            raise ValueError(f"x must be floating point, got {x.dtype}")
+        up = self.up(params).astype(x.dtype)
+        check_params(self, params, (x.shape[-1], up.shape[-1]))
         z, aux = self.bottleneck_from_input(params, x, token_mask)
-        return z @ self.up(params).astype(x.dtype), dataclasses.replace(aux, token_mask=token_mask)
+        return z @ up, dataclasses.replace(aux, token_mask=token_mask)
 
     def bottleneck_from_input(
         self, params: Params, x: jax.Array, token_mask: jax.Array | None
@@ -287,3 +293,32 @@ def kaiming_uniform(key: jax.Array, shape: tuple[int, int]) -> jax.Array:
     """Sample an [I, R] matrix from U(±1/√I): Kaiming-uniform, a = √5, as in PyTorch and PEFT."""
     bound = shape[0] ** -0.5
     return jax.random.uniform(key, shape, jnp.float32, -bound, bound)
+
+
+def check_params(method: Method, params: Params, shape: tuple[int, ...]) -> None:
+    """Raise ValueError if the parameters do not fit the method and a kernel [I, O].
+
+    Without this check, parameters of a different rank could silently get the wrong scale.
+    """
+    if type(method).init_params is Method.init_params:
+        return  # a method without parameters of its own, such as a set of adapters
+    actual = _shapes(params)
+    for name, expected in method.shapes(_initial_shapes(method, shape), actual).items():
+        if actual.get(name) != expected:
+            raise ValueError(
+                f"{method.name} for a kernel {list(shape)} needs {name} {list(expected)}, got "
+                f"{list(actual[name]) if name in actual else 'none'}"
+            )
+
+
+@functools.lru_cache(maxsize=1024)  # a model's layers share shapes and are traced repeatedly
+def _initial_shapes(method: Method, shape: tuple[int, ...]) -> Shapes:
+    return _shapes(jax.eval_shape(lambda: method.init_params(jax.random.key(0), *shape)))
+
+
+def _shapes(params: Params) -> Shapes:
+    leaves = jax.tree_util.tree_leaves_with_path(params)
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="/"): jnp.shape(leaf)
+        for path, leaf in leaves
+    }

@@ -238,4 +238,16 @@ def test_the_calls_from_a_layer_to_the_router():
         sys.setprofile(None)
     path = "__call__ cast_input apply_layer apply low_rank_matmul bottlenecks bottleneck"
     assert calls == [*path.split(), "router_scores"]
-    assert len(all_calls) <= 28  # with those that get parameters only, such as `up`
+    assert len(all_calls) <= 40  # with those that get parameters only, such as `check_params`
+
+
+def test_replaced_parameters_of_another_rank_are_refused():
+    layer = Dense(3, 5, method=LoRA(rank=4, alpha=4), rngs=nnx.Rngs(0))
+    params = LoRA(rank=2, alpha=4).init_params(jax.random.key(0), 3, 5)
+    layer.adapter.set_value(params)
+    with pytest.raises(ValueError, match="needs"):
+        layer(jnp.ones((11, 3)))
+    with pytest.raises(ValueError, match="needs"):
+        LoRA(rank=4).delta(params, jnp.ones((11, 3)))
+    with pytest.raises(ValueError, match="int32"):
+        LoRA(rank=2).delta(params, jnp.ones((11, 3), jnp.int32))

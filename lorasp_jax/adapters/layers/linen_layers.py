@@ -15,9 +15,9 @@ from lorasp_jax.adapters.layers.einsum import (
     general_equation,
     to_matrices,
 )
-from lorasp_jax.dense import cast_input, validate
+from lorasp_jax.dense import cast_input
 from lorasp_jax.peft import Aux, Method
-from lorasp_jax.peft.method import dropout, dropout_rate
+from lorasp_jax.peft.method import check_params, dropout, dropout_rate
 
 
 def _general(layer: Any) -> tuple[str, str]:
@@ -92,7 +92,7 @@ class LayerCall(NamedTuple):
         kernel, bias = self.kernel(), nn.meta.unbox(self.module.get_variable("params", "bias"))
         *batch, d_in, d_out = jax.eval_shape(self.matrices).shape
         single = jax.eval_shape(lambda: jax.tree.map(lambda p: p[(0,) * len(batch)], params))
-        validate.params(method, single, (d_in, d_out))  # the user passes them with each call
+        check_params(method, single, (d_in, d_out))  # the user passes them with each call
         x = cast_input(getattr(self.module, "dtype", None), self.x, kernel)
         return einsum(self.equation, x, kernel, bias, params, method, key)
 

@@ -128,7 +128,8 @@ def apply_to_shared_input(
     fused = []
     if len({layer.dtype for layer in dense}) == 1:
         arrays = [layer.arrays() for layer in dense]
-        x_cast = cast_input(dense[0].dtype, x, arrays[0].kernel)
+        kernel = arrays[0].kernel
+        x_cast = cast_input(dense[0].dtype, x, kernel, token_mask, kernel.shape[0])
         fused = dense_shared_input(x_cast, arrays, token_mask=token_mask)
     fused_results, results = iter(fused), []
     for layer in layers.values():
