@@ -14,7 +14,7 @@ COMMANDS = {
     "train": ("lorasp_jax.cli.train", "adapt a policy to a robot"),
     "study": (
         "lorasp_jax.extras.study.__main__",
-        "run many experiments and test claims about them",
+        "run many experiments",
     ),
     "judge": ("lorasp_jax.extras.judge.__main__", "judge a policy in a Gymnasium environment"),
     "latency": (
