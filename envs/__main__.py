@@ -49,7 +49,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     option = _add_command(subparsers, commands.collect, image_size=64)
     option("--task", required=True, nargs="+", help=f"{tasks}; or all")
     option("--robot", required=True, help=robots)
-    text = "dataset folder or .npz file; for several tasks, folder of the datasets"
+    text = "dataset folder; for several tasks, folder of the datasets"
     option("--out", required=True, type=Path, help=text)
     option("--num-episodes", type=int, default=64, help=f"episodes per task {_DEFAULT}")
     option("--num-envs", type=int, help="parallel worlds (default: depends on the device)")
@@ -82,7 +82,6 @@ def _add_command(
     text = command.__doc__
     sub = subparsers.add_parser(command.__name__, help=text, description=text)
     sub.set_defaults(command=command)
-    sub.add_argument("--overwrite", action="store_true", help=f"{prefix}replace existing output")
     text = f"{prefix}height and width of images [px] {_DEFAULT}"
     sub.add_argument("--image-size", type=int, default=image_size, help=text)
     sub.add_argument("--seed", type=seed, default=0, help=f"random seed {_DEFAULT}")

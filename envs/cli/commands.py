@@ -2,12 +2,10 @@
 
 import argparse
 import contextlib
-import shutil
 import threading
 from collections.abc import Mapping
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -34,16 +32,11 @@ def collect(options: argparse.Namespace, console: Console) -> None:
     """Collect successful expert episodes, one RLDS dataset per task; run again to resume."""
     tasks = names("task") if options.task == ["all"] else list(dict.fromkeys(options.task))
     out: Path = options.out
-    if len(tasks) > 1 and out.suffix == ".npz":
-        raise ValueError(
-            f"an .npz file can hold only one task, got {len(tasks)}: give a folder as --out"
-        )
     files = [out / task for task in tasks] if len(tasks) > 1 else [out]
     scenes = [_env(options, task) for task in tasks]  # fail early on bad input
     with contextlib.ExitStack() as locks:
         for file in files:
             locks.enter_context(locked(file))
-            writing.recover_folder(file)
         todo = {f: e for f, e in zip(files, scenes, strict=True) if not _is_done(options, e, f)}
         try:
             summaries = _collect_concurrently(options, todo, console)
@@ -62,7 +55,7 @@ def gallery(options: argparse.Namespace, console: Console) -> None:
     for task in tasks:
         for robot in robots:
             file = options.out / f"{task}_{Path(robot).stem}.gif"
-            _refuse_existing(options, file)
+            _refuse_existing(file)
             episode = _episode(options, console, task, robot)
             views = _views(episode)[::_EVERY]
             options.out.mkdir(parents=True, exist_ok=True)
@@ -84,7 +77,7 @@ def play(options: argparse.Namespace, console: Console) -> None:
         return
     if options.image_size % 2:
         raise ValueError(f"--image-size of a video must be even, got {options.image_size}")
-    _refuse_existing(options, options.out)
+    _refuse_existing(options.out)
     episode = _episode(options, console, options.task, options.robot)
     views = _views(episode)
     options.out.parent.mkdir(parents=True, exist_ok=True)
@@ -114,24 +107,13 @@ def _is_done(options: argparse.Namespace, env: envs.Env, file: Path) -> bool:
     """Return whether the same command has already completed this dataset.
 
     Raises:
-        ValueError: another file or dataset exists and must not be replaced.
+        ValueError: another file or dataset exists.
     """
     if not file.exists():
         return False
-    recipe, partial = recipes.recipe(options, env), _partial(file)
-    if file.suffix != ".npz":
-        existing = rlds.metadata(file)["options"]  # raises unless it is a dataset
-        if existing == recipe and not options.overwrite:
-            return True
-    elif partial.exists() and _is_complete(rlds.metadata(partial), recipe):
-        return False  # `_save` may have been killed before it deleted the shards: repeat it
-    _refuse_existing(options, file)
-    return False
-
-
-def _is_complete(metadata: Mapping[str, Any], recipe: Mapping[str, Any]) -> bool:
-    """Return whether shards with this metadata hold all episodes of a recipe."""
-    return metadata["options"] == recipe and sum(metadata["parts"]) == recipe["num_episodes"]
+    if rlds.metadata(file)["options"] != recipes.recipe(options, env):  # raises for other folders
+        _refuse_existing(file)
+    return True
 
 
 def _collect_concurrently(
@@ -178,34 +160,11 @@ def _collect(options: argparse.Namespace, env: envs.Env, out: Path, report: Repo
         report(writer.num_episodes, options.num_episodes)
     writer.complete()
     size = sum(file.stat().st_size for file in writer.folder.iterdir())
-    if out.suffix == ".npz":
-        _save(options, writer.folder, out)
-        size = out.stat().st_size
-    else:
-        writing.replace_folder(writer.folder, out, rlds.metadata)  # raises unless it is a dataset
+    writing.rename(writer.folder, out)
     return (
         f"{writer.num_episodes} of {writer.attempted} attempted episodes, "
         f"{writer.metadata['steps']} steps, {size / 1e6:.0f} MB"
     )
-
-
-def _save(options: argparse.Namespace, folder: Path, out: Path) -> None:
-    """Convert a dataset to an .npz file and delete the dataset; safe to repeat if killed.
-
-    Raises:
-        ValueError: another file exists and must not be replaced.
-    """
-    episodes = rlds.read(folder)
-    if options.overwrite or not (out.exists() and _are_same(episodes, Episodes.load(out))):
-        _refuse_existing(options, out)
-        episodes.save(out)
-    shutil.rmtree(folder)
-
-
-def _are_same(one: Episodes, other: Episodes) -> bool:
-    trees = [jax.tree.flatten(episodes) for episodes in (one, other)]
-    (leaves, metadata), (other_leaves, other_metadata) = trees
-    return metadata == other_metadata and all(map(np.array_equal, leaves, other_leaves))
 
 
 def _partial(out: Path) -> Path:
@@ -240,7 +199,7 @@ def _views(episode: Episodes) -> np.ndarray:
     return video.side_by_side({k: np.asarray(x[0, :steps]) for k, x in episode.image.items()})
 
 
-def _refuse_existing(options: argparse.Namespace, file: Path) -> None:
+def _refuse_existing(file: Path) -> None:
     check_local(file)
-    if file.exists() and not options.overwrite:
-        raise ValueError(f"{file} already exists: choose another --out or add --overwrite")
+    if file.exists():
+        raise ValueError(f"{file} already exists: choose another --out")

@@ -10,7 +10,7 @@ import errno
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 TEMPORARY_SUFFIX = ".tmp"
@@ -73,27 +73,6 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def replace_folder(new: Path, path: Path, check: Callable[[Path], object]) -> None:
-    """Rename a complete folder to `path`, then delete the folder that it replaces, if any.
-
-    `check` is called with `path` if it exists, and raises if it must not be deleted. If the process
-    is killed, `recover_folder` completes the replacement.
-    """
-    if path.exists():
-        check(path)
-        rename(path, _old(path))
-    rename(new, path)
-    recover_folder(path)
-
-
-def recover_folder(path: Path) -> None:
-    """Finish an interrupted `replace_folder`: keep the new folder if there is one, else the old."""
-    if not path.exists() and _old(path).exists():
-        rename(_old(path), path)
-    elif _old(path).exists():
-        shutil.rmtree(_old(path))
-
-
 def rename(old: Path, new: Path) -> None:
     """Rename a file or folder within a file system, and sync the new name to disk."""
     os.rename(old, new)
@@ -114,7 +93,3 @@ def sync(path: Path) -> None:
             raise
     finally:
         os.close(descriptor)
-
-
-def _old(path: Path) -> Path:
-    return path.with_name(f".{path.name}.old")

@@ -14,7 +14,7 @@ COMMANDS = {
     "train": ("lorasp_jax.cli.train", "adapt a policy to a robot"),
     "study": (
         "lorasp_jax.extras.study.__main__",
-        "run many experiments and test claims about them",
+        "run many experiments",
     ),
     "judge": ("lorasp_jax.extras.judge.__main__", "judge a policy in a Gymnasium environment"),
     "latency": (
@@ -33,10 +33,9 @@ COMMANDS = {
     ),
     "serve": ("lorasp_jax.extras.serving.__main__", "serve a policy to robots over websockets"),
     "export": ("lorasp_jax.extras.serving.export", "export a policy, to run without this package"),
-    "completion": ("lorasp_jax.cli.completion", "print a shell completion script"),
 }
 """Module and help text of each command. A module has `main(arguments, program)`, which returns the
-exit code, and `parser(program)`, which returns its options for shell completion."""
+exit code."""
 INTERRUPTED = 130
 """Exit code after SIGINT (128 + 2, as in shells) or SIGTERM. Repeats the constant of
 `lorasp_jax.base.errors`, whose import takes a second."""

@@ -1,6 +1,5 @@
 """Adapt a policy to a robot: `lorasp-jax train`, or `python train.py` in a checkout."""
 
-import argparse
 import contextlib
 import shlex
 import time
@@ -47,13 +46,6 @@ def main(arguments: Sequence[str], program: str = "python train.py") -> int:
 
     remedy = ": free some memory or disk space and add --resume"
     return run_command(adapt, errors, f"stopped; to resume: {resume}", remedy)
-
-
-def parser(program: str) -> argparse.ArgumentParser:
-    """Return this command's argument parser, with the config fields of the default method."""
-    from lorasp_jax.training import overrides
-
-    return overrides.completion_parser(program)
 
 
 def _execute(command: "Command", console: Console, started: float) -> None:

@@ -9,6 +9,7 @@ from typing import Any, Literal, Self
 import jax.numpy as jnp
 
 from lorasp_jax.models.inputs import OURS, InputConfig
+from lorasp_jax.peft.fields import check_fields
 
 VOCABULARY_SIZE = 320
 """Rows of the embedding table in this project's base models, including reserved tokens."""
@@ -190,8 +191,8 @@ class BackboneConfig:
             "inputs": InputConfig(**{**inputs, "delta": tuple(inputs.get("delta", ()))}),
         }
         config = cls(**{**fields, **nested})
-        fields.check_fields(config)
-        fields.check_fields(config.inputs, "inputs.")
+        check_fields(config)
+        check_fields(config.inputs, "inputs.")
         for name in (config.dtype, config.param_dtype):
             jnp.dtype(name)  # raises TypeError for an unknown dtype
         return config

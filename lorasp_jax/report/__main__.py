@@ -34,7 +34,7 @@ def _write_rank_maps(options: argparse.Namespace, console: Console) -> None:
     from lorasp_jax.report import rank_map
 
     cache.enable()
-    for path in rank_map.write(options.run, options.task, options.gif):
+    for path in rank_map.write(options.run, options.task):
         _print(console, "rank map", path)
 
 
@@ -62,8 +62,6 @@ def rank_map_parser(program: str) -> argparse.ArgumentParser:
     )
     _add_run(parser)
     parser.add_argument("--task", help="film only this task")
-    text = "also write the first film to this file, at most 3 MB"
-    parser.add_argument("--gif", type=Path, metavar="FILE", help=text)
     return parser
 
 

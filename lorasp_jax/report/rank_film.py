@@ -1,6 +1,6 @@
 """Draw an episode with each image patch tinted by its active rank, above the rank of each tower."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import matplotlib as mpl
@@ -18,7 +18,6 @@ _EXTREMES = (1, 99)
 """Percentiles of the patches' ranks at the ends of the color scale."""
 _GRAY = np.array([0.299, 0.587, 0.114])  # luma of ITU-R BT.601
 _SIZE = (6.4, 4.8)  # inches of 100 pixels
-_STYLE: Any = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
 
 
 def tint(images: np.ndarray, ranks: np.ndarray, scale: Normalize) -> np.ndarray:
@@ -39,7 +38,6 @@ def tint(images: np.ndarray, ranks: np.ndarray, scale: Normalize) -> np.ndarray:
     return np.rint(255 * (TINT * color + (1 - TINT) * gray[..., None])).astype(np.uint8)
 
 
-@mpl.rc_context(_STYLE)
 def draw(
     images: Mapping[str, np.ndarray],
     patches: Mapping[str, np.ndarray],
@@ -65,53 +63,36 @@ def draw(
     tinted = {camera: tint(images[camera], patches[camera], scale) for camera in patches}
     figure = Figure(figsize=_SIZE, dpi=100, layout="constrained")
     canvas = FigureCanvasAgg(figure)
-    parts: Any = figure.subfigures(2, 1, height_ratios=(2, 1))
     figure.suptitle(title, fontsize=10)
-    show_images = _cameras(parts[0], tinted, scale)
-    show_time = _curves(parts[1], towers, control_dt)
+    rows = [[*tinted], ["time"] * len(tinted)]
+    axes: Any = figure.subplot_mosaic(rows, height_ratios=(2, 1))  # pyright: ignore[reportArgumentType]
+    shown = {camera: axes[camera].imshow(frames[0]) for camera, frames in tinted.items()}
+    for camera in shown:
+        axes[camera].set_title(f"{camera} camera", fontsize=9)
+        axes[camera].set_axis_off()
+    legend, panels = mpl.cm.ScalarMappable(scale, _COLORMAP), [axes[camera] for camera in shown]
+    bar = figure.colorbar(legend, ax=panels, extend="both", alpha=TINT, fraction=0.05)
+    bar.set_label("active rank of a patch")
+    mark = _curves(axes["time"], towers, control_dt)
     canvas.draw()
     figure.set_layout_engine("none")  # or the axes would move from frame to frame
     frames = []
     for step in range(len(next(iter(tinted.values())))):
-        show_images(step)
-        show_time(step)
+        for camera, image in shown.items():
+            image.set_data(tinted[camera][step])
+        mark.set_xdata([control_dt * step] * 2)
         canvas.draw()
         frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
     return np.stack(frames)
 
 
-def _cameras(figure: Figure, tinted: Mapping[str, np.ndarray], scale: Normalize) -> Callable:
-    """Draw the cameras and the color scale; return a function that shows a step."""
-    panels = figure.subplots(1, len(tinted), squeeze=False)[0]
-    shown = {}
-    for axes, (camera, frames) in zip(panels, tinted.items(), strict=True):
-        shown[camera] = axes.imshow(frames[0])
-        axes.set_title(f"{camera} camera", fontsize=9)
-        axes.set_axis_off()
-    legend = mpl.cm.ScalarMappable(scale, _COLORMAP)
-    bar = figure.colorbar(legend, ax=[*panels], extend="both", alpha=TINT, fraction=0.05)
-    bar.set_label("active rank of a patch")
-
-    def show(step: int) -> None:
-        for camera, image in shown.items():
-            image.set_data(tinted[camera][step])
-
-    return show
-
-
-def _curves(figure: Figure, towers: Mapping[str, np.ndarray], control_dt: float) -> Callable:
-    """Draw the mean active rank of each tower; return a function that marks a step."""
-    axes = figure.subplots()
+def _curves(axes: Any, towers: Mapping[str, np.ndarray], control_dt: float) -> Any:
+    """Draw the mean active rank of each tower; return the line that marks the time."""
     for tower in (name for name in COLORS if name in towers):
         ranks = towers[tower]
         axes.plot(control_dt * np.arange(len(ranks)), ranks, color=COLORS[tower], label=tower)
-    mark = axes.axvline(0, color="black", lw=1)
     axes.set_ylim(0, 1.15 * max(ranks.max() for ranks in towers.values()))
     axes.set_xlabel("time [s]")
     axes.set_ylabel("mean active rank")
     axes.legend(frameon=False, loc="lower right", ncols=len(towers))
-
-    def show(step: int) -> None:
-        mark.set_xdata([control_dt * step] * 2)
-
-    return show
+    return axes.axvline(0, color="black", lw=1)

@@ -2,9 +2,9 @@
 
 import argparse
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, Literal
 
 import jax
 import tyro
@@ -71,18 +71,6 @@ def parse(arguments: Sequence[str], program: str = "python train.py") -> Command
     config = override(config, rest, program)
     _check_simulated(config)
     return Command(config, known.resume, known.dry_run, known.wandb)
-
-
-def completion_parser(program: str) -> argparse.ArgumentParser:
-    """Return a parser for all options, including the default method's, for shell completion."""
-    parser = argparse.ArgumentParser(
-        prog=program, parents=[_option_parser(program)], add_help=False, conflict_handler="resolve"
-    )
-    for name, kind in _fields(Config(name="NAME", scale="cpu", peft=LoRASP())):
-        choices = get_args(kind) if get_origin(kind) is Literal else None
-        parser.add_argument(f"--{name}", choices=choices)
-    parser.add_argument("--help", action="store_true")
-    return parser
 
 
 def _option_parser(program: str = "", method: str = "") -> argparse.ArgumentParser:
@@ -181,16 +169,6 @@ def _with_rank_of(current: peft.Method, name: str) -> peft.Method:
     if hasattr(method, "rank") and hasattr(current, "rank"):
         return dataclasses.replace(method, rank=current.rank)  # type: ignore[call-arg]
     return method
-
-
-def _fields(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield option names and types of all fields."""
-    for field in dataclasses.fields(config):
-        value, name = getattr(config, field.name), prefix + field.name.replace("_", "-")
-        if dataclasses.is_dataclass(value):
-            yield from _fields(value, f"{name}.")
-        else:
-            yield name, field.type
 
 
 def _concrete(config: Config) -> type[Config]:

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from lorasp_jax.extras.study import statistics
-from lorasp_jax.extras.study.claims import Claim, Criterion
 from lorasp_jax.extras.study.statistics import Estimate
 from lorasp_jax.extras.study.study import Results
 from studies.paper import naming, published
+from studies.paper.criteria import Claim, Criterion
 from studies.paper.naming import TOWERS
 
 LESS_IS_NOTHING = "the paper states no amount, so any difference counts that the interval confirms"

@@ -84,7 +84,7 @@ def get_study(scale: str) -> Study:
     cells = tuple(cell for backbone in BACKBONES for cell in _cells(backbone))
     cells += tuple(cell for backbone in BACKBONES for cell in _new_scene(backbone))
     claims = make_claims([cell.name for cell in cells], RANK, BACKBONES)
-    return Study("paper", cells, claims, measure=measure, page=page.blocks)
+    return Study("paper", cells, measure=measure, page=functools.partial(page.blocks, claims))
 
 
 # Cells

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from typing import get_args
 
 from lorasp_jax.extras.study import page
-from lorasp_jax.extras.study.claims import Claim, Criterion, Judged, Outcome, Verdict, is_weak
-from lorasp_jax.extras.study.claims import verdict as verdict_of
 from lorasp_jax.extras.study.page import NONE
 from studies.paper.book import BACKBONES
+from studies.paper.criteria import Claim, Criterion, Judged, Outcome, Verdict, is_weak
+from studies.paper.criteria import verdict as verdict_of
 
 
 def blocks(claims: Sequence[Claim], judged: Judged) -> dict[str, str]:

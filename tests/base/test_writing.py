@@ -1,16 +1,13 @@
 """Atomic writes of files and folders survive a kill and a full disk."""
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
 
 import pytest
 
-from envs.datasets import rlds
 from lorasp_jax.base import writing
-from tests.envs.datasets.test_episodes import make
 
 KILLED = """
 import os, pathlib, signal, sys
@@ -112,43 +109,3 @@ def test_existing_folders_are_refused(tmp_path):
     refused = pytest.raises(ValueError, match="already exists")
     with refused, writing.atomic_folder(tmp_path):
         pass
-
-
-@pytest.fixture
-def path(tmp_path):
-    return tmp_path / "new folder" / "press"
-
-
-def test_only_datasets_are_replaced(tmp_path, path):
-    rlds.write(make(2), path)
-    rlds.write(make(3), tmp_path / "better")
-    (tmp_path / "photos").mkdir()
-    with pytest.raises(ValueError, match="photos"):
-        writing.replace_folder(tmp_path / "better", tmp_path / "photos", rlds.metadata)
-    writing.replace_folder(tmp_path / "better", path, rlds.metadata)
-    assert rlds.read(path).num_episodes == 3
-    assert os.listdir(path.parent) == ["press"]
-
-
-@pytest.mark.parametrize(("owner", "name"), [(os, "rename"), (shutil, "rmtree")])
-def test_a_kill_while_a_folder_is_replaced(tmp_path, monkeypatch, owner, name):
-    path, better = tmp_path / "in" / "press", tmp_path / "better"
-    for folder, content in ((path, "old"), (better, "new")):
-        folder.mkdir(parents=True)
-        (folder / content).touch()
-    function = getattr(owner, name)
-
-    def killed(*arguments):
-        if name == "rmtree" or arguments[0] == better:
-            raise KeyboardInterrupt
-        function(*arguments)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(owner, name, killed)
-        with pytest.raises(KeyboardInterrupt):
-            writing.replace_folder(better, path, lambda _: None)
-    assert len(os.listdir(path.parent)) == (2 if name == "rmtree" else 1)
-    for _ in range(2):  # the second time there is nothing to do
-        writing.recover_folder(path)
-        assert os.listdir(path.parent) == ["press"]
-        assert os.listdir(path) == ["new" if name == "rmtree" else "old"]

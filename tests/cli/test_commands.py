@@ -7,17 +7,11 @@ import sys
 
 import pytest
 
-from lorasp_jax.cli import commands, completion
+from lorasp_jax.cli import commands
 from lorasp_jax.report import __main__ as report
 from tests import ROOT
 from tests.runs import finish
 
-TAB = """
-source "$0"
-COMP_WORDS=("$@") COMP_CWORD=$(($# - 1))
-_shtab_lorasp_jax lorasp-jax "${@: -1}" "${@: -2:1}"
-printf "%s\\n" "${COMPREPLY[@]}"
-"""
 CONSOLE = "from lorasp_jax.cli.commands import main; main()"
 
 
@@ -45,7 +39,6 @@ def test_interrupt_during_imports_prints_nothing(tmp_path, monkeypatch):
 @pytest.mark.parametrize("name", commands.COMMANDS)
 def test_every_command_has_help_under_its_own_name(name, capsys):
     module = importlib.import_module(commands.COMMANDS[name][0])
-    assert module.parser(f"lorasp-jax {name}").prog == f"lorasp-jax {name}"
     with pytest.raises(SystemExit, match="0"):
         module.main(["--help"], f"lorasp-jax {name}")
     printed = capsys.readouterr().out
@@ -80,45 +73,6 @@ def test_a_folder_without_a_run_has_no_report(tmp_path, capsys):
     assert "no run in" in printed
     assert printed.count("\n") == 1
     assert not list(tmp_path.iterdir())
-
-
-@pytest.fixture(scope="module")
-def bash_script(tmp_path_factory):
-    path = tmp_path_factory.mktemp("completion") / "lorasp-jax.bash"
-    path.write_text(console("completion", "bash").stdout)
-    return path
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (["tra"], {"train"}),
-        (["train", "--peft.rou"], {"--peft.router"}),
-        (["train", "--peft.router", "so"], {"softmax"}),
-        (["envs", "col"], {"collect"}),
-        (["envs", "collect", "--num-"], {"--num-envs", "--num-episodes"}),
-        (["data", "convert", "--to", ""], {"cache", "rlds"}),
-        (["report", "run"], {"runs"}),
-        (["train", "--config", "run"], {"runs"}),
-    ],
-)
-def test_bash_completion(words, expected, bash_script, tmp_path):
-    (tmp_path / "runs").mkdir()
-    found = subprocess.run(
-        ["bash", "-c", TAB, bash_script, "lorasp-jax", *words],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert expected <= {line.rstrip("/ ") for line in found.stdout.splitlines()}
-    assert len(found.stdout.splitlines()) < 10
-
-
-@pytest.mark.parametrize("shell", ["zsh", "fish"])
-def test_other_shells(shell, capsys):
-    assert completion.main([shell], "lorasp-jax completion") == 0
-    assert "peft.router" in capsys.readouterr().out
 
 
 def test_a_command_without_its_dependencies_says_how_to_install_them():

@@ -2,7 +2,6 @@
 
 import itertools
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -23,13 +22,6 @@ MOMENTS = {
     "before the next shard": (sys.modules[__name__], "fake_record", 4),
     "when all shards are complete": (rlds.ShardWriter, "complete", 1),
     "before the dataset is in place": (os, "rename", 1),
-}
-
-# More moments, with the name of the output.
-REPLACING = {
-    "between two datasets": (os, "rename", 2, "press"),
-    "before the old dataset is deleted": (shutil, "rmtree", 1, "press"),
-    "before the shards of a file are deleted": (shutil, "rmtree", 1, "press.npz"),
 }
 
 
@@ -68,10 +60,10 @@ def run_child(call):
     return subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, check=False)
 
 
-def collect_and_die(moment, out, options=""):
+def collect_and_die(moment, out):
     """In a child process: collect until killed."""
-    die_at(*(MOMENTS | REPLACING)[moment][:3])
-    command_line.main([*COLLECT.split(), "--out", out, *options.split()], record=fake_record)
+    die_at(*MOMENTS[moment])
+    command_line.main([*COLLECT.split(), "--out", out], record=fake_record)
 
 
 def collect_and_interrupt(out):

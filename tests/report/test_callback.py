@@ -1,4 +1,4 @@
-"""The report is updated during a run, and a table is printed at its end."""
+"""The report is updated during a run."""
 
 import io
 import json
@@ -9,7 +9,7 @@ from rich.console import Console
 
 from lorasp_jax.report import callback
 from lorasp_jax.training.run_folder import write_json
-from tests.report.test_html import folder, without_base  # noqa: F401
+from tests.report.test_html import folder  # noqa: F401
 from tests.runs import RESULTS
 
 
@@ -33,28 +33,6 @@ def test_report_is_updated(run):
     write_json(run.folder / "results.json", RESULTS)
     report.on_end(run)
     assert "75.0 %" in path.read_text()
-    printed = run.console.file.getvalue()
-    rows = [line.strip("│ ").split("│") for line in printed.splitlines()]
-    cells = {row[0].strip(): [cell.strip() for cell in row[1:]] for row in rows}
-    assert cells["press"] == ["3.1 % [0.9, 10.7] of 64", "75.0 % [63.2, 84.0] of 64"]
-    assert cells["flow-matching loss at steps 2 and 5"] == ["0.5000", "0.1250"]
-    assert cells["active rank, mean"][1] == "3.1"
-    assert cells["trainable parameters"][1] == "10 of 1,000"
-    assert cells["time, total"][1] == "7 s"
-    assert "time, other" in cells
-
-
-def test_table_keeps_numbers_on_one_line(folder):  # noqa: F811
-    console = Console(width=80, record=True, file=io.StringIO())
-    console.print(callback.final_table(folder))
-    assert "75.0 % [63.2, 84.0] of 64" in console.export_text()
-
-
-def test_table_without_evaluation_of_the_base(folder):  # noqa: F811
-    without_base(folder)
-    table = callback.final_table(folder)
-    first_row = [next(iter(column.cells)) for column in table.columns]
-    assert first_row == ["press", "", "75.0 % [63.2, 84.0] of 64"]
 
 
 def test_a_stopped_run_has_a_final_report(run):
@@ -83,8 +61,3 @@ def test_errors_of_the_thread_are_raised_at_the_next_report(run, monkeypatch):
     report._submit(run.folder)
     with pytest.raises(ValueError, match="no run in"):
         report._submit(run.folder)
-
-
-def test_no_table_for_an_unfinished_run(run):
-    with pytest.raises(ValueError, match="no finished run in"):
-        callback.final_table(run.folder)

@@ -1,4 +1,4 @@
-"""Each patch gets the rank of its own token, and episodes are those of the evaluation."""
+"""Each patch gets the rank of its own token, and the policy runs at every step."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -18,7 +18,7 @@ from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Offline
 from lorasp_jax.report import rank_episode
-from lorasp_jax.report.rank_episode import RankEpisode, RankRecorder, patch_ranks
+from lorasp_jax.report.rank_episode import RankEpisode, patch_ranks
 from lorasp_jax.training.run_folder import to_json
 from tests.models.random_models import random_backbone
 from tests.runs import CONFIG, make_run
@@ -41,7 +41,7 @@ def measure(policy, images):
     raw = {"image": {name: i[None] for name, i in images.items()}, "state": jnp.zeros((1, 7))}
     inputs = policy.processor.encode(raw, jnp.zeros(1, jnp.int32))
     aux = policy.model.encode_images(inputs)[2]
-    return patch_ranks(aux["vision"], policy), metrics.layer_ranks(aux, jnp.ones(1, bool))
+    return patch_ranks(aux, policy), metrics.layer_ranks(aux, jnp.ones(1, bool))
 
 
 def random_images(seed=0, cameras=("side", "wrist")):
@@ -87,7 +87,7 @@ def test_tokens_after_the_pixel_shuffle_cover_their_patches(name):
     ranks = ranks.reshape(2, -1)
     processor = SimpleNamespace(cameras=())
     policy = SimpleNamespace(model=SimpleNamespace(config=config), processor=processor)
-    maps = patch_ranks({"head": Aux(jnp.asarray(ranks))}, policy)
+    maps = patch_ranks({"vision": {"head": Aux(jnp.asarray(ranks))}}, policy)
     for camera, name in enumerate(config.cameras):
         for token, numbers in enumerate(covered[camera] - camera * side**2):
             assert (np.asarray(maps[name]).ravel()[numbers] == ranks[camera, token]).all()
@@ -120,56 +120,35 @@ def test_the_mean_over_patches_is_the_tower_mean(name, tmp_path):
     assert np.mean([*maps.values()]) == pytest.approx(tower, rel=1e-5)
 
 
-CONFIG_JSON = {
-    "seed": 3,
-    "evaluation": {"episodes": 4, "num_envs": 2, "execute_steps": 3, "denoise_steps": 2},
-}
-
-
-def episode(success):
-    return RankEpisode("press", success, (), {}, {})  # never drawn
-
-
-@pytest.mark.parametrize(
-    ("outcomes", "chosen"), [([0, 1], 1), ([1, 1], 0), ([0, 0], 0)], ids=["second", "first", "none"]
-)
-def test_the_first_success_is_chosen(outcomes, chosen, monkeypatch, policy):
-    episodes, keys = [episode(bool(success)) for success in outcomes], []
-
-    def play(self, env, key, world):
-        keys.append(key)
-        return episodes[world]
-
-    monkeypatch.setattr(RankRecorder, "play", play)
-    env = SimpleNamespace(task=SimpleNamespace(name="press"))
-    assert RankRecorder(policy, CONFIG_JSON).record(env) is episodes[chosen]
-    final = rank_episode.RandomStream.FINAL_EVALUATION.key(3, "press")
-    assert {*map(str, keys)} == {str(jax.random.split(final, 2)[0])}
+def test_the_first_success_is_chosen(monkeypatch):
+    env, config = SimpleNamespace(task=SimpleNamespace(name="press")), {"seed": 3}
+    for outcomes, chosen in (([0, 1, 1], 1), ([1, 1], 0), ([0] * 8, 0)):
+        episodes = [RankEpisode("press", bool(won), (), {}, {}) for won in outcomes]
+        left = iter(episodes)
+        monkeypatch.setattr(rank_episode, "play", lambda *_, left=left: next(left))
+        assert rank_episode.record(None, env, config) is episodes[chosen]
 
 
 @pytest.mark.slow
-def test_the_episode_is_that_of_the_evaluation(tmp_path):
-    """In the same world, with the same noise, whatever the number of worlds."""
-    env = envs.make("press", robot="piper", num_envs=2, image_size=32)
+def test_the_robot_executes_some_actions_of_a_chunk(tmp_path):
+    """With the observations of an episode, the policy gives the ranks and commands of its film."""
+    env = envs.make("press", robot="piper", num_envs=1, image_size=32)
     policy = make_run(tmp_path / "run").policy
     prompts = PromptTable.of(Offline(), env.instructions, policy.model.config, num_joints=6)
     policy = Policy(policy.model, dataclasses.replace(policy.processor, prompts=prompts))
-    key, settings = jax.random.key(5), CONFIG_JSON["evaluation"]
+    policy, key = policy.with_sampler(), jax.random.key(5)
+    settings = {"execute_steps": 3, "denoise_steps": 2}
+    config = {**to_json(CONFIG), "evaluation": settings}
+    found = rank_episode.play(policy, env, config, key)
     rollout = jax.jit(make_rollout(env, execute_steps=3, denoise_steps=2))(policy, key)
-    one = dataclasses.replace(env, num_envs=1)
-    recorder = RankRecorder(policy, {**to_json(CONFIG), "evaluation": settings})
-    for world in range(2):
-        found = recorder.play(one, key, world)
-        steps = int(rollout.steps[world])
-        assert len(found.poses.geom_xpos) == steps
-        assert found.success == rollout.success[world]
-        # A rollout records poses after each step. Rounding errors grow with time.
-        after = rollout.poses.geom_xpos[:25, world]
-        np.testing.assert_allclose(found.poses.geom_xpos[1:26], after, atol=1e-4)
-        assert set(found.patches) == {"side", "wrist"}
-        assert found.patches["side"].shape == (steps, 2, 2)
-        assert set(found.towers) == {"vision", "language", "action"}
-        means = np.mean([*found.patches.values()], axis=(0, 2, 3))
-        np.testing.assert_allclose(means, found.towers["vision"], rtol=1e-5)
-    worlds = [np.asarray(rollout.poses.geom_xpos)[5, world] for world in range(2)]
-    assert np.abs(worlds[0] - worlds[1]).max() > 0.01  # they differ, so the right one was repeated
+    steps = int(rollout.steps[0])
+    assert len(found.poses.geom_xpos) == steps
+    assert found.success == rollout.success[0]
+    # A rollout records poses after each step. Rounding errors grow with time.
+    after = rollout.poses.geom_xpos[:25, 0]
+    np.testing.assert_allclose(found.poses.geom_xpos[1:26], after, atol=1e-4)
+    assert set(found.patches) == {"side", "wrist"}
+    assert found.patches["side"].shape == (steps, 2, 2)
+    assert set(found.towers) == {"vision", "language", "action"}
+    means = np.mean([*found.patches.values()], axis=(0, 2, 3))
+    np.testing.assert_allclose(means, found.towers["vision"], rtol=1e-5)

@@ -5,12 +5,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from envs.scene.ranges import Randomization
 from lorasp_jax.report import __main__ as command
-from lorasp_jax.report import rank_map
-from lorasp_jax.report.rank_episode import RankRecorder
+from lorasp_jax.report import rank_episode, rank_map
+from lorasp_jax.report.rank_episode import RankEpisode
 from lorasp_jax.training import export
 from lorasp_jax.training.run_folder import to_json, write_json
 from tests.runs import CONFIG, RESULTS, finish, make_run
@@ -55,58 +54,33 @@ def test_an_unknown_task(folder, capsys):
     assert f"the tasks of {folder} are press, got 'pres'" in line
 
 
-def test_an_existing_gif_is_kept(folder, capsys):
-    gif = folder / "map.gif"
-    gif.write_text("mine")
-    assert f"{gif} already exists" in refused(capsys, folder, "--gif", gif)
-    assert gif.read_text() == "mine"
-    assert "URL" in refused(capsys, folder, "--gif", "https://host/map.gif")
-
-
 def test_a_run_without_its_policy(folder, capsys):
     assert "contains no policy" in refused(capsys, folder)
 
 
-def test_every_task_gets_a_film_and_the_first_a_gif(folder, capsys, monkeypatch):
-    """With stand-ins for the policy and the drawing."""
+def test_every_task_gets_a_film(folder, capsys, monkeypatch):
+    """With stand-ins for the policy, the episodes and the drawing."""
     task = RESULTS["tasks"]["press"]
     write_json(folder / "results.json", RESULTS | {"tasks": {"press": task, "pour": task}})
     config = dataclasses.replace(CONFIG, image_size=48, control_dt=0.2)
     write_json(folder / "config.json", to_json(config))
     frames = np.random.default_rng(0).integers(0, 255, (3, 16, 32, 3), np.uint8)
-    recorded = []
-    monkeypatch.setattr(rank_map, "load_policy", lambda run: None)
-    read = lambda run: {"metadata": {"robot": "panda"}}  # noqa: E731
-    monkeypatch.setattr(rank_map.native, "read_description", read)
-    recorder = SimpleNamespace(record=recorded.append)
-    monkeypatch.setattr(rank_map, "RankRecorder", lambda policy, config: recorder)
-    monkeypatch.setattr(rank_map, "film", lambda env, episode: frames)
-    gif = folder / "new" / "map.gif"
-    assert command.main(["rank-map", str(folder), "--gif", str(gif)]) == 0
+    recorded, episode = [], RankEpisode("press", True, (), {}, {})
+    policy = SimpleNamespace(with_sampler=lambda: None)
+    monkeypatch.setattr(rank_map, "load_policy", lambda run: policy)
+    monkeypatch.setattr(rank_map, "describe", lambda run: {"robot": "panda"})
+    monkeypatch.setattr(rank_map, "record", lambda _, env, __: recorded.append(env) or episode)
+    monkeypatch.setattr(rank_map, "render_episode", lambda *_: {})
+    monkeypatch.setattr(rank_map.rank_film, "draw", lambda *_, **__: frames)
+    assert command.main(["rank-map", str(folder)]) == 0
     films = [folder / f"rank_map_{task}.mp4" for task in ("press", "pour")]
-    printed = capsys.readouterr().out.splitlines()
-    assert printed == [f"rank map: {path}" for path in (films[0], gif, films[1])]
+    assert capsys.readouterr().out.splitlines() == [f"rank map: {path}" for path in films]
     assert all(path.stat().st_size for path in films)
     made = [(env.task.name, env.robot.name, env.num_envs) for env in recorded]
     assert made == [("press", "panda", 1), ("pour", "panda", 1)]
     assert {(env.image_size, env.control_dt) for env in recorded} == {(48, 0.2)}
-    with Image.open(gif) as image:
-        assert (image.n_frames, image.info["duration"]) == (3, 200)
     assert command.main(["rank-map", str(folder), "--task", "pour"]) == 0  # films are replaced
     assert len(recorded) == 3
-
-
-def test_a_large_gif_drops_frames(tmp_path, monkeypatch):
-    frames = np.random.default_rng(0).integers(0, 255, (12, 40, 40, 3), np.uint8)
-    path = tmp_path / "map.gif"
-    rank_map.write_small_gif(path, frames, 0.1)
-    whole = path.stat().st_size
-    monkeypatch.setattr(rank_map, "MAX_GIF_BYTES", whole // 2)
-    rank_map.write_small_gif(path, frames, 0.1)
-    assert path.stat().st_size <= whole // 2
-    with Image.open(path) as image:
-        assert 3 <= image.n_frames < 12
-        assert image.info["duration"] > 100
 
 
 @pytest.mark.slow
@@ -115,22 +89,16 @@ def test_a_run_is_filmed(folder, monkeypatch):
     run = make_run(folder)
     run.policy = with_random_adapters(run.policy)
     export.write(run)
-    settings = dataclasses.replace(CONFIG.evaluation, episodes=2, num_envs=2, denoise_steps=1)
+    settings = dataclasses.replace(CONFIG.evaluation, denoise_steps=1)
     scene = Randomization.typical()
     config = dataclasses.replace(CONFIG, evaluation=settings, scene=scene)
     write_json(folder / "config.json", to_json(config))
     monkeypatch.setattr(rank_map, "load_policy", lambda _: run.policy)
-    films = []
-    film = rank_map.film
-    monkeypatch.setattr(rank_map, "film", lambda *a: films.append(a[1]) or film(*a))
-    tried = []
-    play = RankRecorder.play
-    monkeypatch.setattr(RankRecorder, "play", lambda *a: tried.append(a[-1]) or play(*a))
+    monkeypatch.setattr(rank_episode, "RECORDED_WORLDS", 1)
+    draws, render = [], rank_map.render_episode
+    monkeypatch.setattr(rank_map, "render_episode", lambda *a: draws.append(a[2]) or render(*a))
     prompts = run.policy.processor.prompts
     monkeypatch.setattr(type(prompts), "rows", lambda _, texts: np.zeros(len(texts), np.int32))
-    gif = folder / "map.gif"
-    assert [*rank_map.write(folder, "press", gif)] == [folder / "rank_map_press.mp4", gif]
-    assert tried == [0, 1]  # random adapters never succeed
-    assert scene.size[0] <= films[0].draw.size <= scene.size[1]
-    assert films[0].draw.size != 1
-    assert gif.stat().st_size <= rank_map.MAX_GIF_BYTES
+    assert [*rank_map.write(folder, "press")] == [folder / "rank_map_press.mp4"]
+    assert scene.size[0] <= draws[0].size <= scene.size[1]
+    assert draws[0].size != 1

@@ -1,6 +1,7 @@
 """Compare or save the deployment variants of a run (`lorasp-jax deploy --help`)."""
 
 import argparse
+import functools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -53,7 +54,8 @@ def _run(options: argparse.Namespace) -> None:
     cells = measurement.cells(options.run, options.episodes)
     study = Study("deployment", cells, measure=measurement.measure)
     names = chosen if options.variants else variants.VARIANTS
-    results = run_here(study, options.run / study.name, names, Console(stderr=True))
+    say = functools.partial(print, file=sys.stderr)
+    results = run_here(study, options.run / study.name, names, say)
     print(measurement.table(results), end="")
 
 

@@ -1,4 +1,4 @@
-"""Studies: many runs as one experiment, with scheduling, statistics and claims."""
+"""Studies: many runs as one experiment, with scheduling and statistics."""
 
 from lorasp_jax.extras.study.study import Cell, Derived, Study
 

@@ -9,13 +9,12 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 
 from lorasp_jax.base.arguments import positive
 from lorasp_jax.base.errors import REFUSED, parse_arguments, run_command
 from lorasp_jax.extras.study import page, progress, results
 from lorasp_jax.extras.study.progress import BROKEN, CellState, Status
-from lorasp_jax.extras.study.study import Derived, Study, select
+from lorasp_jax.extras.study.study import Study, select
 
 SCALES = ("smoke", "accelerator")
 _SHARED_MEMORY = 0.9
@@ -64,11 +63,12 @@ def _execute(options: argparse.Namespace, console: Console) -> int:
     folder, names = options.out / study.name, select(study, options.only, options.shard)
     if options.dry_run:
         statuses = progress.read(study, folder)
-        console.print(_table(study, names, statuses))
+        for name in names:
+            _print(console, f"{name}: {statuses[name].state} {statuses[name].reason}")
         _print(console, _totals(study, names, statuses))
         return 0
     if not options.no_run:
-        _run(options, study, folder, names, console)
+        _run(options, study, folder, names)
     statuses = progress.read(study, folder)
     # Only after a run is it news that a cell still waits.
     reported = BROKEN if options.no_run else {*BROKEN, CellState.WAITING}
@@ -99,19 +99,6 @@ def _write(study: Study, path: Path, statuses: dict[str, Status], console: Conso
         _print(console, f"written: {readme}")
 
 
-def _table(study: Study, names: Collection[str], statuses: Mapping[str, Status]) -> Table:
-    """Tabulate method, steps and state of the named cells; "?" depends on missing results."""
-    table = Table("cell", "method", "steps", "state", title=f"study {study.name}")
-    for cell in (cell for cell in study.cells if cell.name in names):
-        config, method, steps = statuses[cell.name].config, "?", "?"
-        if isinstance(cell, Derived):
-            method, steps = f"from {cell.source}", "0"
-        elif config:
-            method, steps = type(config.peft).__name__, f"{config.optim.steps:,}"
-        table.add_row(cell.name, method, steps, str(statuses[cell.name].state))
-    return table
-
-
 def _totals(study: Study, names: Collection[str], statuses: Mapping[str, Status]) -> str:
     """Count the named cells by state on one line."""
     counts = Counter(statuses[name].state for name in names)
@@ -123,19 +110,14 @@ def _print(console: Console, line: str) -> None:
     console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
-def _run(
-    options: argparse.Namespace, study: Study, folder: Path, names: list[str], console: Console
-) -> None:
+def _run(options: argparse.Namespace, study: Study, folder: Path, names: list[str]) -> None:
     """Run cells in worker processes, failed ones once more."""
     for name in names:
         progress.clear_failure(folder / name)
     statuses = progress.read(study, folder)
-    for name in names:
-        if statuses[name].state is CellState.FINISHED:
-            progress.tidy(folder / name)  # the last process may have been killed before it did
     if all(statuses[name].state is not CellState.RUNNABLE for name in names):
         return
-    from lorasp_jax.extras.study.workers import Workers
+    from lorasp_jax.extras.study.workers import run_workers
 
     if options.jobs > 1:  # by default, the first process takes most of the device's memory
         share = f"{_SHARED_MEMORY / options.jobs:.3f}"
@@ -143,7 +125,7 @@ def _run(
     load_study = functools.partial(
         results.load_study, options.config, options.scale, options.results
     )
-    Workers(load_study, folder, names, console).run(options.jobs)
+    run_workers(load_study, folder, names, options.jobs)
 
 
 def _shard(text: str) -> tuple[int, int]:

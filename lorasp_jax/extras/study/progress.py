@@ -168,6 +168,11 @@ def record_failure(folder: Path, reason: str, details: str) -> None:
     write_text(folder / FAILED_FILE, f"{reason}\n\n{details}")
 
 
+def has_ended(folder: Path) -> bool:
+    """Say whether a cell is finished or has failed."""
+    return (folder / CELL_FILE).exists() or (folder / FAILED_FILE).exists()
+
+
 def clear_failure(folder: Path) -> None:
     """Remove failed.txt, so that the cell can run again."""
     for path in (folder / FAILED_FILE, *folder.glob(f".{FAILED_FILE}.*{TEMPORARY_SUFFIX}")):

@@ -5,12 +5,11 @@ killed. What is finished stands in the cells' folders, so that workers need not 
 and a killed one loses at most the steps since its last checkpoint.
 """
 
-import collections
 import contextlib
 import functools
 import time
 import traceback
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ import filelock
 from lorasp_jax.base.locks import acquire
 from lorasp_jax.config import Config
 from lorasp_jax.extras.study import progress
-from lorasp_jax.extras.study.progress import CellState, Status
+from lorasp_jax.extras.study.progress import CellState
 from lorasp_jax.extras.study.study import Cell, Derived, Measure, Results, Study
 from lorasp_jax.training.run_folder import write_json
 
@@ -54,8 +53,8 @@ class Job:
 
 RunCell = Callable[[Job], dict[str, Any]]
 """Runs a cell, resuming it if it was interrupted; returns cell.json without the config."""
-Report = Callable[[str, str], None]
-"""Called with "start", "end" or "fail" and the name of a cell."""
+Say = Callable[[str], None]
+"""Called with a line of text when a cell begins and when it has ended."""
 
 
 def work(
@@ -63,13 +62,15 @@ def work(
     folder: Path,
     names: Collection[str],
     run_cell: RunCell,
-    report: Report = lambda _event, _name: None,
+    say: Say = print,
     poll: float = POLL,
 ) -> None:
-    """Run the named cells until none of them can run.
+    """Run the named cells, in the study's order, until none of them can run.
 
-    While another worker runs one, this one waits: the cell may enable others, or be left behind.
+    After a cell come the others of its group, whose programs are compiled. While another worker
+    runs a cell, this one waits: the cell may enable others, or be left behind.
     """
+    group_of = {cell.name: group for group, cells in study.groups.items() for cell in cells}
     last = ""
     while True:
         statuses = progress.read(study, folder)
@@ -80,36 +81,16 @@ def work(
         ]
         if not runnable:
             return
-        run = functools.partial(_run_claimed, study, folder, run_cell, report)
+        runnable.sort(key=lambda name: group_of[name] != group_of.get(last))
+        run = functools.partial(_run_claimed, study, folder, run_cell, say)
         # The best cell that is free; then look again, because it may have enabled better ones.
-        ran = next((name for name in _by_urgency(study, statuses, runnable, last) if run(name)), "")
+        ran = next((name for name in runnable if run(name)), "")
         if not ran:
             time.sleep(poll)
         last = ran or last
 
 
-def _by_urgency(
-    study: Study, statuses: Mapping[str, Status], names: Sequence[str], last: str
-) -> list[str]:
-    """Sort cells in the order in which a worker that has run the cell `last` should run them.
-
-    First come those that most cells wait for, then those of the last cell's group, whose programs
-    are compiled, then the first of each other group, since other workers may go on with the rest.
-    """
-    waiting = [c for c in study.cells if statuses[c.name].state is CellState.WAITING]
-    dependents = collections.Counter(need for cell in waiting for need in cell.needs)
-    group_of = {c.name: group for group, cells in study.groups.items() for c in cells}
-    before = collections.Counter[str]()  # runnable cells of a group before this one
-
-    def urgency(name: str) -> tuple[int, bool, int]:
-        group = group_of[name]
-        before[group] += 1
-        return -dependents[name], group != group_of.get(last), before[group]
-
-    return sorted(names, key=urgency)
-
-
-def _run_claimed(study: Study, folder: Path, run_cell: RunCell, report: Report, name: str) -> bool:
+def _run_claimed(study: Study, folder: Path, run_cell: RunCell, say: Say, name: str) -> bool:
     """Run a cell, after those of `_due`; return False if another worker has claimed one of them."""
     for due in _due(study, folder, study[name]):
         with _claimed(folder, due.name) as claimed:
@@ -124,7 +105,7 @@ def _run_claimed(study: Study, folder: Path, run_cell: RunCell, report: Report, 
             if is_due and config:  # no other worker has run the cell meanwhile
                 results = progress.results_of(due.needs, statuses)
                 measure = study.measure if due.measured else None
-                run_one(Job(due, config, folder, results, measure), run_cell, report)
+                run_one(Job(due, config, folder, results, measure), run_cell, say)
     return True
 
 
@@ -144,9 +125,9 @@ def _is_here(folder: Path, name: str) -> bool:
     return (folder / name / progress.CELL_FILE).exists()
 
 
-def run_one(job: Job, run_cell: RunCell, report: Report) -> None:
+def run_one(job: Job, run_cell: RunCell, say: Say) -> None:
     """Run a cell and write cell.json, or failed.txt if it raises an exception."""
-    report("start", job.cell.name)
+    say(f"running {job.cell.name}")
     try:
         job.folder.mkdir(parents=True, exist_ok=True)
         result = run_cell(job)
@@ -154,10 +135,17 @@ def run_one(job: Job, run_cell: RunCell, report: Report) -> None:
         write_json(job.folder / progress.CELL_FILE, {"config": settings, **result})
     except Exception as error:
         progress.record_failure(job.folder, progress.one_line(error), traceback.format_exc())
-        report("fail", job.cell.name)
+        say(f"{job.cell.name}: failed: {progress.one_line(error)}")
     else:
         progress.tidy(job.folder)
-        report("end", job.cell.name)
+        say(_summary(job.cell.name, result))
+
+
+def _summary(name: str, result: dict[str, Any]) -> str:
+    """Return the success of a cell by task, on one line."""
+    outcomes = result["outcomes"].items()
+    rates = (f"{task} {text.count('1') / len(text):.1%}" for task, text in outcomes)
+    return f"{name}: {', '.join(rates)} in {result['seconds']['total']:.0f} s"
 
 
 @contextlib.contextmanager

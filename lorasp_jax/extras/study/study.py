@@ -1,4 +1,4 @@
-"""A study: named cells, most of which are training runs, and the claims that they test."""
+"""A study: named cells, most of which are training runs."""
 
 import fnmatch
 import re
@@ -97,12 +97,11 @@ class Derived:
 
 @dataclass(frozen=True)
 class Study:
-    """A list of cells, and what they are to show.
+    """A list of cells.
 
     Attributes:
         name: the study's folder in the folder of all runs.
         cells: every cell; each comes after those that it needs.
-        claims: the claims to test, decided before the cells run (see `study.claims`).
         finished: results that the study starts from; these cells run only if a derived cell needs
             their policies.
         measure: measures the policies of cells further.
@@ -112,7 +111,6 @@ class Study:
 
     name: str
     cells: tuple[Cell | Derived, ...]
-    claims: tuple[Any, ...] = ()
     finished: Results = field(default_factory=dict)
     measure: Measure | None = None
     page: Callable[["Study", Results, Path], dict[str, str]] | None = None

@@ -3,14 +3,10 @@
 from pathlib import Path
 from typing import Any
 
-from flax import nnx
 from rich.console import Console
-from rich.table import Table
 
-from lorasp_jax.adapters import adaptation
 from lorasp_jax.base import hub
 from lorasp_jax.config import Config
-from lorasp_jax.dense import AdaptedLayer
 from lorasp_jax.training import early, setup
 from lorasp_jax.training.base import base_model
 from lorasp_jax.training.cost import preflight
@@ -33,7 +29,6 @@ def dry_run(
     if names := [name for name in remote if hub.is_remote(name)]:
         console.print(f"not downloaded for a dry run: {', '.join(names)}", soft_wrap=True)
     console.print(setup.headline(config, built.model))
-    console.print(_parameter_table(built.model))
     run = Run(config, folder, console, built.base_hash)
     held, batches = early.data_shapes(run, built)
     compiled = early.compile_steps(run, built, batches)
@@ -48,22 +43,6 @@ def dry_run(
         f"all {config.optim.steps} steps: {step_flops * config.optim.steps / 1e15:.4g} PFLOP"
     )
     console.print("dry run: nothing was collected, trained or written")
-
-
-def _parameter_table(model: nnx.Module) -> Table:
-    """Tabulate parameter counts per tower; layers outside the towers count as projections."""
-    counts: dict[str, adaptation.Counts] = {}
-    for name, child in vars(model).items():
-        if isinstance(child, nnx.Module):
-            part = "projections" if isinstance(child, AdaptedLayer) else name
-            pair = adaptation.count(child), counts.get(part, adaptation.Counts(0, 0))
-            counts[part] = adaptation.Counts(*map(sum, zip(*pair, strict=True)))
-    table = Table("part")
-    for column in ("parameters", "trainable", "share"):
-        table.add_column(column, justify="right")
-    for part, (trainable, total) in (counts | {"all": adaptation.count(model)}).items():
-        table.add_row(part, f"{total:,}", f"{trainable:,}", f"{trainable / max(total, 1):.2%}")
-    return table
 
 
 def _planned(held: int, analysis: Any) -> str:

@@ -8,7 +8,6 @@ dry run prints what XLA plans beside it.
 
 import dataclasses
 import functools
-import math
 import os
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -33,7 +32,6 @@ HEADROOM = 1.05
 """Factor on the total to cover temporaries, the executable and fragmentation."""
 REMATS: tuple[Remat, ...] = ("none", "products", "narrow", "full")
 GIB, MIB = 2**30, 2**20
-_FRACTION = "XLA_PYTHON_CLIENT_MEM_FRACTION"
 
 
 def byte_unit(size: float) -> tuple[int, str]:
@@ -78,7 +76,7 @@ def choose_remat(
     """Return the least rematerialization that fits in `available` device bytes, and its estimate.
 
     Raises:
-        ValueError: none fits; the message suggests changes.
+        ValueError: none fits.
     """
     remat = config.model.remat
     memory: dict[Remat, Memory] = {}
@@ -87,29 +85,10 @@ def choose_remat(
         if memory[choice].peak <= available:
             return choice, memory[choice]
     least = min(memory, key=lambda choice: memory[choice].peak)
-    raise ValueError(_out_of_memory_message(config, memory[least], least, available))
-
-
-def _out_of_memory_message(config: Config, memory: Memory, remat: Remat, available: float) -> str:
-    """Suggest settings that need less memory."""
-    grows = memory.activations + memory.recomputation
-    batch, fixed = config.optim.batch_size, memory.peak - HEADROOM * grows
-    fitting = math.floor(batch * (available - fixed) / (memory.peak - fixed))
-    fitting -= fitting % (jax.device_count() * config.optim.accumulate)
-    hints = [f"--optim.batch-size {fitting}"] if 0 < fitting < batch else []
-    accumulate = 2 * config.optim.accumulate
-    if batch % (jax.device_count() * accumulate) == 0:
-        hints += [f"--optim.accumulate {accumulate}"]
-    hints += ["--model.remat full"] if remat != "full" else []
-    hints += ["--model.param-dtype bfloat16"] if config.model.param_dtype != "bfloat16" else []
-    if not (config.model.base_dtype or config.peft.trains_base):
-        hints += ["--model.base-dtype float8"]
-    hints += [f"--fsdp {2 * config.fsdp} on {2 * config.fsdp} or more devices"]
-    if jax.default_backend() == "gpu" and _FRACTION not in os.environ:
-        hints += [f"{_FRACTION}=0.95, because JAX leaves a quarter of the GPU's memory to others"]
-    return (
-        f"this run needs about {memory.peak / GIB:.1f} GiB per device, but only "
-        f"{available / GIB:.1f} GiB are available ({memory}); try {', '.join(hints)}"
+    raise ValueError(
+        f"this run needs about {memory[least].peak / GIB:.1f} GiB per device, but only "
+        f"{available / GIB:.1f} GiB are available ({memory[least]}): lower --optim.batch-size, or "
+        "see what saves memory in docs/launch.md"
     )
 
 

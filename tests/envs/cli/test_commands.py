@@ -12,12 +12,11 @@ from PIL import Image
 import envs
 from envs import __main__ as command_line
 from envs.datasets import rlds
-from envs.datasets.episodes import Episodes
 from envs.experts import collection
 from lorasp_jax.base import locks, writing
 from tests.cases import mostly_slow
 from tests.envs import user_arm
-from tests.envs.children import COLLECT, MOMENTS, REPLACING, fake_record, run_child
+from tests.envs.children import COLLECT, MOMENTS, fake_record, run_child
 from tests.envs.datasets.test_episodes import assert_equal, make
 from tests.envs.datasets.test_rlds import trimmed
 
@@ -49,13 +48,13 @@ def run(capsys, monkeypatch):
 
 def test_bad_input_is_one_sentence(tmp_path, run, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    existing, photos = tmp_path / "episodes.npz", tmp_path / "photos"
+    existing, photos = tmp_path / "movie.mp4", tmp_path / "photos"
     existing.write_text("precious")
     photos.mkdir()
     press = "--task press --robot piper --out"
     for text, out, message in (
-        (f"collect {press}", existing, "already exists"),
-        (f"collect --overwrite {press}", photos, "photos"),
+        (f"play {press}", existing, "already exists"),
+        (f"collect {press}", photos, "photos"),
         (f"collect --num-episodes 0 {press}", tmp_path / "new", "num_episodes"),
         (f"collect --num-envs 0 {press}", tmp_path / "new", "num_envs"),
         (f"collect --randomize --control-dt 0.02 {press}", tmp_path / "new", "latency"),
@@ -63,7 +62,6 @@ def test_bad_input_is_one_sentence(tmp_path, run, monkeypatch):
         (f"collect --actions voltage {press}", tmp_path / "new", "joint, delta_joint, end_eff"),
         (f"collect --distractors 5 {press}", tmp_path / "new", "distractors"),
         ("collect --task press dance --robot piper --out", tmp_path / "new", "dance"),
-        ("collect --task all --robot piper --out", tmp_path / "e.npz", "one task"),
         (f"play --image-size 33 {press}", tmp_path / "a.mp4", "must be even, got 33"),
         ("play --task dance --robot piper --out", tmp_path / "a.mp4", "dance"),
         ("gallery --task press --robot r2d2 --out", tmp_path / "g", "r2d2"),
@@ -76,7 +74,7 @@ def test_bad_input_is_one_sentence(tmp_path, run, monkeypatch):
         assert message in output
         assert "Traceback" not in output
     assert existing.read_text() == "precious"
-    assert sorted(os.listdir(tmp_path)) == ["episodes.npz", "photos"]
+    assert sorted(os.listdir(tmp_path)) == ["movie.mp4", "photos"]
 
 
 def test_play_and_gallery_write_files(tmp_path, run, monkeypatch):
@@ -122,13 +120,10 @@ def test_collect_writes_the_episodes_of_the_library(tmp_path, run):
     )
 
 
-def test_collect_writes_a_file_or_several_datasets(tmp_path, run):
-    assert run(COLLECT, "--out", tmp_path / "press.npz")[0] == 0
+def test_collect_writes_several_datasets(tmp_path, run):
     code, output = run(COLLECT.replace("press", "pour press"), "--out", tmp_path / "many")
     assert code == 0, output
-    assert sorted(os.listdir(tmp_path)) == ["many", "press.npz"]
     assert sorted(os.listdir(tmp_path / "many")) == ["pour", "press"]
-    assert_equal(Episodes.load(tmp_path / "press.npz"), rlds.read(tmp_path / "many" / "press"))
     assert rlds.read(tmp_path / "many" / "pour").task == "pour"
 
 
@@ -181,7 +176,7 @@ def test_interrupted_before_the_first_shard(tmp_path, run, monkeypatch):
 def test_several_tasks_resume(tmp_path, run, monkeypatch):
     text, out = COLLECT.replace("press", "all"), tmp_path / "many"
     with monkeypatch.context() as patch:
-        patch.setattr(writing, "replace_folder", stopping(writing.replace_folder, 2))
+        patch.setattr(writing, "rename", stopping(writing.rename, 2))
         code, output = run(text, "--out", out)
     assert code == 130
     done, rest = ([f for f in out.iterdir() if (f.suffix == ".partial") == p] for p in (0, 1))
@@ -198,7 +193,7 @@ def test_several_tasks_resume(tmp_path, run, monkeypatch):
     assert_equal(rlds.read(tmp_path / "press"), rlds.read(out / "press"))
     code, output = run(text, "--out", out, "--seed", 1)
     assert code == 2
-    assert "open_pot already exists: choose another --out or add --overwrite" in output
+    assert "open_pot already exists: choose another --out" in output
 
 
 def test_one_bad_task_stops_the_others(tmp_path, run):
@@ -219,20 +214,6 @@ def test_ctrl_c_keeps_the_current_shard(tmp_path):
     assert len(rlds.metadata(tmp_path / "press.partial")["parts"]) == 2
     assert b"episodes are in" in child.stderr
     assert b"Traceback" not in child.stderr
-
-
-def test_overwriting_keeps_the_old_until_the_new_is_complete(tmp_path, run, monkeypatch):
-    out = tmp_path / "press"
-    run(COLLECT, "--out", out)
-    before = rlds.read(out)
-    with monkeypatch.context() as patch:
-        patch.setattr(rlds.ShardWriter, "complete", stopping(rlds.ShardWriter.complete, 0))
-        code, output = run(COLLECT, "--out", out, "--seed", 1, "--overwrite")
-    assert (code, "20 of 20 episodes are in" in output) == (130, True)
-    assert_equal(rlds.read(out), before)
-    assert run(COLLECT, "--out", out, "--seed", 1, "--overwrite")[0] == 0
-    assert os.listdir(tmp_path) == ["press"]
-    assert rlds.metadata(out)["options"]["seed"] == 1
 
 
 def test_a_damaged_shard_is_refused(tmp_path, run, monkeypatch):
@@ -273,32 +254,3 @@ def test_a_second_process_is_refused(tmp_path, run):
         assert not out.with_name("press.partial").exists()
     assert run(COLLECT, "--out", out)[0] == 0
     assert os.listdir(tmp_path) == ["press"]
-
-
-@pytest.mark.parametrize("moment", mostly_slow(REPLACING, [*REPLACING][:1]))
-def test_killed_while_the_old_is_replaced(tmp_path, run, moment):
-    out = tmp_path / REPLACING[moment][3]
-    if out.suffix != ".npz":
-        run(COLLECT, "--out", out)
-    text = "" if out.suffix == ".npz" else "--seed 1 --overwrite"
-    child = run_child(f"collect_and_die({moment!r}, {str(out)!r}, {text!r})")
-    assert child.returncode == -signal.SIGKILL, child.stderr
-    assert len(os.listdir(tmp_path)) > 1
-    code, output = run(f"{COLLECT} {text}", "--out", out)
-    assert code == 0, output
-    assert os.listdir(tmp_path) == [out.name]
-    found = Episodes.load(out) if out.suffix == ".npz" else rlds.read(out)
-    assert found.num_episodes == 20
-
-
-def test_an_unrelated_file_survives_complete_shards(tmp_path, run, monkeypatch):
-    out = tmp_path / "press.npz"
-    with monkeypatch.context() as patch:
-        patch.setattr(rlds.ShardWriter, "complete", stopping(rlds.ShardWriter.complete, 0))
-        run(COLLECT, "--out", out)
-    make().save(out)
-    code, output = run(COLLECT, "--out", out)
-    assert (code, "already exists" in output) == (2, True)
-    assert_equal(Episodes.load(out), make())
-    assert run(f"{COLLECT} --overwrite", "--out", out)[0] == 0
-    assert os.listdir(tmp_path) == ["press.npz"]

@@ -16,18 +16,19 @@ from tests.extras.study.fakes import NAMES, ran, study
 FILE = "from tests.extras.study.fakes import study\n\ndef get_study(scale):\n    return study()\n"
 
 
-class InProcess(workers.Workers):
+class InProcess:
     """Run the cells in this process."""
 
     run_cell = staticmethod(fakes.run)
 
-    def run(self, count):
-        runner.work(self._study, self._folder, self._names, self.run_cell)
+    @classmethod
+    def run(cls, load, folder, names, count):
+        runner.work(load(), folder, names, cls.run_cell)
 
 
 @pytest.fixture
 def start(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(workers, "Workers", InProcess)
+    monkeypatch.setattr(workers, "run_workers", InProcess.run)
     (tmp_path / "study.py").write_text(FILE)
 
     def start(*options):
@@ -98,13 +99,12 @@ def test_a_damaged_cell_is_reported(start, folder):
 def test_dry_run(start, folder):
     code, text = start("--dry-run", "--only", "lora/*", "s*")
     assert code == 0
-    assert re.search(r"sp/s0 │ LoRASP │ 2,000 │ runnable", text)
-    assert re.search(r"lora/s0 │ \? │ \? │ waiting", text)
+    assert "sp/s0: runnable" in text
+    assert "lora/s0: waiting for sp/s0" in text
     assert not folder.exists()
     start()
     code, text = start("--dry-run")
-    assert re.search(r"lora/s1 │ LoRA │ 2,000 │ finished", text)
-    assert re.search(r"cut/s0 │ from lora/s0 │ 0 │ finished", text)
+    assert "cut/s0: finished" in text
 
 
 @pytest.mark.parametrize(

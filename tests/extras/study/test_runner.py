@@ -110,16 +110,12 @@ def test_workers_share_a_group_that_others_wait_for(folder):
 
 
 def test_a_worker_goes_on_with_the_group_that_it_has_compiled(folder):
-    work(folder, ["sp/s0", "sp/s1"])
-    statuses = progress.read(study(), folder)
-    names = ["lora/s0", "lora/s1", "lr"]
-
-    def order(last):
-        return runner._by_urgency(study(), statuses, names, last)
-
-    # cut/s0 waits for lora/s0; of the rest, a fresh worker prefers what no other may be compiling.
-    assert order("lora/s0") == ["lora/s0", "lora/s1", "lr"]
-    assert order("lr") == order("") == ["lora/s0", "lr", "lora/s1"]
+    first = dataclasses.replace(study(), cells=(study()["lr"], *study().cells[:4]))
+    second = dataclasses.replace(study()["lr"], name="lr2", group="lr")
+    names = ["lr", "sp/s0", "sp/s1", "lr2"]
+    mixed = dataclasses.replace(first, cells=(*first.cells[:3], second))
+    work(folder, names, of=mixed)
+    assert ran(folder) == ["lr", "lr2", "sp/s0", "sp/s1"]
 
 
 def test_workers_run_a_missing_source_once(folder, tmp_path):

@@ -76,11 +76,9 @@ def test_the_printed_memory_is_that_of_the_compiled_program(config, tmp_path, mo
     assert batches * step_bytes < compiled["arguments"] - 0.98 * state
     assert compiled["arguments"] < 1.02 * state + 2 * batches * step_bytes
     assert compiled["peak"] > compiled["arguments"] + compiled["dataset"]
-    rows = [line.replace(",", "").strip("│ ").split() for line in printed.splitlines()]
-    table = {row[0]: [cell for cell in row[1:] if cell != "│"] for row in rows if row}
     model = setup.build(config, tmp_path, abstract=True, load_base=load_base).model
     trained, total = adaptation.count(model)
-    assert [int(number) for number in table["all"][:2]] == [total, trained]
+    assert f"({trained:,} of {total:,})" in printed
     assert "TFLOP" in printed
 
 

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 
-import jax
 import pytest
 
 from lorasp_jax.config import Config, ModelConfig, OptimConfig
@@ -72,42 +71,11 @@ def test_the_least_rematerialization_that_fits_is_chosen(memory):
     assert preflight.choose_remat(full, TINY, memory["none"].peak)[0] == "full"
 
 
-def test_a_run_that_cannot_fit_suggests_a_batch_that_does(memory):
+def test_a_run_that_cannot_fit_is_refused(memory):
     available = (memory["full"].peak + preflight.HEADROOM * memory["full"].base) / 2
-    with pytest.raises(ValueError, match=r"needs about .* try --optim.batch-size") as caught:
+    with pytest.raises(ValueError, match=r"needs about .* GiB .*--optim.batch-size") as caught:
         preflight.choose_remat(CONFIG, TINY, available)
-    assert "--optim.accumulate 2, " in str(caught.value)
-    assert "--fsdp 2" in str(caught.value)
     assert "\n" not in str(caught.value)
-    size = int(str(caught.value).partition("--optim.batch-size ")[2].partition(",")[0])
-    assert size % jax.device_count() == 0
-    smaller = dataclasses.replace(CONFIG, optim=OptimConfig(batch_size=size))
-    assert preflight.choose_remat(smaller, TINY, available)[0] == "full"
-
-
-def test_on_a_gpu_it_suggests_to_use_all_of_the_memory(memory, monkeypatch):
-    name = "XLA_PYTHON_CLIENT_MEM_FRACTION"
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.delenv(name, raising=False)
-    with pytest.raises(ValueError, match=f"{name}=0.95, because JAX leaves a quarter"):
-        preflight.choose_remat(CONFIG, TINY, memory["full"].base)
-    monkeypatch.setenv(name, "0.9")
-    with pytest.raises(ValueError, match="needs about") as caught:
-        preflight.choose_remat(CONFIG, TINY, memory["full"].base)
-    assert name not in str(caught.value)
-
-
-def test_the_suggested_batch_is_a_multiple_of_the_micro_batches(memory, monkeypatch):
-    monkeypatch.setattr(preflight, "estimate_memory", lambda *_: memory["full"])
-    optim = OptimConfig(batch_size=64, accumulate=4)
-    config = dataclasses.replace(CONFIG, optim=optim, model=ModelConfig(remat="full"))
-    grows = memory["full"].activations + memory["full"].recomputation
-    fixed = memory["full"].peak - preflight.HEADROOM * grows
-    with pytest.raises(ValueError, match="needs about") as caught:
-        preflight.choose_remat(config, TINY, 0.75 * memory["full"].peak + 0.25 * fixed)
-    assert f"--optim.batch-size {48 // (4 * jax.device_count()) * 4 * jax.device_count()}," in str(
-        caught.value
-    )
 
 
 def test_a_device_has_memory():

@@ -4,9 +4,9 @@ import dataclasses
 
 import pytest
 
-from lorasp_jax.extras.study import claims
-from lorasp_jax.extras.study.claims import Criterion, Outcome, judge, verdict
 from lorasp_jax.extras.study.statistics import Estimate
+from studies.paper import criteria
+from studies.paper.criteria import Criterion, Outcome, judge, verdict
 
 
 def criterion(side, bound):
@@ -68,4 +68,4 @@ def test_weak_verdicts_change_with_the_bound(intervals, expected, scale, side):
         test = dataclasses.replace(criterion(side, 0.0), maximum=scale)
         tests.append(test)
         outcomes.append(judge(test, {"cell": (0.0, *interval)}))
-    assert claims.is_weak(tests, outcomes) is expected
+    assert criteria.is_weak(tests, outcomes) is expected
