@@ -28,7 +28,7 @@ class Aux:
       active_rank: f32 [...tokens], number of active directions; None if the method has no rank.
       kept_energy: f32 [...tokens], the active directions' fraction of the score energy: E_k of
         eq. (12) of the LoRA-SP paper. None for methods without an energy gate.
-      losses: fp32 scalars by name, averaged over the valid tokens.
+      losses: f32 [] by name, or [L] for stacked layers, averaged over the valid tokens.
       token_mask: bool [...tokens], True for valid tokens; None if all are valid.
       usage: f32 [R], number of valid tokens that use each direction; None without an energy gate.
       statistics: sums over valid tokens, by layer path; empty except during calibration
