@@ -57,7 +57,9 @@ def masked_mean(values: jax.Array, mask: jax.Array | None) -> jax.Array:
 
 
 def auxiliary_losses(aux: Any) -> dict[str, jax.Array]:
-    """Average each auxiliary loss over the adapted layers that have it: f32 scalars by name.
+    """Average each auxiliary loss, such as eqs. (13) and (14) of LoRA-SP, over adapted layers.
+
+    The means are f32 [], by name, over the layers that have the loss.
 
     Args:
       aux: any tree of `Aux`, such as the result of `collect_aux`. An `Aux` stacked by a scan counts

@@ -33,7 +33,7 @@ class Batches(Protocol):
         ...
 
     def shapes(self, size: int) -> Any:
-        """Return a `RawBatch` of arrays, or of their shapes and shardings, as `take` returns them."""
+        """Return a `RawBatch` like those of `take`, or of their shapes and shardings."""
         ...
 
     def take(self, key: jax.Array, step: int, size: int) -> RawBatch:

@@ -79,8 +79,8 @@ def select(accept: jax.Array, after: Any, before: Any) -> Any:
 def summarize(steps: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the means `[...]` of metrics `[steps, ...]` over the accepted steps, if any.
 
-    The number of skipped steps is added as "skipped". `steps` must include `consecutive_skips` of `Guard`
-    after each step.
+    The number of skipped steps is added as "skipped". `steps` must include the guard's
+    `consecutive_skips` after each step.
     """
     accepted = steps["consecutive_skips"] == 0
     names = [name for name in steps if name != "consecutive_skips"] if accepted.any() else []

@@ -38,8 +38,8 @@ class Frozen(NamedTuple):
 def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) -> Callable:
     """Return the jitted scan over steps: (frozen, batches, state, key) -> state, metrics.
 
-    `frozen` is a `Frozen`, `batches` a `RawBatch`; the batches and the metrics have a leading axis over
-    steps. `shardings` are those of the state, from `meshes.shardings`. If a run calls this
+    `frozen` is a `Frozen`, `batches` a `RawBatch`; the batches and the metrics have a leading axis
+    over steps. `shardings` are those of the state, from `meshes.shardings`. If a run calls this
     again with equal inputs, it gets the same program, which JAX has traced already.
     """
     optim, mesh = run.config.optim, shardings.step.mesh

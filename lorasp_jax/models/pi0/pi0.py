@@ -110,8 +110,8 @@ class Pi0Prefix(NamedTuple):
     """Encoded images and instruction, valid tokens first.
 
     Attributes:
-        cache: keys and values `[L, B, P, K, H]` of the language expert's L layers, for P prefix tokens,
-            K key-value heads and head width H.
+        cache: keys and values `[L, B, P, K, H]` of the language expert's L layers, for P
+            prefix tokens and K key-value heads of width H.
         valid: `[B, P]` bool, False for padding and missing cameras.
         out: `[B, P, D]` output of the language expert.
     """

@@ -27,7 +27,7 @@ def apply_masked_scores(
     """Eq. (11): Σ(x) V x, zero outside the mask, in the dtype of v_x = V x [..., n].
 
     Scores and mask may be wider than n; their trailing entries belong to pruned directions. NaN
-    propagates through the kept energy E_k [..., 1], since the mask of a row with NaN scores is empty.
+    propagates through E_k, the kept energy [..., 1]: a row with NaN scores has an empty mask.
     """
     n, dtype = v_x.shape[-1], v_x.dtype
     if n < scores.shape[-1]:

@@ -32,7 +32,9 @@ class LossSums(NamedTuple):
 def loss_sums(
     scores: jax.Array, logits: jax.Array, mask: jax.Array, kept_energy: jax.Array, valid: jax.Array
 ) -> LossSums:
-    """Sum over T rows: scores and mask [T, R], logits [T, n], kept energy and valid [T, 1].
+    """Sum eqs. (13) and (14) over T rows.
+
+    Scores and mask are [T, R], logits [T, n], kept energy and valid [T, 1].
 
     Rows with all-zero scores are excluded: they carry no signal for the router. NaN propagates.
     """
