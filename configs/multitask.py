@@ -6,7 +6,7 @@
 
 Collects PiPER demonstrations with the scripted expert, evaluates the base that was pretrained on a
 simulated Franka Panda (assets/), trains adapters jointly on the paper's four tasks, evaluates again
-and writes runs/multitask/report.html. Expected results and times are in the README. Scale cpu
+and writes runs/multitask/report.html. Expected results and times are in docs/train.md. Scale cpu
 trains only two tasks; pass `--tasks open_pot pour press pick_place` for all four.
 """
 

@@ -35,7 +35,7 @@ class ModelConfig:
     """Backbone and base weights."""
 
     backbone: str = "pi0"
-    """pi0 or smolvla."""
+    """A folder of `lorasp_jax/models`, such as pi0 or smolvla."""
     size: str = "nano"
     """nano for a CPU, small for one accelerator, base for the published size; pi0 also has
     nano_pi05 and base_pi05."""

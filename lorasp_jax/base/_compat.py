@@ -1,4 +1,4 @@
-"""JAX's private names that this package needs; no other module of `envs` imports them.
+"""Private JAX APIs that this package needs; no other module of it imports any.
 
 All exist in JAX 0.10.2, 0.11.2 and 0.12.0.1.
 """

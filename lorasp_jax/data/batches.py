@@ -57,7 +57,7 @@ class Steps:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Raw:
+class RawBatch:
     """A batch before normalization: the observations at B steps and the actions that follow.
 
     Attributes:
@@ -132,10 +132,10 @@ def windows(steps: Steps, start: Array, chunk: int) -> tuple[Array, Array]:
     return xp.minimum(window, last), window <= last
 
 
-def gather(steps: Steps, start: Array, chunk: int) -> Raw:
+def gather(steps: Steps, start: Array, chunk: int) -> RawBatch:
     """Gather the windows that start at steps `start`, `[B]`; see `windows`."""
     window, inside = windows(steps, start, chunk)
-    return Raw(
+    return RawBatch(
         image={name: image[start] for name, image in steps.image.items()},
         state=steps.state[start],
         actions=steps.action[window],
@@ -144,13 +144,13 @@ def gather(steps: Steps, start: Array, chunk: int) -> Raw:
     )
 
 
-def draw(key: jax.Array, steps: Steps, *, batch_size: int, chunk: int) -> Raw:
+def draw(key: jax.Array, steps: Steps, *, batch_size: int, chunk: int) -> RawBatch:
     """Gather `batch_size` windows that start at uniformly random steps."""
     start = jax.random.randint(key, (batch_size,), 0, steps.end.shape[0])
     return gather(steps, start, chunk)
 
 
-def encode(key: jax.Array, raw: Raw, processor: Processor, *, state_noise: float) -> Batch:
+def encode(key: jax.Array, raw: RawBatch, processor: Processor, *, state_noise: float) -> Batch:
     """Normalize a batch for the model; `key` seeds the noise added to the normalized state."""
     batch: Any = jax.tree.map(jnp.asarray, raw)
     observed: RawObservation = {"image": batch.image, "state": batch.state}

@@ -11,14 +11,14 @@ from typing import Any
 import grain
 import numpy as np
 
-from lorasp_jax.data.batches import Raw, Steps, gather
+from lorasp_jax.data.batches import RawBatch, Steps, gather
 
 _THREADS = 1  # a second thread would only wait for the GIL
 _PREFETCH = 4  # batches
 
 
 class Stream:
-    """An endless iterator of `Raw` batches in host memory.
+    """An endless iterator of `RawBatch` batches in host memory.
 
     Attributes:
         position: index of the next batch, counted from the start of training.
@@ -56,7 +56,7 @@ class Stream:
         share = batch_size // count
         rows = slice(index * share, (index + 1) * share)
 
-        def read(start: np.ndarray) -> Raw:
+        def read(start: np.ndarray) -> RawBatch:
             return gather(steps, start[rows], chunk)
 
         order: Any = grain.MapDataset.range(len(steps.end)).seed(seed).shuffle().repeat()
@@ -68,7 +68,7 @@ class Stream:
     def __iter__(self) -> "Stream":
         return self
 
-    def __next__(self) -> Raw:
+    def __next__(self) -> RawBatch:
         """Return the batch at `position` and advance."""
         raw = next(self._iterator)
         self.position += 1

@@ -28,7 +28,7 @@ class Aux:
       active_rank: f32 [...tokens], number of active directions; None if the method has no rank.
       kept_energy: f32 [...tokens], the active directions' fraction of the score energy: E_k of
         eq. (12) of the LoRA-SP paper. None for methods without an energy gate.
-      losses: fp32 scalars by name, averaged over the valid tokens.
+      losses: f32 [] by name, or [L] for stacked layers, averaged over the valid tokens.
       token_mask: bool [...tokens], True for valid tokens; None if all are valid.
       usage: f32 [R], number of valid tokens that use each direction; None without an energy gate.
       statistics: sums over valid tokens, by layer path; empty except during calibration
@@ -57,7 +57,9 @@ def masked_mean(values: jax.Array, mask: jax.Array | None) -> jax.Array:
 
 
 def auxiliary_losses(aux: Any) -> dict[str, jax.Array]:
-    """Average each auxiliary loss over the adapted layers that have it: f32 scalars by name.
+    """Average each auxiliary loss, such as eqs. (13) and (14) of LoRA-SP, over adapted layers.
+
+    The means are f32 [], by name, over the layers that have the loss.
 
     Args:
       aux: any tree of `Aux`, such as the result of `collect_aux`. An `Aux` stacked by a scan counts

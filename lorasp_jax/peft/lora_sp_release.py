@@ -81,10 +81,10 @@ class LoRASPRelease(BankMethod):
         # Scores after the first R belong to directions that `lorasp_jax.prune` removed.
         mask &= jnp.arange(mask.shape[-1]) < self.rank
         usage = (mask & valid[..., None]).reshape(-1, mask.shape[-1]).astype(jnp.float32).sum(0)
-        energy = kept_energy(scores, mask)
-        z = apply_masked_scores(v_x, self.scale * scores, mask, energy[..., None])
+        e_k = kept_energy(scores, mask)
+        z = apply_masked_scores(v_x, self.scale * scores, mask, e_k[..., None])
         active_rank = mask.astype(jnp.float32).sum(-1)
-        return z, Aux(active_rank, energy, release_losses(scores, mask, valid), usage=usage)
+        return z, Aux(active_rank, e_k, release_losses(scores, mask, valid), usage=usage)
 
 
 def release_scores(router: dict[str, jax.Array], hidden: jax.Array) -> jax.Array:

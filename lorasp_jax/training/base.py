@@ -44,7 +44,7 @@ def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str
         param_dtype=options.param_dtype,
         unroll=model_config.unroll if options.unroll is None else options.unroll,
     )
-    if not model_config.inputs.masks_missing:
+    if not (model_config.inputs.masks_missing or config.data.source):  # see `setup.build`
         cameras = model_config.cameras[: len(envs.Env.cameras)]
         model_config = dataclasses.replace(model_config, cameras=cameras)
     if abstract and (not options.source or hub.is_remote(options.source)):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from envs.datasets.episodes import Episodes
 from lorasp_jax.config import Config
-from lorasp_jax.data.batches import Raw, Steps, draw, fit_to_size, flatten, nbytes
+from lorasp_jax.data.batches import RawBatch, Steps, draw, fit_to_size, flatten, nbytes
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.training.cost.speed import Speed
 from lorasp_jax.training.demonstrations import in_thread
@@ -21,7 +21,7 @@ from lorasp_jax.training.run import Run
 MAX_BYTES = 2**28
 """Largest size of the batches of one call, unless a single batch is larger."""
 
-Collect = Callable[[Config, int], dict[str, Episodes]]
+CollectGeneration = Callable[[Config, int], dict[str, Episodes]]
 """Collects demonstrations per task for generation 1, 2, ... (see `fresh_demonstrations`)."""
 
 
@@ -33,10 +33,10 @@ class Batches(Protocol):
         ...
 
     def shapes(self, size: int) -> Any:
-        """Return a `Raw` of arrays, or of their shapes and shardings, as `take` returns them."""
+        """Return a `RawBatch` like those of `take`, or of their shapes and shardings."""
         ...
 
-    def take(self, key: jax.Array, step: int, size: int) -> Raw:
+    def take(self, key: jax.Array, step: int, size: int) -> RawBatch:
         """Return the batches of `size` steps from `step` on, with a leading axis over steps.
 
         `key` is that of `RandomStream.TRAINING`.
@@ -64,7 +64,7 @@ class DrawnBatches:
         self._sharding = meshes.batches_sharding(mesh)
 
         @functools.partial(jax.jit, static_argnames="size", out_shardings=self._sharding)
-        def draw_batches(steps: Steps, key: jax.Array, first: jax.Array, size: int) -> Raw:
+        def draw_batches(steps: Steps, key: jax.Array, first: jax.Array, size: int) -> RawBatch:
             keys = jax.vmap(lambda step: StepKeys.of(key, step).windows)(first + jnp.arange(size))
             one = functools.partial(draw, batch_size=batch_size, chunk=chunk)
             return jax.vmap(lambda key: one(key, steps))(keys)
@@ -78,7 +78,7 @@ class DrawnBatches:
         return max(size for size in range(1, min(limit, count) + 1) if count % size == 0)
 
     def shapes(self, size: int) -> Any:
-        """Return a `Raw` of shapes and shardings."""
+        """Return a `RawBatch` of shapes and shardings."""
         key = jax.eval_shape(lambda: jax.random.key(0))
         step = jax.ShapeDtypeStruct((), jnp.int32)
         raw = jax.eval_shape(functools.partial(self._draw, size=size), self._steps, key, step)
@@ -86,7 +86,7 @@ class DrawnBatches:
             lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=self._sharding), raw
         )
 
-    def take(self, key: jax.Array, step: int, size: int) -> Raw:
+    def take(self, key: jax.Array, step: int, size: int) -> RawBatch:
         """Draw the batches; see `Batches`."""
         if self._refresh is not None:
             self._steps = self._refresh(self._steps, step, self._running)
@@ -133,7 +133,7 @@ class Refresh:
 class StreamedBatches:
     """Batches that are read from disk, one per call; the next one is already on the device."""
 
-    def __init__(self, batches: Iterator[Raw], speed: Speed) -> None:
+    def __init__(self, batches: Iterator[RawBatch], speed: Speed) -> None:
         """Read the first batch; batches have a leading axis of length 1."""
         self._batches, self._speed = batches, speed
         self._batch = next(batches)
@@ -142,11 +142,11 @@ class StreamedBatches:
         """Return 1."""
         return 1
 
-    def shapes(self, size: int) -> Raw:  # noqa: ARG002
+    def shapes(self, size: int) -> RawBatch:  # noqa: ARG002
         """Return the batch that was read."""
         return self._batch
 
-    def take(self, key: jax.Array, step: int, size: int) -> Raw:  # noqa: ARG002
+    def take(self, key: jax.Array, step: int, size: int) -> RawBatch:  # noqa: ARG002
         """Return the batch that was read; the order of batches is that of the iterator."""
         return self._batch
 
@@ -157,7 +157,7 @@ class StreamedBatches:
 
 
 def make_batches(
-    run: Run, mesh: jax.sharding.Mesh, start: int, collect: Collect, speed: Speed
+    run: Run, mesh: jax.sharding.Mesh, start: int, collect: CollectGeneration, speed: Speed
 ) -> Batches:
     """Return the batches of the run's data from step `start` on.
 
@@ -181,7 +181,7 @@ def make_batches(
     return DrawnBatches(steps, mesh, optim.batch_size, run.policy.model.config.chunk, refresh)
 
 
-def streamed(run: Run, mesh: jax.sharding.Mesh, start: int) -> Iterator[Raw]:
+def streamed(run: Run, mesh: jax.sharding.Mesh, start: int) -> Iterator[RawBatch]:
     """Return the dataset's batches from step `start` on, sharded over the devices.
 
     They have a leading axis of length 1, see `StreamedBatches`.

@@ -12,7 +12,7 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.base.bars import bars
 from lorasp_jax.config import Config, OptimConfig
 from lorasp_jax.policies.policy import Policy
-from lorasp_jax.training.batches import Collect, make_batches
+from lorasp_jax.training.batches import CollectGeneration, make_batches
 from lorasp_jax.training.checkpoint import Checkpoints
 from lorasp_jax.training.cost.speed import Speed
 from lorasp_jax.training.demonstrations import fresh_demonstrations
@@ -37,7 +37,7 @@ def train(
     callbacks: Sequence[Callback] = (),
     *,
     resume: bool = False,
-    collect: Collect = fresh_demonstrations,
+    collect: CollectGeneration = fresh_demonstrations,
 ) -> None:
     """Train the adapters of `run.policy`, then set `run.policy` to the trained policy.
 
@@ -75,7 +75,7 @@ def train(
 
 def _split(
     run: Run,
-) -> tuple[TrainState, Callable[[TrainState], Policy], Callable[[int, Collect], Program]]:
+) -> tuple[TrainState, Callable[[TrainState], Policy], Callable[[int, CollectGeneration], Program]]:
     """Place the run on its devices.
 
     Returns:
@@ -96,7 +96,7 @@ def _split(
     def policy(state: TrainState) -> Policy:
         return Policy(nnx.merge(graphdef, state.eval_adapters, frozen.parameters), processor)
 
-    def make_program(start: int, collect: Collect) -> Program:
+    def make_program(start: int, collect: CollectGeneration) -> Program:
         speed = Speed.of(run.config, run.policy.model.config)
         batches = make_batches(run, mesh, start, collect, speed)
         return Program(jit_steps(run, graphdef, optimizer, shardings), frozen, batches, speed)
@@ -186,8 +186,8 @@ def _failure(
     last checkpoint is at step `saved`.
     """
     remedy = f"nothing after step {saved} was saved: try a lower --optim.learning-rate"
-    if (skipped := rows["in_a_row"].max()) >= optim.max_skipped:
-        last = int(rows["in_a_row"].argmax())
+    if (skipped := rows["consecutive_skips"].max()) >= optim.max_skipped:
+        last = int(rows["consecutive_skips"].argmax())
         spike = f" or above {optim.spike:g} times its running mean" if optim.spike else ""
         return RunError(
             f"{skipped} consecutive steps were skipped because loss or gradient was non-finite"

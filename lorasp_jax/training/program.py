@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from lorasp_jax.base import messages
-from lorasp_jax.data.batches import Raw, encode
+from lorasp_jax.data.batches import RawBatch, encode
 from lorasp_jax.policies.processor import Processor
 from lorasp_jax.training import compilation
 from lorasp_jax.training.batches import Batches
@@ -38,8 +38,8 @@ class Frozen(NamedTuple):
 def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) -> Callable:
     """Return the jitted scan over steps: (frozen, batches, state, key) -> state, metrics.
 
-    `frozen` is a `Frozen`, `batches` a `Raw`; the batches and the metrics have a leading axis over
-    steps. `shardings` are those of the state, from `meshes.shardings`. If a run calls this
+    `frozen` is a `Frozen`, `batches` a `RawBatch`; the batches and the metrics have a leading axis
+    over steps. `shardings` are those of the state, from `meshes.shardings`. If a run calls this
     again with equal inputs, it gets the same program, which JAX has traced already.
     """
     optim, mesh = run.config.optim, shardings.step.mesh
@@ -54,7 +54,7 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
         max_delay=optim.rtc_max_delay,
     )
 
-    def body(state: TrainState, raw: Raw, frozen: Frozen, key: jax.Array) -> Any:
+    def body(state: TrainState, raw: RawBatch, frozen: Frozen, key: jax.Array) -> Any:
         keys = StepKeys.of(key, state.step)
         noise = optim.state_noise
         batch = encode(keys.state_noise, raw, frozen.processor, state_noise=noise)
@@ -68,7 +68,7 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
         out_shardings=(shardings, meshes.replicated(mesh)),
         compiler_options=compilation.step_options(mesh.size),
     )
-    def scan(frozen: Frozen, batches: Raw, state: TrainState, key: jax.Array) -> Any:
+    def scan(frozen: Frozen, batches: RawBatch, state: TrainState, key: jax.Array) -> Any:
         return jax.lax.scan(lambda state, raw: body(state, raw, frozen, key), state, batches)
 
     inputs = optim, run.config.auxiliary, graphdef, *jax.tree.leaves(shardings)

@@ -17,7 +17,7 @@ class RandomStream(enum.IntEnum):
     ADAPTERS = 3
     BASE = 4
     STATISTICS = 5
-    CORRECTION = 6
+    # 6 is retired: a new purpose gets a number that no run has used.
     EVALUATION = 10
     """Evaluations before and during training."""
     FINAL_EVALUATION = 11

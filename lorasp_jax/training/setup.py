@@ -106,6 +106,8 @@ def build(
     chosen = {name: getattr(config.model, name) for name in ("max_tokens", "chunk")}
     base = with_config(base, **{name: value for name, value in chosen.items() if value})
     source = open_dataset(config, base.config, folder) if config.data.source else None
+    if source and not base.config.inputs.masks_missing:
+        base = with_config(base, cameras=base.config.cameras[: len(source.cameras)])
     prompts, joints = _prompts_and_joints(source, environments, tokenizer, base.config)
     _check_sizes(config, base.config.chunk)
     check_delta(base.config.inputs.delta, joints)

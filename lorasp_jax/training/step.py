@@ -84,9 +84,9 @@ def loss_fn(
     graphdef: Any,
     batch: Batch,
     key: jax.Array,
-    weights: Metrics,
+    weights: dict[str, jax.Array],
     *,
-    valid: jax.Array | None = None,
+    num_valid: jax.Array | None = None,
     noise: jax.Array | None = None,
     flow_time: jax.Array | None = None,
     max_delay: int = 0,
@@ -94,15 +94,17 @@ def loss_fn(
     """Return the flow-matching loss plus weighted auxiliary losses (arXiv 2603.07404, eq. 14).
 
     The task loss is the mean over the elements that `batch.action_mask` marks as valid, without
-    given actions (see `flow_matching.draw`); `valid` overrides their number. `key` seeds the
+    given actions (see `flow_matching.draw`); `num_valid` overrides their number. `key` seeds the
     adapters' dropout and the sampling of noise and flow time; `noise` and `flow_time` override the
     samples. The metrics include the unweighted auxiliary losses.
     """
+    # with_dropout clones the model, so the merge needs no copy=True. Both uses of the key are safe:
+    # with_dropout only folds layer paths into it, and flow_matching.draw splits it once.
     model = adaptation.with_dropout(nnx.merge(graphdef, adapters, frozen), key)
     if max_delay and flow_time is None:
         noise, flow_time = flow_matching.draw(key, batch.actions, max_delay)
     mask = _scored(batch, flow_time)
-    valid = jnp.sum(mask) if valid is None else valid
+    num_valid = jnp.sum(mask) if num_valid is None else num_valid
     per_element, aux = model.loss(
         key,
         batch.observation,
@@ -111,7 +113,7 @@ def loss_fn(
         noise=noise,
         flow_time=flow_time,
     )
-    task = jnp.sum(per_element * mask) / jnp.maximum(valid, 1)
+    task = jnp.sum(per_element * mask) / jnp.maximum(num_valid, 1)
     losses = auxiliary_losses(aux) | adaptation.penalties(model)
     total = task + sum(weights[name] * value for name, value in losses.items())
     return total, {"loss": total, "task": task, **losses, **active_ranks(aux)}
@@ -130,7 +132,7 @@ def gradients(
     graphdef: Any,
     batch: Batch,
     key: jax.Array,
-    weights: Metrics,
+    weights: dict[str, jax.Array],
     parts: int = 1,
     max_delay: int = 0,
 ) -> tuple[Any, Metrics]:
@@ -145,11 +147,11 @@ def gradients(
     # Row i goes into micro-batch i % parts, so that no row moves to another device.
     split = lambda x: jnp.swapaxes(x.reshape(-1, parts, *x.shape[1:]), 0, 1)  # noqa: E731
     drawn = flow_matching.draw(key, batch.actions, max_delay)
-    valid = jnp.sum(_scored(batch, drawn[1])) / parts
+    num_valid = jnp.sum(_scored(batch, drawn[1])) / parts
 
     def add(total: Any, part: Any) -> tuple[Any, Metrics]:
         rows, (noise, flow_time), part_key = part
-        overrides = {"valid": valid, "noise": noise, "flow_time": flow_time}
+        overrides = {"num_valid": num_valid, "noise": noise, "flow_time": flow_time}
         grads, metrics = gradient(adapters, frozen, graphdef, rows, part_key, weights, **overrides)
         return jax.tree.map(jnp.add, total, grads), metrics
 
@@ -191,7 +193,7 @@ def train_step(
     metrics |= {
         "grad_norm": grad_norm,
         "update_norm": optax.tree.norm(updates),
-        "in_a_row": guard.in_a_row,
+        "consecutive_skips": guard.consecutive_skips,
     }
     after = TrainState(state.step + 1, adapters, opt_state, guard, average)
     before = dataclasses.replace(state, step=after.step, guard=guard)

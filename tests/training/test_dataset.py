@@ -12,12 +12,14 @@ import pytest
 from rich.console import Console
 
 from lorasp_jax.adapters import adaptation
-from lorasp_jax.config import DataConfig
+from lorasp_jax.config import DataConfig, ModelConfig
 from lorasp_jax.data.batches import flatten
 from lorasp_jax.evaluation.callback import NoEvaluation
 from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.models.smolvla import SmolVLAConfig
 from lorasp_jax.report.html import write_report
 from lorasp_jax.training import setup
+from lorasp_jax.training.base import base_model
 from lorasp_jax.training.batches import StreamedBatches
 from lorasp_jax.training.batches import streamed as read
 from lorasp_jax.training.cost import preflight
@@ -100,8 +102,8 @@ def test_a_streamed_run_on_eight_devices(tmp_path):
         assert found["task"] == pytest.approx(expected["task"], rel=1e-5)
 
 
-def prepare(folder, monkeypatch, source, available=2**40):
-    model = random_backbone(Pi0Config.dummy())
+def prepare(folder, monkeypatch, source, available=2**40, model_config=None):
+    model = random_backbone(model_config or Pi0Config.dummy())
     monkeypatch.setattr(preflight, "available_bytes", lambda: available)
     evaluation = dataclasses.replace(CONFIG.evaluation, execute_steps=1)
     data = DataConfig(source=str(source))
@@ -134,6 +136,26 @@ def test_prepare(tmp_path, monkeypatch):
     (tmp_path / "dataset.json").unlink()
     assert prepare(tmp_path, monkeypatch, "removed, but cached", small // 64).streams
     assert prepare(tmp_path, monkeypatch, "removed, but cached", small).streams  # as at the start
+
+
+def test_published_smolvla_is_trimmed_to_the_cameras_of_the_dataset(tmp_path, monkeypatch):
+    """It has three, and its weights expect no image of a missing one."""
+    options = ModelConfig("smolvla", size="base", checkpoint="")
+    config = dataclasses.replace(CONFIG, model=options, data=DataConfig(source="recorded"))
+    simulated = dataclasses.replace(config, data=DataConfig())
+    whole, two = (base_model(c, abstract=True)[0].config for c in (config, simulated))
+    assert (len(whole.cameras), len(two.cameras)) == (3, 2)
+    dummy = SmolVLAConfig.dummy()
+    inputs = dataclasses.replace(dummy.inputs, masks_missing=False)
+    dummy = dataclasses.replace(dummy, cameras=whole.cameras, inputs=inputs)
+    group = random_episodes("press", 0)
+    for names in (("side",), ("side", "top", "wrist")):
+        images = {name: group.image["side"] for name in names}
+        path = tmp_path / f"{len(names)}.npz"
+        dataclasses.replace(group, image=images).save(path)
+        run = prepare(tmp_path / path.stem, monkeypatch, path, model_config=dummy)
+        slots = zip(whole.cameras, names, strict=False)
+        assert run.policy.processor.cameras == tuple(slots)
 
 
 def test_a_run_without_simulation_has_a_report(tmp_path):

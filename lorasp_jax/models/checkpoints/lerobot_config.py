@@ -55,10 +55,13 @@ def require(fields: Fields, supported: Fields) -> None:
 
 
 def _types() -> dict[str, Callable[[Fields], BackboneConfig]]:
-    types = {}
+    types: dict[str, Callable[[Fields], BackboneConfig]] = {}
     for name in backbone.names():
         package = backbone.find(name).__module__.rpartition(".")[0]
-        types |= importlib.import_module(f"{package}.lerobot").TYPES
+        found = importlib.import_module(f"{package}.lerobot").TYPES
+        if repeated := sorted(types.keys() & found):
+            raise ValueError(f"{package}.lerobot defines {', '.join(repeated)}, as another does")
+        types |= found
     return types
 
 

@@ -110,7 +110,8 @@ class Pi0Prefix(NamedTuple):
     """Encoded images and instruction, valid tokens first.
 
     Attributes:
-        cache: keys and values `[L, B, P, K, H]` of all layers of the language expert.
+        cache: keys and values `[L, B, P, K, H]` of the language expert's L layers, for P
+            prefix tokens and K key-value heads of width H.
         valid: `[B, P]` bool, False for padding and missing cameras.
         out: `[B, P, D]` output of the language expert.
     """

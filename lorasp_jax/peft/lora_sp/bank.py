@@ -22,19 +22,19 @@ def init_bank(v: jax.Array, d_out: int) -> Bank:
 
 
 def apply_masked_scores(
-    v_x: jax.Array, scores: jax.Array, mask: jax.Array, energy: jax.Array
+    v_x: jax.Array, scores: jax.Array, mask: jax.Array, kept_energy: jax.Array
 ) -> jax.Array:
     """Eq. (11): Σ(x) V x, zero outside the mask, in the dtype of v_x = V x [..., n].
 
     Scores and mask may be wider than n; their trailing entries belong to pruned directions. NaN
-    propagates through the energy [..., 1], since the mask of a row with NaN scores is empty.
+    propagates through E_k, the kept energy [..., 1]: a row with NaN scores has an empty mask.
     """
     n, dtype = v_x.shape[-1], v_x.dtype
     if n < scores.shape[-1]:
         scores, mask = scores[..., :n], mask[..., :n]
     limit = min(MAX_Z, float(jnp.finfo(dtype).max))
     product = clip(v_x.astype(jnp.float32) * scores, limit)
-    return jnp.where(mask, product, 0 * jax.lax.stop_gradient(energy)).astype(dtype)
+    return jnp.where(mask, product, 0 * jax.lax.stop_gradient(kept_energy)).astype(dtype)
 
 
 class BankMethod(Method):
@@ -66,7 +66,7 @@ class BankMethod(Method):
         raise NotImplementedError
 
     def down(self, params: Params) -> jax.Array:
-        """[V, W1]."""
+        """P = [V, W1]: one matmul projects x onto the bank and into the router's hidden layer."""
         return jnp.concatenate([params["bank"]["v"], params["router"]["w1"]], axis=1)
 
     def bottleneck_params(self, params: Params) -> Params:

@@ -1,4 +1,4 @@
-"""`LoRASP.bottleneck` as a single GPU kernel, for the default router and gate.
+"""`LoRASP.bottleneck` as a single GPU kernel, for the default router.
 
 Layers with a shared input run in one launch.
 """
@@ -28,7 +28,7 @@ def supported_size(size: int) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class FusedBottleneck(Bottleneck):
-    """`LoRASP.bottleneck` with router "gelu", one mask per token and a constant η."""
+    """`LoRASP.bottleneck` with router "gelu"."""
 
     rank: int
     num_scores: int
@@ -84,8 +84,8 @@ class FusedBottleneck(Bottleneck):
             start=columns.start,
             interpret=self.interpret,
         )
-        active_rank, energy = (column.T.reshape(n, *tokens) for column in statistics)
-        aux = Aux(active_rank, energy, Losses(sums), usage=sums.kept)
+        active_rank, e_k = (column.T.reshape(n, *tokens) for column in statistics)
+        aux = Aux(active_rank, e_k, Losses(sums), usage=sums.active)
         return z.reshape(*tokens, z.shape[-1]), aux
 
 
@@ -127,11 +127,11 @@ def bottleneck_block(
         in_bank = jax.lax.broadcasted_iota(jnp.int32, mask.shape, 1) < v_x.shape[1]
         mask &= in_bank.astype(jnp.int32)
     kept = mask.astype(jnp.float32)
-    energy = kept_energy(scores, kept)[:, None]
+    e_k = kept_energy(scores, kept)[:, None]
     scaled, is_kept = (_first(a, v_x.shape[1]) for a in (scale * scores, kept))
-    z = apply_masked_scores(v_x, scaled, is_kept != 0, energy)
-    sums = loss_sums(scores, logits, kept, energy, valid)
-    return z, sums, mask, [kept.sum(-1, keepdims=True), energy]
+    z = apply_masked_scores(v_x, scaled, is_kept != 0, e_k)
+    sums = loss_sums(scores, logits, kept, e_k, valid)
+    return z, sums, mask, [kept.sum(-1, keepdims=True), e_k]
 
 
 def _matmul(rows: jax.Array, matrix: jax.Array) -> jax.Array:

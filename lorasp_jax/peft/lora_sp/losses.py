@@ -15,7 +15,7 @@ from lorasp_jax.kernels.energy_gate import energy_share
 
 
 class LossSums(NamedTuple):
-    """Sums over valid rows: f32 [1], except `kept` and `share` [R]."""
+    """Sums over valid rows: f32 [1], except `active` and `share` [R]."""
 
     rows: jax.Array
     """Number of valid rows."""
@@ -23,16 +23,18 @@ class LossSums(NamedTuple):
     """1 - E_k."""
     z: jax.Array
     """(logsumexp(logits) - ln n)² for n logits."""
-    kept: jax.Array
+    active: jax.Array
     """1 for each active direction, else 0; no gradient."""
     share: jax.Array
     """Each direction's share of the energy."""
 
 
 def loss_sums(
-    scores: jax.Array, logits: jax.Array, mask: jax.Array, energy: jax.Array, valid: jax.Array
+    scores: jax.Array, logits: jax.Array, mask: jax.Array, kept_energy: jax.Array, valid: jax.Array
 ) -> LossSums:
-    """Sum over T rows: scores and mask [T, R], logits [T, n], kept energy and valid [T, 1].
+    """Sum eqs. (13) and (14) over T rows.
+
+    Scores and mask are [T, R], logits [T, n], kept energy and valid [T, 1].
 
     Rows with all-zero scores are excluded: they carry no signal for the router. NaN propagates.
     """
@@ -43,10 +45,10 @@ def loss_sums(
         return jnp.where(valid, values, 0).sum(0)
 
     return LossSums(
-        rows=total(jnp.ones_like(energy)),
-        spectral=total(1 - energy),
+        rows=total(jnp.ones_like(kept_energy)),
+        spectral=total(1 - kept_energy),
         z=total(jnp.square(log_mean_exp)),
-        kept=total(mask.astype(jnp.float32)),
+        active=total(mask.astype(jnp.float32)),
         share=total(energy_share(scores)),
     )
 
@@ -87,9 +89,9 @@ def balance_loss(sums: LossSums) -> jax.Array:
     token. f_i is direction i's share of all active directions (no gradient), and P_i is its mean
     energy share.
     """
-    kept = jax.lax.stop_gradient(sums.kept)
-    frequency = kept / jnp.maximum(kept.sum(-1, keepdims=True), 1)
-    return kept.shape[-1] * _mean(jnp.sum(frequency * sums.share, -1, keepdims=True), sums)
+    active = jax.lax.stop_gradient(sums.active)
+    frequency = active / jnp.maximum(active.sum(-1, keepdims=True), 1)
+    return active.shape[-1] * _mean(jnp.sum(frequency * sums.share, -1, keepdims=True), sums)
 
 
 @jax.jit

@@ -6,7 +6,8 @@ lines. `LoRASP.bottleneck` computes the same result faster, from these functions
 
     (10) scores       s(x) = router(x) >= 0                           `router.router_scores`
     (12) energy gate  smallest k with E_k(x) >= η                     `energy_gate`
-    (11) update       ΔW(x) = U Σ(x) V                                `bank.apply_masked_scores`
+    (11) update       ΔW(x) x = U Σ(x) V x: first Σ(x) V x            `bank.apply_masked_scores`
+                      then U                                          `low_rank_matmul`
     (13) spectral     L_spec(x) = 1 - E_k(x)                          `losses.spectral_loss`
     (14) router       L_router: balance and z                         `balance_loss`, `z_loss`
 
@@ -25,7 +26,7 @@ from lorasp_jax.peft.auxiliary import Aux
 from lorasp_jax.peft.lora_sp.bank import BankMethod, apply_masked_scores, init_bank
 from lorasp_jax.peft.lora_sp.gpu_kernel import FusedBottleneck
 from lorasp_jax.peft.lora_sp.losses import Losses, loss_sums
-from lorasp_jax.peft.lora_sp.router import Router, init_output_layer, router_scores
+from lorasp_jax.peft.lora_sp.router import RouterKind, init_output_layer, router_scores
 from lorasp_jax.peft.method import Params, kaiming_uniform
 
 
@@ -48,7 +49,7 @@ class LoRASP(BankMethod):
     """α of the scale α/R. None: 2 R."""
     hidden_width: int = 32
     """H, width of the router's hidden layer."""
-    router: Router = "gelu"
+    router: RouterKind = "gelu"
     """"gelu": GELU hidden layer with biases, softplus scores that are initially 1. "gelu_relu": the
     same with ReLU scores. "gelu_softmax": the same with R times the softmax over directions.
     "softmax": softmax hidden layer, no biases, 0/1 matrix as initial second layer (Table I)."""
@@ -91,11 +92,11 @@ class LoRASP(BankMethod):
         mask, _, _ = energy_gate(scores, self.energy_target)
         if scores.shape[-1] > self.rank:  # the others' directions were removed by pruning
             mask &= jnp.arange(scores.shape[-1]) < self.rank
-        energy = kept_energy(scores, mask)[:, None]
-        z = apply_masked_scores(v_x, self.scale * scores, mask, energy)
-        sums = loss_sums(scores, logits, mask, energy, valid.reshape(-1, 1))
+        e_k = kept_energy(scores, mask)[:, None]
+        z = apply_masked_scores(v_x, self.scale * scores, mask, e_k)
+        sums = loss_sums(scores, logits, mask, e_k, valid.reshape(-1, 1))
         active_rank = mask.astype(jnp.float32).sum(-1).reshape(tokens)
-        aux = Aux(active_rank, energy.reshape(tokens), Losses(sums), usage=sums.kept)
+        aux = Aux(active_rank, e_k.reshape(tokens), Losses(sums), usage=sums.active)
         return z.reshape(*tokens, self.rank), aux
 
     def implementation(self, params: Params) -> Bottleneck:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-Router = Literal["gelu", "gelu_relu", "gelu_softmax", "softmax"]
+RouterKind = Literal["gelu", "gelu_relu", "gelu_softmax", "softmax"]
 
 SCORE_INIT_STD = 0.01
 INVERSE_SOFTPLUS_OF_ONE = math.log(math.e - 1)
@@ -26,7 +26,7 @@ _LOG1P = _RATIO.convert(kind=np.polynomial.Polynomial).coef[::-1].tolist()
 
 
 def init_output_layer(
-    key: jax.Array, router: Router, hidden_width: int, rank: int
+    key: jax.Array, router: RouterKind, hidden_width: int, rank: int
 ) -> dict[str, jax.Array]:
     """Initialize the router's second layer w2 [H, R], and its biases b1 [H], b2 [R] if it has any.
 
@@ -46,7 +46,7 @@ def init_output_layer(
 def router_scores(
     router: dict[str, jax.Array],
     hidden: jax.Array,
-    kind: Router,
+    kind: RouterKind,
     matmul: Callable[[jax.Array, jax.Array], jax.Array] = jnp.matmul,
 ) -> tuple[jax.Array, jax.Array]:
     """Eq. (10): h = φ(x W1 + b1), s(x) = ψ(h W2 + b2) with a non-negative ψ.
@@ -54,6 +54,7 @@ def router_scores(
     For "gelu", "gelu_relu" and "gelu_softmax", φ is GELU and ψ is softplus, ReLU or R times the
     softmax over directions. "softmax" has no biases; φ is softmax and ψ is ReLU. With the initial
     0/1 matrix W2, this ReLU has no effect. With a trained W2, it keeps the scores non-negative.
+    The GPU kernel traces this function too, so it uses only operations that Triton supports.
 
     Args:
       router: w2 [H, R], and b1 [H], b2 [R] unless `kind` is "softmax".
