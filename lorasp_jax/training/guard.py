@@ -31,13 +31,13 @@ class Guard:
 
     Attributes:
         counted: `[]` int32, number of accepted steps.
-        consecutive_skips: `[]` int32, number of steps skipped since the last accepted step.
+        in_a_row: `[]` int32, number of steps skipped since the last accepted step.
         loss: `[]` running mean of the loss over accepted steps.
         grad_norm: `[]` running mean of the global gradient norm over accepted steps.
     """
 
     counted: jax.Array
-    consecutive_skips: jax.Array
+    in_a_row: jax.Array
     loss: jax.Array
     grad_norm: jax.Array
 
@@ -63,11 +63,11 @@ def check_step(
     weight = 1 / jnp.minimum(guard.counted + 1, WINDOW)
     accepted = Guard(
         guard.counted + 1,
-        jnp.zeros_like(guard.consecutive_skips),
+        jnp.zeros_like(guard.in_a_row),
         guard.loss + weight * (loss - guard.loss),
         guard.grad_norm + weight * (grad_norm - guard.grad_norm),
     )
-    skipped = Guard(guard.counted, guard.consecutive_skips + 1, guard.loss, guard.grad_norm)
+    skipped = Guard(guard.counted, guard.in_a_row + 1, guard.loss, guard.grad_norm)
     return accept, select(accept, accepted, skipped)
 
 
@@ -80,9 +80,9 @@ def summarize(steps: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the means `[...]` of metrics `[steps, ...]` over the accepted steps, if any.
 
     The number of skipped steps is added as "skipped". `steps` must include the guard's
-    `consecutive_skips` after each step.
+    `in_a_row` after each step.
     """
-    accepted = steps["consecutive_skips"] == 0
-    names = [name for name in steps if name != "consecutive_skips"] if accepted.any() else []
+    accepted = steps["in_a_row"] == 0
+    names = [name for name in steps if name != "in_a_row"] if accepted.any() else []
     means = {name: steps[name][accepted].mean(0) for name in names}
     return {**means, "skipped": np.asarray(np.sum(~accepted))}

@@ -186,8 +186,8 @@ def _failure(
     last checkpoint is at step `saved`.
     """
     remedy = f"nothing after step {saved} was saved: try a lower --optim.learning-rate"
-    if (skipped := rows["consecutive_skips"].max()) >= optim.max_skipped:
-        last = int(rows["consecutive_skips"].argmax())
+    if (skipped := rows["in_a_row"].max()) >= optim.max_skipped:
+        last = int(rows["in_a_row"].argmax())
         spike = f" or above {optim.spike:g} times its running mean" if optim.spike else ""
         return RunError(
             f"{skipped} consecutive steps were skipped because loss or gradient was non-finite"

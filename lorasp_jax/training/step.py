@@ -193,7 +193,7 @@ def train_step(
     metrics |= {
         "grad_norm": grad_norm,
         "update_norm": optax.tree.norm(updates),
-        "consecutive_skips": guard.consecutive_skips,
+        "in_a_row": guard.in_a_row,
     }
     after = TrainState(state.step + 1, adapters, opt_state, guard, average)
     before = dataclasses.replace(state, step=after.step, guard=guard)

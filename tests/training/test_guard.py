@@ -67,11 +67,11 @@ def test_a_skipped_step_changes_only_the_count(step, bad):
     assert not math.isfinite(metrics["grad_norm"])
     for name, value in unchanged(skipped).items():
         np.testing.assert_array_equal(value, unchanged(before)[name], err_msg=name)
-    skips = skipped.guard.consecutive_skips, metrics["consecutive_skips"]
+    skips = skipped.guard.in_a_row, metrics["in_a_row"]
     assert (int(skipped.step), *map(int, skips)) == (2, 1, 1)
     assert int(skipped.guard.counted) == 1
     good = after(step, skipped, GOOD)  # as if it had not happened
-    assert int(good.guard.consecutive_skips) == 0
+    assert int(good.guard.in_a_row) == 0
     for name, value in unchanged(good).items():
         np.testing.assert_array_equal(value, unchanged(after(step, before, GOOD))[name])
         assert (value != unchanged(before)[name]).any(), name
@@ -106,7 +106,7 @@ def test_train_step_detects_spikes_if_enabled(step, monkeypatch):
     monkeypatch.setattr(guards, "WINDOW", 2)
     for spike, skipped in ((0.0, 0), (50.0, 1)):
         state = after(step(spike), initial_state(), TINY, TINY, GOOD)
-        assert int(state.guard.consecutive_skips) == skipped
+        assert int(state.guard.in_a_row) == skipped
 
 
 def test_no_second_copy_of_the_state_is_needed(step, monkeypatch):
@@ -136,7 +136,7 @@ def test_no_second_copy_of_the_state_is_needed(step, monkeypatch):
 
 def test_summary():
     loss, skips = np.array([1.0, np.nan, np.inf, 3.0]), np.array([0, 1, 2, 0])
-    rows = {"loss": loss, "ranks": np.stack([loss, 2 * loss], -1), "consecutive_skips": skips}
+    rows = {"loss": loss, "ranks": np.stack([loss, 2 * loss], -1), "in_a_row": skips}
     found = {name: value.tolist() for name, value in guards.summarize(rows).items()}
     assert found == {"loss": 2.0, "ranks": [2.0, 4.0], "skipped": 2}
     assert guards.summarize({name: v[1:3] for name, v in rows.items()}) == {"skipped": 2}
