@@ -22,7 +22,6 @@ from lorasp_jax.data import cache, inspection
 from lorasp_jax.data.opening import open_source
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.policies import statistics_files, tokenizer
-from lorasp_jax.report.callback import final_table
 from lorasp_jax.report.html import write_report
 from tests import fuzzing
 from tests.data.lerobots import GOLDEN, golden
@@ -52,9 +51,8 @@ def resume(folder: Path) -> None:
 
 
 def show(folder: Path) -> None:
-    """Write the report and the table of a finished run."""
+    """Write the report of a finished run."""
     write_report(folder)
-    final_table(folder)
 
 
 def tokenize(folder: Path) -> None:

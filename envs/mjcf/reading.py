@@ -45,8 +45,8 @@ def read(
     All files that it refers to must be in `folder`, by default its own.
 
     Raises:
-        ValueError: the file does not exist, MuJoCo rejects it, or it refers to files outside of
-            `folder` or includes itself.
+        ValueError: the file does not exist, MuJoCo rejects it, it refers to files outside of
+            `folder`, or something in it is too large.
     """
     path = Path(path).absolute()
     with as_value_error(path):

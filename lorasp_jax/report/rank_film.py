@@ -64,8 +64,8 @@ def draw(
     figure = Figure(figsize=_SIZE, dpi=100, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=10)
-    rows = [[*tinted], ["time"] * len(tinted)]
-    axes: Any = figure.subplot_mosaic(rows, height_ratios=(2, 1))  # pyright: ignore
+    rows: Any = [[*tinted], ["time"] * len(tinted)]
+    axes: Any = figure.subplot_mosaic(rows, height_ratios=(2, 1))
     shown = {camera: axes[camera].imshow(frames[0]) for camera, frames in tinted.items()}
     for camera in shown:
         axes[camera].set_title(f"{camera} camera", fontsize=9)

@@ -1,6 +1,7 @@
-"""Loading a robot's MJCF reads no files outside of its folder."""
+"""Loading a robot's MJCF reads no files outside of its folder, never hangs and bounds memory."""
 
 import os
+import struct
 
 import pytest
 
@@ -98,6 +99,60 @@ def test_pipes(name, robots):
     asset = f'<include file="{name}"/>' if name == "a.xml" else mesh(name)
     with pytest.raises(ValueError, match=name):
         reading.read(model(robots, asset))
+
+
+@pytest.mark.parametrize(
+    ("asset", "body"),
+    [
+        ('<size nkey="1000000000"/>', ""),
+        ("", '<replicate count="1000000000"><site/></replicate>'),
+        ("", '<replicate count="1000"><replicate count="1000"><site/></replicate></replicate>'),
+        ("", '<flexcomp name="f" count="999 999 9"/>'),
+        (f"<!--{' ' * 2**25}-->", ""),
+        ('<asset><hfield name="h" nrow="9999999" ncol="9999999" size="1 1 1 1"/></asset>', ""),
+        ('<asset><texture name="t" type="2d" file="t.png"/></asset>', ""),
+        ('<asset><mesh name="m" builtin="cone" params="1000000000 1"/></asset>', ""),
+        ('<sensor><user dim="500000000"/></sensor>', ""),
+        ('<asset><model name="m" file="circle.xml"/></asset>', ""),
+        ("<a>" * 5000 + "</a>" * 5000, ""),
+        ("<!DOCTYPE x>&nothing;", ""),
+    ],
+)
+def test_sizes(asset, body, robots):
+    head = b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + struct.pack(">2I", 2**31 - 1, 2**31 - 1)
+    (robots / "robot" / "t.png").write_bytes(head)
+    circle = '<mujoco><include file="x.xml"/></mujoco>'
+    (robots / "robot" / "circle.xml").write_text(circle)
+    with pytest.raises(ValueError, match=r"x\.xml|t\.png|its |circle"):
+        reading.read(model(robots, asset, body=body))
+
+
+@pytest.mark.parametrize("kind", ["attach", "include"])
+def test_nested_descriptions(kind, robots):
+    """Ten includes in each of five levels: more elements than MuJoCo could build."""
+    for i in range(5):
+        model = f'<asset><model name="m" file="x{i + 1}.xml"/></asset>'
+        ten = "".join(f'<attach model="m" body="b" prefix="{j}"/>' for j in range(10))
+        if kind == "include":
+            model, ten = "", 10 * f'<include file="x{i + 1}.xml"/>'
+        text = f'<mujoco>{model}<worldbody><body name="b">{ten}</body></worldbody></mujoco>'
+        (robots / "robot" / f"x{i}.xml").write_text(text)
+    end = '<mujoco><worldbody><body name="b"><geom size="1"/></body></worldbody></mujoco>'
+    (robots / "robot" / "x5.xml").write_text(end)
+    with pytest.raises(ValueError, match=r"x1\.xml expands"):
+        reading.read(robots / "robot" / "x0.xml")
+    assert sources.check(robots / "robot" / "x3.xml", robots / "robot") is None
+
+
+def test_many_elements_and_deep_descriptions(robots):
+    path = model(robots, "", body="<geom/>" * 10_000)
+    with pytest.raises(ValueError, match=r"x\.xml expands"):
+        reading.read(path)
+    for i in range(25):
+        text = f'<mujoco><include file="{i + 1}.xml"/></mujoco>'
+        (robots / "robot" / f"{i}.xml").write_text(text)
+    with pytest.raises(ValueError, match=r"20\.xml .*deep"):
+        reading.read(robots / "robot" / "0.xml")
 
 
 def test_memory_attribute_is_ignored(robots):

@@ -306,7 +306,7 @@ def test_temporary_files_of_a_killed_process_are_removed(tmp_path):
 def test_pipes_in_place_of_files_do_not_block(tmp_path):
     for name in ("config.json", "metrics.jsonl"):
         os.mkfifo(tmp_path / name)
-    with pytest.raises(ValueError, match=r"config\.json must be a file, but is a pipe"):
+    with pytest.raises(ValueError, match=r"config\.json must be a regular file"):
         run_folder.read_json(tmp_path / "config.json")
-    with pytest.raises(ValueError, match=r"metrics\.jsonl must be a file, but is a pipe"):
+    with pytest.raises(ValueError, match=r"metrics\.jsonl must be a regular file"):
         read_metrics(tmp_path)

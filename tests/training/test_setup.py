@@ -124,7 +124,7 @@ def test_lerobot_policies_are_preprocessed_as_their_config_says(config, tmp_path
     assert found.config.inputs == inputs.OPENPI
     two_arms = dataclasses.replace(inputs.OURS, delta=(True,) * 14)
     found = random_backbone(dataclasses.replace(Pi0Config.dummy(), inputs=two_arms))
-    with pytest.raises(ValueError, match="has 14 entries, but the robot's actions have 7"):
+    with pytest.raises(ValueError, match="14 entries"):
         prepare(config, tmp_path, load_base=lambda *_, **__: (found, ""))
 
 

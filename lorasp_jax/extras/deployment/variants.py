@@ -11,11 +11,8 @@ from flax import nnx
 import lorasp_jax
 from envs.datasets.episodes import Episodes
 from lorasp_jax.adapters import adaptation
-from lorasp_jax.dense import AdapterParam
 from lorasp_jax.extras.study.held_out import Keyed, forward, keyed_batches
 from lorasp_jax.kernels.quantized_weights import Kind, QuantizedKernel
-from lorasp_jax.models.backbone import Backbone
-from lorasp_jax.peft.lora_sp.bank import BankMethod
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training.base import quantized
 
@@ -26,25 +23,25 @@ Batches = Sequence[Keyed]
 """Batches with the keys of their losses."""
 
 
-def _whole(model: Backbone, batches: Batches) -> Backbone:
+def _whole(model: nnx.Module, batches: Batches) -> nnx.Module:
     del batches
     return model
 
 
-def _pruned(model: Backbone, batches: Batches) -> Backbone:
+def _pruned(model: nnx.Module, batches: Batches) -> nnx.Module:
     return lorasp_jax.prune(model, batches, for_kernel=True, forward=forward)[0]
 
 
-def _half(model: Backbone, batches: Batches) -> Backbone:
+def _half(model: nnx.Module, batches: Batches) -> nnx.Module:
     (rank,) = {method.rank for method in adaptation.methods(model).values() if is_bank(method)}
     return lorasp_jax.prune(model, batches, rank=max(rank // 2, 1), forward=forward)[0]
 
 
-def _merged(model: Backbone, batches: Batches) -> Backbone:
+def _merged(model: nnx.Module, batches: Batches) -> nnx.Module:
     return in_bf16(lorasp_jax.merge(lorasp_jax.distill(model, batches, forward=forward)[0]))
 
 
-FORMS: dict[str, Callable[[Backbone, Batches], Backbone]] = {
+FORMS: dict[str, Callable[[nnx.Module, Batches], nnx.Module]] = {
     "whole": _whole,
     "pruned": _pruned,
     "half": _half,
@@ -80,7 +77,7 @@ def check(name: str) -> str:
 
 def is_bank(method: Any) -> bool:
     """Return whether a method has LoRA-SP's bank of directions."""
-    return isinstance(method, BankMethod)
+    return isinstance(method, lorasp_jax.LoRASP | lorasp_jax.LoRASPRelease)
 
 
 def in_form(policy: Policy, form: str, episodes: Mapping[str, Episodes]) -> Policy:
@@ -103,11 +100,11 @@ def on_base(policy: Policy, base: str) -> Policy:
     return dataclasses.replace(policy, model=quantized(policy.model, BASES[base]))
 
 
-def in_bf16(model: Backbone) -> Backbone:
+def in_bf16(model: Any) -> Any:
     """Return the model with its frozen weights rounded to bf16, as they are saved."""
-    graphdef, frozen, rest = nnx.split(model, nnx.All(nnx.Param, nnx.Not(AdapterParam)), ...)
+    graphdef, adapters, frozen = lorasp_jax.split(model)
     is_kernel = lambda leaf: isinstance(leaf, QuantizedKernel)  # noqa: E731
     frozen = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), frozen, is_leaf=is_kernel)
-    model = nnx.merge(graphdef, frozen, rest)
+    model = nnx.merge(graphdef, adapters, frozen)
     model.config = dataclasses.replace(model.config, param_dtype="bfloat16")
     return model
