@@ -63,9 +63,10 @@ def test_merging_restores_classes(net):
     assert nnx.graphdef(lorasp_jax.merge(model)) == structure
 
 
-def test_only_two_modules_use_setattr():
-    """They are paths.py, for `set_child`, and layers.py, where an attribute names the kernel."""
+def test_only_three_modules_use_setattr():
+    """They are paths.py, for `set_child`, layers.py, where an attribute names the kernel, and
+    prepared.py, which replaces fused layers."""
     by_name = re.compile(r"\b(setattr|delattr)\(|\.__class__ =")
     sources = (ROOT / "lorasp_jax").rglob("*.py")
     users = {path.name for path in sources if by_name.search(path.read_text())}
-    assert users == {"paths.py", "layers.py"}
+    assert users == {"paths.py", "layers.py", "prepared.py"}

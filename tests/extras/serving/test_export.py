@@ -9,12 +9,12 @@ import pytest
 import lorasp_jax
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.extras.serving import export, exported, exporting
-from lorasp_jax.extras.study import transforms
 from lorasp_jax.models.inputs import InputConfig
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
 from lorasp_jax.training import load_policy
 from lorasp_jax.training.run_folder import to_json, write_json
+from studies.paper import transforms
 from tests.cases import mostly_slow
 from tests.extras.serving.test_exported import arguments, in_process
 from tests.extras.serving.test_policies import make_policy
