@@ -92,6 +92,9 @@ class Settings:
         """Raise ValueError if a number is out of range."""
         if not 0 <= self.ahead < self.execute:
             raise ValueError(f"ahead must be 0 to {self.execute - 1}, got {self.ahead}")
+        for name in ("control_dt", "patience", "hold"):
+            if not 0 < (value := getattr(self, name)) < math.inf:
+                raise ValueError(f"{name} must be above 0 s and finite, got {value}")
 
 
 class Session:
