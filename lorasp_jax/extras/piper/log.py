@@ -31,7 +31,7 @@ class Log:
         if (folder / FILE).exists():
             raise ValueError(f"{folder} already has a log: choose another folder")
         folder.mkdir(parents=True, exist_ok=True)
-        self._file = open(folder / FILE, "w")  # the thread closes it
+        self._file = open(folder / FILE, "w")  # noqa: SIM115
         self._folder, self._observations = folder, 0
         self._queue: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._error: Exception | None = None

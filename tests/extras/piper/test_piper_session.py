@@ -209,7 +209,8 @@ def test_the_log_has_every_observation_chunk_and_command(bench, tmp_path):
 @pytest.mark.parametrize("full", [True, False])
 def test_a_log_that_cannot_be_written_says_so_at_the_end(full, tmp_path, monkeypatch):
     if full:
-        monkeypatch.setattr(logs, "open", lambda _, mode: open("/dev/full", mode), raising=False)
+        file = open("/dev/full", "w")  # noqa: SIM115
+        monkeypatch.setattr(logs, "open", lambda *_: file, raising=False)
     log = Log(tmp_path)
     log.line(0.0, value=1 if full else object())  # a full disk shows when the file is closed
     with pytest.raises(OSError, match="No space left" if full else "float"):
