@@ -120,11 +120,29 @@ def _teach(options: argparse.Namespace, parts: tuple, seconds: float) -> str | N
 
 
 def _keep(recorder: Recording) -> None:
-    """Let a person judge the episode."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    if input(f"keep this episode of {recorder.steps} steps? [y/N] ").strip().lower() == "y":
+    """Let a person judge the episode; it is kept if nobody can.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C in place of an answer; the episode is not kept.
+    """
+    before = [signal.signal(number, _end_prompt) for number in shared.SIGNALS]
+    answer, note = "y", ""
+    try:
+        answer = input(f"keep this episode of {recorder.steps} steps? [y/N] ").strip().lower()
+    except (EOFError, OSError) as error:
+        note = f"nobody answers ({error}), so the episode is kept: "
+    finally:  # what is being written must not be interrupted
+        for number, handler in zip(shared.SIGNALS, before, strict=True):
+            signal.signal(number, handler)
+    if answer == "y":
         recorder.keep()
-        print(f"{recorder.num_episodes} episodes recorded")
+        print(f"{note}{recorder.num_episodes} episodes recorded")
+
+
+def _end_prompt(number: int, _: Any) -> None:
+    if number == signal.SIGINT:
+        raise KeyboardInterrupt("the episode is not kept")
+    raise EOFError(signal.Signals(number).name)  # the terminal may be gone
 
 
 def _recorder(

@@ -117,9 +117,11 @@ class PiperArm:
             Unsafe: the feedback is implausible, or the arm reports a fault.
             ConnectionError: the drivers do not switch on, or the arm does not obey the bus.
         """
-        self._check_feedback(limits)
+        # An earlier session's target may be in force: the drivers must not switch on with it.
+        self.command(self._check_feedback(limits).pose)
         end = self._clock.now() + timeout
         while not self.sdk.EnablePiper():  # reports the state before the call
+            self.command(self._check_feedback(limits).pose)
             self._wait(end, f"the drivers are not on after {timeout:g} s")
         while (reading := self._check_feedback(limits)).ctrl_mode != CAN_CONTROL:
             self.command(reading.pose)

@@ -1,9 +1,10 @@
 """A session on disk: every reading, command, chunk and event, and every picture that was sent."""
 
+import functools
 import json
 import queue
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +26,15 @@ class Log:
 
         Raises:
             ValueError: the folder already has one.
-            OSError: the folder cannot be created.
+            OSError: the folder or the file cannot be created.
         """
         if (folder / FILE).exists():
             raise ValueError(f"{folder} already has a log: choose another folder")
         folder.mkdir(parents=True, exist_ok=True)
+        self._file = open(folder / FILE, "w")  # noqa: SIM115
         self._folder, self._observations = folder, 0
         self._queue: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._error: OSError | None = None
+        self._error: Exception | None = None
         self._thread = threading.Thread(target=self._write)
         self._thread.start()
 
@@ -57,19 +59,23 @@ class Log:
         self._queue.put(None)
         self._thread.join()
         if self._error:
-            raise OSError(f"the log in {self._folder} is incomplete: {self._error}")
+            problem = f"the log in {self._folder} is incomplete: {self._error}"
+            raise OSError(problem) from self._error
 
     def _write(self) -> None:
-        with open(self._folder / FILE, "w") as file:
-            while (item := self._queue.get()) is not None:
-                try:
-                    self._write_item(file, item)
-                except OSError as error:  # raised by `close`; the arm goes on
-                    self._error = self._error or error
+        while (item := self._queue.get()) is not None:
+            self._attempt(functools.partial(self._write_item, item))
+        self._attempt(self._file.close)
 
-    def _write_item(self, file: Any, item: Any) -> None:
+    def _attempt(self, write: Callable[[], None]) -> None:
+        try:
+            write()
+        except Exception as error:  # raised by `close`; the arm goes on
+            self._error = self._error or error
+
+    def _write_item(self, item: Any) -> None:
         if isinstance(item, dict):
-            file.write(json.dumps(item, default=_plain) + "\n")
+            self._file.write(json.dumps(item, default=_plain) + "\n")
         else:
             name, image = item
             Image.fromarray(image).save(self._folder / name, compress_level=1)

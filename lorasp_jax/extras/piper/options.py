@@ -22,6 +22,8 @@ from lorasp_jax.extras.piper.teaching import Lesson
 from lorasp_jax.extras.serving.client import PolicyClient, PolicyError, ServerGone
 from lorasp_jax.extras.serving.pictures import to_square
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Those that end a program, and so must stop the arm."""
 _CONTINUATION = ("executed", "delay")  # keys for servers whose chunks continue the previous one
 _WAIT = 300.0  # s to wait for a server that is still compiling
 
@@ -87,8 +89,8 @@ def opened_log(options: argparse.Namespace) -> Iterator[Log]:
 
 
 def stop_on_signals(session: Session | Lesson) -> None:
-    """Let signals stop a session, in which the arm brakes and holds, or a lesson."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    """Let `SIGNALS` stop a session, in which the arm brakes and holds, or a lesson."""
+    for number in SIGNALS:
         signal.signal(number, lambda *_: session.stop())
 
 

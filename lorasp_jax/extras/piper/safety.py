@@ -197,9 +197,9 @@ class Governor:
         self.limits, self._dt = limits, dt
         self.start(np.zeros(7))
 
-    def start(self, measured: np.ndarray) -> None:
-        """Begin at rest at the measured pose [7]; the first target is approached slowly."""
-        self.pose, self.velocity = measured.astype(float), np.zeros(7)
+    def start(self, pose: np.ndarray) -> None:
+        """Begin at rest at a pose [7]; the first target is approached slowly."""
+        self.pose, self.velocity = pose.astype(float), np.zeros(7)
         self.approaching, self.blocked = True, False
         self._target: np.ndarray | None = None
 

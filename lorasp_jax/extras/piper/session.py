@@ -1,7 +1,7 @@
 """The control loop: read the arm, ask the policy, command the arm, 200 times a second.
 
 Whatever goes wrong, the arm brakes and holds. If feedback or pictures come back soon, it goes on
-from the measured pose. Otherwise, and after a refused chunk or a policy's error, it moves slowly to
+from where it holds. Otherwise, and after a refused chunk or a policy's error, it moves slowly to
 its rest pose and stays there, powered; it does not move again while it reports a fault itself.
 Signals and all other errors stop it where it is.
 """
@@ -92,6 +92,9 @@ class Settings:
         """Raise ValueError if a number is out of range."""
         if not 0 <= self.ahead < self.execute:
             raise ValueError(f"ahead must be 0 to {self.execute - 1}, got {self.ahead}")
+        for name in ("control_dt", "patience", "hold"):
+            if not 0 < (value := getattr(self, name)) < math.inf:
+                raise ValueError(f"{name} must be above 0 s and finite, got {value}")
 
 
 class Session:
@@ -159,7 +162,8 @@ class Session:
         self._next = start = self._clock.now()
         while self._clock.now() - start < seconds and not self.stopped and not done():
             self._tick()
-            if self.problem and self._clock.now() - self._since > self._settings.hold:
+            held = self.problem and not self._governor.velocity.any()
+            if held and self._clock.now() - self._since > self._settings.hold:
                 self._rest()
                 break
 
@@ -180,8 +184,11 @@ class Session:
     def _drive(self, reading: Reading, now: float) -> None:
         """Follow the policy's path by one tick."""
         if self.problem:
+            if self._governor.velocity.any():
+                return  # it brakes to the end, whatever comes back
+            self._cameras.read()  # still no picture: it goes on holding
             self._say("going on")
-            self._governor.start(reading.pose)
+            self._governor.start(self._governor.pose)
             self.problem = None
             self._forget()
         self._receive(now)
@@ -295,7 +302,7 @@ class Session:
         if fault(reading, self._limits) or self.stopped:
             return
         self._say("moving slowly to the rest pose")
-        self._governor.start(reading.pose)
+        self._governor.start(self._governor.pose)
         end = self._clock.now() + _REST_TIME
         while np.abs(self._governor.pose - REST)[:6].max() > _REACHED and not self.stopped:
             reading = self._read()

@@ -74,6 +74,21 @@ def test_enabling_does_not_move_the_arm(bench):
     np.testing.assert_allclose(fake.world.pose, before, atol=2e-3)
 
 
+def test_enabling_again_does_not_return_to_an_earlier_target(bench):
+    arm, fake, clock = ready(bench)
+    drive(arm, clock, fake.world.pose + np.array([0.4, 0, 0, 0, 0, 0, 0]), 200)
+    arm.disable()
+    wait(clock, 0.1)
+    fake.world.data.qpos[0] -= 0.6  # a person pushes the powerless arm
+    fake._setpoint[0] -= 0.6
+    wait(clock, 0.1)
+    before = fake.world.pose
+    arm.enable(LIMITS)
+    wait(clock, 0.5)
+    np.testing.assert_allclose(fake.world.pose, before, atol=5e-3)
+    assert fake.unsafe == []
+
+
 def test_the_speed_percentage_limits_the_arm_too(bench):
     arm, fake, clock = ready(bench)
     start = fake.world.pose

@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import signal
+import types
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from envs.rendering.video import write_video
 from envs.tasks import press
 from lorasp_jax.data.opening import open_source
+from lorasp_jax.extras.piper import __main__ as command
 from lorasp_jax.extras.piper import options, safety
 from lorasp_jax.extras.piper.__main__ import HELD
 from lorasp_jax.extras.piper.__main__ import main as real
@@ -17,6 +20,7 @@ from lorasp_jax.extras.piper.fake.__main__ import main as fake
 from lorasp_jax.extras.piper.fake.firmware import FakePiper
 from lorasp_jax.extras.piper.fake.timing import RealTime
 from lorasp_jax.extras.piper.fake.world import World
+from lorasp_jax.extras.piper.recording import Recording
 from lorasp_jax.extras.serving.client import PolicyClient
 from tests.extras.piper.benches import channel
 from tests.extras.serving.stand_in import SPEC, StandIn, serving
@@ -263,6 +267,33 @@ def test_teaching_with_the_real_command(linked, tmp_path, monkeypatch, capsys):
     assert questions[0].startswith("keep this episode of ")
     assert real([*words, "--teach", "leader"]) == HELD
     assert "no leader sends targets" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("number", [None, *options.SIGNALS])
+def test_an_episode_that_nobody_judges_is_not_lost(number, tmp_path, monkeypatch, capsys):
+    def ask(question):
+        if number:
+            signal.raise_signal(number)
+        raise EOFError("EOF when reading a line")
+
+    monkeypatch.setattr("builtins.input", ask)
+    ways = {"task": "press", "instructions": (), "control_dt": 0.1, "image_size": 16}
+    recorder = Recording(tmp_path / "data", prompt="press it", **ways)
+    recorder.step({"side": np.zeros((16, 16, 3), np.uint8)}, np.ones(7), np.ones(7))
+    handlers = {each: signal.getsignal(each) for each in options.SIGNALS}
+    try:
+        options.stop_on_signals(types.SimpleNamespace(stop=lambda: None))
+        if number == signal.SIGINT:
+            with pytest.raises(KeyboardInterrupt, match="not kept"):
+                command._keep(recorder)
+        else:
+            command._keep(recorder)
+    finally:
+        for each, handler in handlers.items():
+            signal.signal(each, handler)
+    kept = number != signal.SIGINT
+    assert recorder.num_episodes == kept
+    assert ("the episode is kept: 1 episodes recorded" in capsys.readouterr().out) == kept
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from lorasp_jax.extras.piper import log as logs
 from lorasp_jax.extras.piper import session as sessions
 from lorasp_jax.extras.piper.asking import InThread
 from lorasp_jax.extras.piper.fake.demonstrator import Demonstrator
@@ -205,9 +206,27 @@ def test_the_log_has_every_observation_chunk_and_command(bench, tmp_path):
         Log(tmp_path)
 
 
+@pytest.mark.parametrize("full", [True, False])
+def test_a_log_that_cannot_be_written_says_so_at_the_end(full, tmp_path, monkeypatch):
+    if full:
+        file = open("/dev/full", "w")  # noqa: SIM115
+        monkeypatch.setattr(logs, "open", lambda *_: file, raising=False)
+    log = Log(tmp_path)
+    log.line(0.0, value=1 if full else object())  # a full disk shows when the file is closed
+    with pytest.raises(OSError, match="No space left" if full else "float"):
+        log.close()
+
+
 def test_wrong_settings_are_refused():
     with pytest.raises(ValueError, match="ahead must be 0 to 4, got 5"):
         Settings("turn", ahead=5)
+
+
+@pytest.mark.parametrize("name", ["control_dt", "patience", "hold"])
+@pytest.mark.parametrize("value", [0.0, -0.1, np.nan, np.inf])
+def test_times_must_be_positive_and_finite(name, value):
+    with pytest.raises(ValueError, match=f"{name} must be .* got {value}"):
+        Settings("turn", **{name: value})
 
 
 def test_asking_in_a_thread(bench):

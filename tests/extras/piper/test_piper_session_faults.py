@@ -41,18 +41,19 @@ def test_frames_that_stop_for_good(bench):
     assert_holds(run, "no feedback from the arm")
 
 
-def test_going_on_starts_from_the_measured_pose(bench):
-    run, pushed = Run(bench, Turning(), hold=5.0), []
+@pytest.mark.parametrize("push", [0.0, 0.3])
+def test_after_a_short_gap_the_arm_brakes_to_the_end_and_goes_on_from_there(bench, push):
+    run = Run(bench, Turning(), hold=5.0)
 
-    def push():
+    def resume():
         bench.fake.faults.silent = False
-        bench.world.data.qpos[0] += 0.3  # meanwhile somebody has moved the arm
-        pushed.append(bench.world.pose[0])
+        bench.world.data.qpos[0] += push  # meanwhile somebody has moved the arm
 
-    run.at = {0.5: lambda: vars(bench.fake.faults).update(silent=True), 0.7: push}
-    run(0.9)
-    jump = np.abs(np.diff(run.path[:, 0])).argmax() + 1
-    assert run.path[jump, 0] == pytest.approx(pushed[0], abs=0.05)
+    run.at = {0.45: lambda: vars(bench.fake.faults).update(silent=True), 0.51: resume}
+    assert run(1.5) is None
+    assert "no feedback from the arm" in run.said[0]
+    assert run.said[1:] == ["going on"]
+    assert_braked(run)
 
 
 @pytest.mark.parametrize(
@@ -229,3 +230,19 @@ def test_pictures_that_stop(bench):
     run = Run(bench, Turning(), cameras=Blinking(bench.world.images))
     assert run(1.5) is None
     assert run.said[:2] == ["holding: camera wrist shows nothing new", "going on"]
+
+
+def test_pictures_that_stop_for_good(bench):
+    class Dying(Simulated):
+        def read(self):
+            if bench.clock.now() > due:
+                raise NoPicture("camera wrist shows nothing new")
+            return super().read()
+
+    due = bench.clock.now() + 0.45
+    run = Run(bench, Turning(), cameras=Dying(bench.world.images))
+    assert "nothing new" in run(30.0)
+    assert run.said == [run.said[0], "moving slowly to the rest pose"]
+    np.testing.assert_allclose(bench.world.pose[:6], sessions.REST[:6], atol=0.03)
+    assert_braked(run)
+    assert_holds(run, "camera wrist shows nothing new")
