@@ -119,7 +119,11 @@ def missing_group(error: ModuleNotFoundError) -> str | None:
     name = re.escape(_REQUIREMENTS.get(module, module.replace("_", "-")))
     requirement = re.compile(rf"{name}(?![\w\[-])", re.IGNORECASE)
     groups: dict[str, list[str]] = {}
-    for line in importlib.metadata.requires("lorasp_jax") or ():
+    try:
+        lines = importlib.metadata.requires("lorasp_jax") or ()
+    except importlib.metadata.PackageNotFoundError:  # a checkout that is not installed
+        return None
+    for line in lines:
         if group := re.search(r"extra == ['\"]([\w-]+)", line):
             groups.setdefault(group[1], []).append(line)
     having = [name for name, lines in groups.items() if any(map(requirement.match, lines))]

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lorasp_jax.base import shipped
+from lorasp_jax.base.files import join_inside
 from lorasp_jax.base.locks import locked
 from lorasp_jax.base.writing import atomic_file, atomic_folder
 
@@ -17,7 +18,7 @@ HUB = "hf://"
 """URL prefix of Hub repositories, hf://owner/name."""
 REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 """Repository id on the Hub, owner/name."""
-BUCKET = re.compile(r"(gs|s3|memory)://[\w.-]+(/[\w.+=@-]+)*/?")
+BUCKET = re.compile(r"(gs|memory)://[\w.-]+(/[\w.+=@-]+)*/?")
 """URL of a folder or file in a bucket; memory:// is fsspec's in-memory store, for tests."""
 IGNORED_PATTERNS = (
     "train_state/*",
@@ -56,9 +57,7 @@ def local(
         return _from_hub(name.removeprefix(HUB), only, repository)
     if "://" in name:
         if not BUCKET.fullmatch(name) or ".." in name.split("/"):
-            raise ValueError(
-                f"a bucket URL must be gs://bucket/folder or s3://bucket/folder, got {name}"
-            )
+            raise ValueError(f"a bucket URL must be gs://bucket/folder, got {name}")
         return _from_bucket(name)
     for candidate in (path, shipped.ROOT / path) if _is_shipped(path) else (path,):
         if os.path.exists(candidate):  # Path.exists raises if a name is too long
@@ -145,7 +144,7 @@ def _copy(store: Any, root: str, target: Path) -> None:
     is_file = names == [root]
     with (atomic_file if is_file else atomic_folder)(target) as unfinished:
         for name in names:
-            file = unfinished if is_file else unfinished / name[len(root) :].lstrip("/")
+            file = unfinished if is_file else join_inside(unfinished, name[len(root) :].lstrip("/"))
             file.parent.mkdir(parents=True, exist_ok=True)
             store.get_file(name, str(file))
 

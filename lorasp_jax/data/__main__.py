@@ -55,6 +55,8 @@ def convert(options: argparse.Namespace, console: Console) -> None:
     sources = [open_source(path, keys) for path in options.paths]
     if options.to != "cache" and len(sources) > 1:
         raise ValueError(f"--to {options.to} converts exactly one dataset, got {len(sources)}")
+    if options.to != "cache" and isinstance(sources[0], cache.Cache):
+        sources[0].verify_images()
     with _progress_bar(f"writing {options.out.name}") as (progress, print_line):
         if options.to == "rlds":
             rlds_export.to_rlds(sources[0], options.out, progress)

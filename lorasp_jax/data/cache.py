@@ -85,6 +85,9 @@ def write(
         shared = _metadata(sources[0].episode(0)) if sources[1:] else {}
         for source in sources[1:]:  # fail now, not after hours of reading images
             _check_compatible(shared, source.episode(0))
+        for source in sources:  # the copy's checksums would declare damaged images valid
+            if isinstance(source, Cache):
+                source.verify_images()
         with (
             atomic_folder(path) as folder,
             Writer(folder) as writer,
@@ -331,7 +334,8 @@ def _read_header(path: Path) -> dict[str, Any]:
         raise ValueError(f"unknown field {unknown[0]!r}")
     if header["format"] != FORMAT:
         raise ValueError(
-            f"format {header['format']!r} is not {FORMAT!r}: convert the dataset again"
+            f"format {header['format']!r} is not {FORMAT!r}: convert the dataset again, or, if it "
+            "is the cache of a run, use another --name"
         )
     check(header, _HEADER_TYPES)
     if not 0 < header["control_dt"] < math.inf:

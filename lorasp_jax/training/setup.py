@@ -322,7 +322,8 @@ def _load_dataset(run: Run, source: Source, free_bytes: float) -> None:
         bar = progress.add_task(f"reading {run.config.data.source}", total=None)
         report = lambda done, total: progress.update(bar, completed=done, total=total)  # noqa: E731
         cache = as_cache(source, run.folder, report)
-        cache.verify_images()
+        if processes.is_first():  # the others read the same files
+            cache.verify_images()
         progress.update(bar, completed=cache.num_steps, total=cache.num_steps)
     metadata = cache.metadata
     run.dataset, run.episodes, run.simulated = cache.steps, outline(cache), is_simulated(cache)

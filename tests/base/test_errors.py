@@ -1,5 +1,6 @@
 """How commands end."""
 
+import importlib.metadata
 import io
 
 import pytest
@@ -62,6 +63,15 @@ def test_a_missing_group_is_named(module, group):
     code, text = end(fail(missing))
     assert code == REFUSED
     assert f'pip install "lorasp_jax[{group}]"' in text
+
+
+def test_without_metadata_the_missing_module_is_raised(monkeypatch):
+    def requires(name):
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "requires", requires)
+    with pytest.raises(ModuleNotFoundError, match="no brax"):
+        end(fail(ModuleNotFoundError("no brax", name="brax")))
 
 
 def test_a_missing_module_of_ours_is_a_bug():

@@ -123,6 +123,14 @@ def test_bucket_is_downloaded_once(bucket, tmp_path):
     assert not list(tmp_path.rglob(".*"))
 
 
+def test_objects_of_a_bucket_stay_in_its_folder(bucket, tmp_path):
+    escaping = "/models/pi0/../../../../../evil"  # such a name is legal in a bucket
+    bucket.store[escaping] = bucket.store["/models/pi0/params/d/0"]
+    with pytest.raises(ValueError, match=r"'\.\./.*evil': names must stay in the folder"):
+        hub.local("memory://models/pi0")
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
 def test_unreadable_bucket(bucket, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"cannot download .*models/no: .*no such file or folder$"):
         hub.local("memory://models/no")
@@ -140,13 +148,20 @@ def test_unreadable_bucket(bucket, tmp_path, monkeypatch):
     "where",
     [
         *("nothing://models/pi0", "://a", "file:///etc/passwd", "http://localhost:9/x"),
-        *("github://a:b@/x", "gs://../../x", "gs://a/../../../../x", "gs://", "gs://a//b"),
+        *(
+            "github://a:b@/x",
+            "gs://../../x",
+            "gs://a/../../../../x",
+            "gs://",
+            "gs://a//b",
+            "s3://a/b",
+        ),
         *("zip://x::/tmp/x.zip", "simplecache::file:///etc/passwd", "local:///etc/passwd"),
     ],
 )
 def test_other_urls_are_rejected(where, monkeypatch):
     monkeypatch.delattr("fsspec.core.url_to_fs")
-    with pytest.raises(ValueError, match="a bucket URL must be gs://bucket/folder or s3"):
+    with pytest.raises(ValueError, match="a bucket URL must be gs://bucket/folder"):
         hub.local(where)
 
 

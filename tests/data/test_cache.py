@@ -11,6 +11,8 @@ import pytest
 
 from envs.datasets.episodes import Episodes
 from lorasp_jax.base.digest import DIGEST, with_digest
+from lorasp_jax.base.errors import REFUSED
+from lorasp_jax.data import __main__ as command_line
 from lorasp_jax.data import cache, rlds_export
 from lorasp_jax.data.batches import flatten, gather
 from lorasp_jax.data.lerobot import Keys, LeRobot
@@ -172,6 +174,20 @@ def test_incompatible_datasets_are_refused_before_reading(tmp_path):
         cache.write(sources, tmp_path / "cache", lambda *steps: reports.append(steps))
     assert not reports
     assert not list(tmp_path.iterdir())
+
+
+def test_a_damaged_image_is_not_copied(simulated, tmp_path):
+    damaged = cache.Cache(shutil.copytree(simulated[1].path, tmp_path / "damaged"))
+    file = damaged.path / "image_side.npy"
+    content = bytearray(file.read_bytes())
+    content[-50] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(ValueError, match="image_side"):
+        written(tmp_path / "copy", damaged)
+    for to in ("lerobot", "rlds"):
+        out = ("--to", to, "--out", str(tmp_path / "copy"))
+        assert command_line.main(["convert", str(damaged.path), *out]) == REFUSED
+    assert [path.name for path in tmp_path.iterdir()] == ["damaged"]
 
 
 def test_a_broken_dataset_leaves_no_cache(tmp_path):

@@ -4,12 +4,15 @@ All processes train; only the first one collects, evaluates, prints and writes. 
 be on storage that they share. The functions also work in a single process.
 """
 
+import concurrent.futures
 import contextlib
+import functools
 import json
 import os
 import platform
 import socket
 import sys
+import threading
 from collections.abc import Iterator, Mapping
 from typing import Any, NoReturn
 
@@ -19,12 +22,18 @@ from jax.experimental import multihost_utils
 from rich.console import Console
 
 from lorasp_jax.training import _compat
+from lorasp_jax.training.demonstrations import in_thread
 
 _JOIN_TIMEOUT = 180  # s
 _EXIT_TIMEOUT = 60  # s; after it, JAX aborts the others if a process has died or waits to exit
 _BARRIER_TIMEOUT = 24 * 3600 * 1000  # ms; the first process may collect and evaluate for hours
 _VARIABLES = ("JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 _MAX_FACTS = 2**16  # bytes
+_LEAVING = (
+    "lorasp_jax_leaving"  # folder of the exit codes of processes that leave before the others
+)
+_POLL = 1  # s
+_connected = threading.Event()
 
 
 def initialize(console: Console) -> None:
@@ -45,14 +54,14 @@ def initialize(console: Console) -> None:
     if os.environ.get("JAX_PLATFORMS") == "cpu":
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
     jax.config.update("jax_enable_preemption_service", False)  # `interrupt` handles signals
-    jax.distributed.initialize(
-        address,
-        count,
-        number,
+    connect = functools.partial(
+        jax.distributed.initialize,
         initialization_timeout=_JOIN_TIMEOUT,
         heartbeat_timeout_seconds=_EXIT_TIMEOUT,
         shutdown_timeout_seconds=_EXIT_TIMEOUT,
     )
+    in_thread(connect, address, count, number).result()  # signals do not interrupt C++
+    _connected.set()
 
 
 def _cluster_info() -> tuple[str, int, int]:
@@ -139,10 +148,15 @@ def agree(topic: str, facts: Mapping[str, Any]) -> None:
 
 
 def exit_all(code: int) -> NoReturn:
-    """Exit without waiting for this process's threads, but for the other processes."""
+    """Exit without waiting for this process's threads, but for the other processes.
+
+    Those that wait at a barrier, or come to one, exit with the same code.
+    """
     sys.stdout.flush()
     sys.stderr.flush()
-    if jax.distributed.is_initialized():
+    if _connected.is_set():  # JAX would wait for a connection that is under way
+        shared = _compat.coordination
+        shared.client.key_value_set(f"{_LEAVING}/{shared.process_id}", str(code))
         jax.distributed.shutdown()
     os._exit(code)
 
@@ -153,10 +167,20 @@ def is_first() -> bool:
 
 
 def barrier(name: str) -> None:
-    """Wait on the host for all processes; a collective on the devices would time out."""
+    """Wait on the host for all processes; a collective on the devices would time out.
+
+    Exit if another process exits instead of coming here.
+    """
+    if jax.process_count() == 1:
+        return
     import orbax.checkpoint as ocp
 
-    ocp.multihost.get_barrier_sync_fn()(key=name, timeout_ms=_BARRIER_TIMEOUT)
+    wait = functools.partial(ocp.multihost.get_barrier_sync_fn(), timeout_ms=_BARRIER_TIMEOUT)
+    passed = in_thread(lambda: wait(key=name))  # signals do not interrupt C++
+    while not concurrent.futures.wait([passed], _POLL).done:
+        for _, code in _compat.coordination.client.key_value_dir_get(_LEAVING):
+            exit_all(int(code))
+    passed.result()
 
 
 @contextlib.contextmanager

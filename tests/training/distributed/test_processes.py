@@ -2,6 +2,8 @@
 
 import socket
 import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -10,10 +12,32 @@ from rich.console import Console
 
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.distributed import processes
+from tests import ROOT
 from tests.runs import repeatable
-from tests.several import NAMES, start
+from tests.several import NAMES, environments, start
 
 WORKER = ("-u", "-m", "tests.training.worker")
+WAITING = """
+import sys, time
+from rich.console import Console
+from lorasp_jax.base.errors import run_command
+from lorasp_jax.training.distributed import processes
+from lorasp_jax.training.interrupt import sigterm_as_interrupt
+
+def run():
+    with sigterm_as_interrupt():
+        print("connecting", flush=True)
+        processes.initialize(Console())
+        first = processes.is_first()
+        print("ready", flush=True)
+        if first and sys.argv[1:] == ["fails"]:
+            raise ValueError("the expert failed")
+        if first:
+            time.sleep(1000)
+        processes.barrier("collected")
+
+processes.exit_all(run_command(run, Console(stderr=True)))
+"""
 
 
 @pytest.mark.slow
@@ -66,6 +90,38 @@ def test_a_failed_process_ends_the_other_within_two_minutes(number, fails, tmp_p
     assert failed.returncode
     assert other.returncode
     assert ("RuntimeError: nobody catches this" in printed) == fails
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("own", "signaled", "code"),
+    [((), (0, 1), 130), ((), (0,), 130), (("fails",), (), 2)],
+)
+def test_all_exit_alike_while_the_first_works_and_the_others_wait(own, signaled, code):
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    children = start(2, "-u", "-c", WAITING, own={0: own}, **pipes)
+    for child in children:
+        while "ready" not in child.stdout.readline():
+            pass
+    for number in signaled:
+        children[number].terminate()
+    for child in children:
+        child.communicate(timeout=50)  # JAX would abort them after 60 s
+    assert [child.returncode for child in children] == [code, code]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_signal_ends_the_wait_for_other_processes(number):
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    command = [sys.executable, "-u", "-c", WAITING]
+    environment = [*environments(2)][number]
+    with subprocess.Popen(command, env=environment, cwd=ROOT, **pipes) as child:
+        assert child.stdout.readline() == "connecting\n"
+        time.sleep(3)
+        child.terminate()
+        child.communicate(timeout=50)
+    assert child.returncode == 130
 
 
 def test_alone_errors_are_raised_as_they_are():
