@@ -12,11 +12,9 @@ from envs.experts import expert
 from envs.rewards import potential
 from envs.state import State
 from envs.tasks import View
-from tests import ROOT
 from tests.envs import expert_in_c
 
 EPISODES = 4
-PAGE = ROOT / "docs" / "reinforcement_learning.md"
 
 
 def stages(scene, data, size=1.0) -> np.ndarray:
