@@ -69,6 +69,7 @@ def test_an_arm_with_a_fault_holds_where_it_is(bench, faults, words):
 
     def fail():
         vars(bench.fake.faults).update(faults)
+        bench.fake._tick = -1  # the drivers' states, every tenth time, come next
         seen.append(bench.world.pose)
 
     run.at = {0.5: fail}
