@@ -11,12 +11,23 @@ from pathlib import Path
 import pytest
 
 from lorasp_jax.cli import train
+from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.run_folder import write_json
 from tests import ROOT
 from tests.runs import RESULTS
 
 MULTITASK = ["--config", str(ROOT / "configs" / "multitask.py"), "--scale", "smoke"]
 NANO = ["--model.checkpoint", str(ROOT / "assets" / "pi0_nano")]
+
+
+def test_processes_compare_their_versions_before_their_options(monkeypatch, capsys):
+    def agree(topic, facts):
+        raise ValueError(f"{topic} of {sorted(facts)}")
+
+    monkeypatch.setattr(processes, "initialize", lambda _: None)
+    monkeypatch.setattr(processes, "agree", agree)
+    assert train.main(["--distributed", "--no-such-option"]) == 2
+    assert "versions of ['flax', 'jax', 'lorasp_jax']" in capsys.readouterr().err
 
 
 @pytest.fixture(autouse=True)

@@ -54,6 +54,7 @@ def test_two_processes_match_one_on_simulated_tasks(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize(
     ("own", "says", "reason"),
     [

@@ -25,6 +25,10 @@ def main(arguments: Sequence[str], program: str = "python train.py") -> int:
     """
     started = time.perf_counter()
     cache.enable()
+    import flax
+    import jax
+
+    import lorasp_jax
     from lorasp_jax.training.distributed import processes
     from lorasp_jax.training.interrupt import sigterm_as_interrupt
     from lorasp_jax.training.overrides import parse
@@ -38,6 +42,8 @@ def main(arguments: Sequence[str], program: str = "python train.py") -> int:
             if "--distributed" in arguments:
                 processes.initialize(console)
                 console.quiet = not processes.is_first()
+                versions = {x.__name__: x.__version__ for x in (jax, flax, lorasp_jax)}
+                processes.agree("versions", versions)
             with processes.together():
                 command = parse(arguments, program)
             options = {"resume": command.resume, "dry_run": command.dry_run}

@@ -3,6 +3,8 @@
 They exist in JAX 0.10.2, 0.11.2 and 0.12.0.1.
 """
 
+from typing import Any
+
 from jax._src import clusters, distributed
 from jax.interpreters import partial_eval
 
@@ -11,7 +13,7 @@ find_processes = clusters.ClusterEnv.auto_detect_unset_distributed_params
 Kubernetes or a TPU pod. `jax.distributed.initialize` calls this function but does not expose its
 result, needed to say what is awaited and to check the port: JAX crashes if it is in use."""
 
-coordination = distributed.global_state
+coordination: Any = distributed.global_state
 """Its `client` reads and writes the keys that all processes share; orbax gives only barriers."""
 
 eliminate_dead_code = partial_eval.dce_jaxpr
