@@ -131,7 +131,7 @@ def run_here(
 ) -> dict[str, dict[str, Any]]:
     """Run some cells in this process; write and return the results of all that are finished.
 
-    What the cells print goes to files.
+    What the cells print goes to files. Results of cells that an earlier command had stay.
 
     Raises:
         ValueError: one of the cells failed, or has run with other settings.
@@ -146,11 +146,13 @@ def run_here(
         progress.clear_failure(folder / name)
     work(study, folder, names, run, say)
     statuses = progress.read(study, folder)
-    found = progress.results_of(statuses, statuses)
-    results.write(folder / results.RESULTS_FILE, study.name, found)
     for name in names:
         if statuses[name].state is not CellState.FINISHED:
             raise ValueError(f"{folder / name}: {statuses[name].state} {statuses[name].reason}")
+    found, file = progress.results_of(statuses, statuses), folder / results.RESULTS_FILE
+    earlier = results.load(file, study.name) if file.exists() else {}
+    others = {name: result for name, result in earlier.items() if name not in statuses}
+    results.write(file, study.name, {**others, **found})
     return found
 
 

@@ -1,3 +1,5 @@
+import dataclasses
+
 import pytest
 
 from lorasp_jax.extras.study import results, workers
@@ -81,3 +83,7 @@ def test_a_small_study_runs_here(folder):
     assert (again, len(ran(folder))) == (found, 2)
     with pytest.raises(ValueError, match="lora/s0: waiting for sp/s1"):
         workers.run_here(fakes.study(), folder, ["lora/s0"], lines.append, fakes.run)
+    assert results.load(folder / "results.json") == found
+    fewer = dataclasses.replace(fakes.study(), cells=(fakes.study()["lr"],))
+    workers.run_here(fewer, folder, ["lr"], lines.append, fakes.run)
+    assert results.load(folder / "results.json") == found, "results of other cells stay"
