@@ -10,10 +10,9 @@ from typing import Any
 
 from rich.console import Console
 
-from envs import actions
 from envs.cli import commands
 from envs.experts.collection import Record
-from envs.names import names
+from envs.names import MODES, names
 from envs.scene import distractors
 from lorasp_jax.base import compilation_cache as cache
 from lorasp_jax.base.errors import parse_arguments, run_command
@@ -54,7 +53,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     option("--num-episodes", type=int, default=64, help=f"episodes per task {_DEFAULT}")
     option("--num-envs", type=int, help="parallel worlds (default: depends on the device)")
     option("--control-dt", type=finite, default=0.1, help=f"time between actions [s] {_DEFAULT}")
-    option("--actions", default="joint", help=f"mode: {', '.join(actions.MODES)} {_DEFAULT}")
+    option("--actions", default="joint", help=f"mode: {', '.join(MODES)} {_DEFAULT}")
     text = f"standard deviation of noise on executed actions, in their units {_DEFAULT}"
     option("--action-noise", type=finite, default=0.0, help=text)
     text = f"unrelated objects on the table, up to {distractors.MAX_COUNT} {_DEFAULT}"

@@ -11,18 +11,14 @@ Changes are relative to the last targets, not to measured positions, so that ser
 an arm creep.
 """
 
-from typing import Literal, get_args
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from envs import robots
+from envs.names import Mode
 from envs.robots import Robot, multiply
 from envs.scene import scene
-
-Mode = Literal["joint", "delta_joint", "end_effector"]
-MODES: tuple[str, ...] = get_args(Mode)
 
 TARGET_DT = 0.02
 """Time between interpolated joint targets [s]; our choice (50 Hz)."""

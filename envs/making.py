@@ -9,9 +9,9 @@ import mujoco
 
 import envs.scene.distractors
 from envs import checks, mjcf
-from envs.actions import MODES, TARGET_DT, Mode
+from envs.actions import TARGET_DT
 from envs.env import Env
-from envs.names import check
+from envs.names import MODES, Mode, check
 from envs.physics import physics
 from envs.physics.physics import Backend
 from envs.rendering import renderer as render

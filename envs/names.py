@@ -2,6 +2,11 @@
 
 import re
 from pathlib import Path
+from typing import Literal, get_args
+
+Mode = Literal["joint", "delta_joint", "end_effector"]
+MODES: tuple[str, ...] = get_args(Mode)
+"""Action modes; here, because this module is light to import."""
 
 
 def names(kind: str) -> list[str]:

@@ -30,7 +30,7 @@ COMMANDS = {
     "deploy": (["-m", "lorasp_jax.extras.deployment", "--help"], "--save"),
     "report": (["-m", "lorasp_jax.report", "--help"], "rank-map"),
     "export": (["-m", "lorasp_jax.extras.serving.export", "--help"], "--max-batch"),
-    "rank maps": (["-m", "lorasp_jax.report", "rank-map", "--help"], "--gif"),
+    "rank maps": (["-m", "lorasp_jax.report", "rank-map", "--help"], "--task"),
 }
 PROGRAM = """
 import atexit, runpy, sys

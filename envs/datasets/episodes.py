@@ -15,7 +15,7 @@ from typing import Any, Self
 import jax
 import numpy as np
 
-from envs.actions import MODES
+from envs.names import MODES
 from lorasp_jax.base.files import as_value_error, check_local, check_memory, check_regular
 from lorasp_jax.base.writing import atomic_file
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import envs
-from envs import actions, robots
+from envs import actions, names, robots
 from envs.experts import collection
 
 
@@ -24,7 +24,7 @@ def command(robot, key):
     return jnp.concatenate([joints, jnp.array([[0.02], [0.04]])], axis=1)
 
 
-@pytest.mark.parametrize("mode", actions.MODES)
+@pytest.mark.parametrize("mode", names.MODES)
 def test_bounds_of_each_mode(robot, mode):
     low, high = actions.bounds(mode, robot, 0.1)
     assert len(low) == len(high) == (7 if mode == "end_effector" else robot.num_joints + 1)
