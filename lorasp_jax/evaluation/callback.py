@@ -15,13 +15,11 @@ from envs.env import Env
 from envs.physics import physics
 from envs.scene.randomization import Draw
 from envs.state import Poses
-from lorasp_jax.adapters import adaptation
 from lorasp_jax.base import messages
 from lorasp_jax.base.bars import bars
 from lorasp_jax.base.writing import atomic_file
-from lorasp_jax.config import Config
 from lorasp_jax.evaluation import metrics, video
-from lorasp_jax.evaluation.programs import compiled_rollout, prepared
+from lorasp_jax.evaluation.programs import compiled_rollout
 from lorasp_jax.evaluation.results import Result, evaluate
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training import early, records
@@ -45,14 +43,14 @@ class Evaluation(Callback):
 
     def __init__(
         self,
-        compile_rollout: Callable[[Config, str], tuple[Env, Callable]] = compiled_rollout,
+        compile_rollout: Callable[[Run, str], tuple[Env, Callable]] = compiled_rollout,
         evaluate: Callable[..., Result] = evaluate,
         write_video: Callable[[Env, Poses, Path, Draw | None], None] | None = video.write_episode,
     ) -> None:
         """Create the callback; nothing compiles until the first evaluation.
 
         Args:
-            compile_rollout: (config, task) -> the task's environment and its rollout, whose first
+            compile_rollout: (run, task) -> the task's environment and its rollout, whose first
                 call compiles.
             evaluate: evaluates a policy, like `results.evaluate`.
             write_video: renders an episode and writes the video to a file, like
@@ -72,11 +70,11 @@ class Evaluation(Callback):
         """
         if built.source or physics.default_backend() == "warp":
             return
-        policy = prepared(early.blank_policy(run, built))
+        policy = early.blank_policy(run, built).with_sampler()
 
         def compile_task(task: str) -> None:
             with messages.announce(f"the evaluation of {task}"):
-                env, rollout = self._compile_rollout(run.config, task)
+                env, rollout = self._compile_rollout(run, task)
                 rollout.compile(policy)
                 jax.block_until_ready(rollout(policy, jax.random.key(0), calls=1))
             self._rollouts[task] = env, rollout
@@ -132,7 +130,7 @@ class Evaluation(Callback):
         """
         progress_bars = bars(run.console, "episodes", shown=not episodes)
         with run.timed("evaluate"), progress_bars as progress:
-            policy = prepared(run.policy)  # once for all tasks
+            policy = run.policy.with_sampler()  # once for all tasks
             evaluate_task = functools.partial(
                 self._evaluate_task, run, policy, when, episodes, progress
             )
@@ -168,7 +166,7 @@ class Evaluation(Callback):
                 progress.update(bar, completed=done, description=f"evaluating {task} {when}")
 
             if task not in self._rollouts:
-                self._rollouts[task] = self._compile_rollout(run.config, task)
+                self._rollouts[task] = self._compile_rollout(run, task)
             env, rollout = self._rollouts[task]
             return self._evaluate(policy, env, key, episodes, rollout=rollout, progress=report)
 
@@ -208,7 +206,7 @@ def summarize(run: Run, after: dict[str, Result]) -> dict[str, Any]:
     if modules:
         values = [v for linears in layers.values() for v in linears.values()]
         modules["mean"] = float(np.mean(np.concatenate(values)))
-    trainable, total = adaptation.count(run.policy.model)
+    trainable, total = run.parameters
     return {
         "scale": run.config.scale,
         "seconds": run.seconds,

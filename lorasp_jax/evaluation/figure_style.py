@@ -2,6 +2,9 @@
 
 from typing import Any
 
+COLORS = {"vision": "#4269d0", "language": "#efb118", "action": "#3ca951", "before": "#9498a0"}
+"""Color of each tower in every figure; results before training are gray."""
+
 STYLE: Any = {
     "font.size": 9,
     "axes.spines.top": False,

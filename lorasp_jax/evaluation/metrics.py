@@ -2,14 +2,15 @@
 
 import math
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lorasp_jax.peft import Aux
+from lorasp_jax.policies.policy import ModelAux
 
-Reports = dict[str, dict[str, Aux]]
+Reports = ModelAux
 """Tower -> name of a linear layer -> `Aux` of its adapters, `[..., W, T]`.
 
 W is the number of worlds, times the images of each in the vision tower. T is the number of tokens.
@@ -101,7 +102,7 @@ def _tokens(
 ) -> dict[str, dict[str, tuple[jax.Array, jax.Array]]]:
     """Return active rank and validity, both `[..., W, T]`, of each layer that has a rank."""
 
-    def by_world(linear: Aux) -> tuple[jax.Array, jax.Array]:
+    def by_world(linear: Any) -> tuple[jax.Array, jax.Array]:
         rank, mask = linear.active_rank, linear.token_mask
         assert rank is not None
         assert mask is not None  # backbones always set it

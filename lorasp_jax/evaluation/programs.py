@@ -20,13 +20,12 @@ from envs.env import Env
 from envs.scene.ranges import Randomization
 from envs.state import Poses, State
 from lorasp_jax.base import fast_cpu
-from lorasp_jax.config import Config
 from lorasp_jax.evaluation import rollout
 from lorasp_jax.evaluation.rollout import Rollout, act, as_rollout, num_calls, predict
-from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import RawObservation
 from lorasp_jax.training.distributed import mesh as meshes
+from lorasp_jax.training.run import Run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,22 +132,16 @@ class Worlds:
         self.state = _hold(self._env, self.state, action, np.int32(steps))
 
 
-def prepared(policy: Policy) -> Policy:
-    """Return the policy with a sampler, made by one program; for rollouts of several tasks."""
-    if isinstance(policy.model, Sampler):
-        return policy
-    return dataclasses.replace(policy, model=_sampler(policy.model))
-
-
 def _shareable(policy: Policy) -> Policy:
     """Return the policy as `_predict` takes it, with a sampler and for rows of any prompt table."""
-    return Policy(prepared(policy).model, policy.processor.shared())
+    return Policy(policy.with_sampler().model, policy.processor.shared())
 
 
-def compiled_rollout(config: Config, task: str) -> tuple[Env, Callable[..., Rollout]]:
+def compiled_rollout(run: Run, task: str) -> tuple[Env, Callable[..., Rollout]]:
     """Return the environment of a task, shared by all runs of this process, and its rollout."""
-    settings, size = config.evaluation, config.image_size
-    env = _environment(task, config.robot, settings.worlds, size, config.control_dt)
+    config, settings = run.config, run.config.evaluation
+    sizes = settings.worlds, config.image_size, config.control_dt
+    env = _environment(task, config.robot, *sizes)
     steps = {"execute_steps": settings.execute_steps, "denoise_steps": settings.denoise_steps}
     return env, split_rollout(env, ranges=config.ranges, **steps)
 
@@ -158,11 +151,6 @@ def _environment(task: str, robot: str, worlds: int, image_size: int, control_dt
     return envs.make(
         task, robot=robot, num_envs=worlds, image_size=image_size, control_dt=control_dt
     )
-
-
-@jax.jit
-def _sampler(model: Any) -> Any:
-    return model.sampler()
 
 
 _cached = functools.partial(traced.cached, files=(__file__, rollout.__file__))

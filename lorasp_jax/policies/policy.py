@@ -7,9 +7,11 @@ from typing import Any, Self
 import jax
 
 from lorasp_jax.models.observation import Observation
+from lorasp_jax.models.sampling import Sampler
+from lorasp_jax.models.transformer.layers import ModelAux
 from lorasp_jax.policies.processor import Processor, RawObservation
 
-__all__ = ["Observation", "Policy"]
+__all__ = ["ModelAux", "Observation", "Policy"]
 
 
 @jax.tree_util.register_dataclass
@@ -30,7 +32,9 @@ class Policy:
 
         Call it before a `jax.lax` loop, since XLA does not guarantee to hoist these computations.
         """
-        return dataclasses.replace(self, model=self.model.sampler())
+        if isinstance(self.model, Sampler):
+            return self
+        return dataclasses.replace(self, model=_sampler(self.model))
 
     def sample(
         self,
@@ -74,3 +78,8 @@ class Policy:
         )
         actions = self.processor.decode(chunk, observation["state"])
         return (actions, aux) if return_aux else actions
+
+
+@jax.jit
+def _sampler(model: Any) -> Any:
+    return model.sampler()

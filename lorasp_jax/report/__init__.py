@@ -1,1 +1,1 @@
-"""Reports and films of a run, generated only from the files in its folder."""
+"""Reports of a run, generated only from the files in its folder."""

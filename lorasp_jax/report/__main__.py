@@ -31,7 +31,7 @@ def _write_report(options: argparse.Namespace, console: Console) -> None:
 
 def _write_rank_maps(options: argparse.Namespace, console: Console) -> None:
     from lorasp_jax.base import compilation_cache as cache
-    from lorasp_jax.report import rank_map
+    from lorasp_jax.evaluation import rank_map
 
     cache.enable()
     for path in rank_map.write(options.run, options.task):

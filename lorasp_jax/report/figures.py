@@ -7,10 +7,7 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from lorasp_jax.evaluation.figure_style import STYLE
-
-COLORS = {"vision": "#4269d0", "language": "#efb118", "action": "#3ca951", "before": "#9498a0"}
-"""Color of each tower in every figure; results before training are gray."""
+from lorasp_jax.evaluation.figure_style import COLORS, STYLE
 
 _STYLE = STYLE | {"font.size": 10}
 

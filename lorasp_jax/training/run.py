@@ -10,6 +10,7 @@ from typing import Any
 from rich.console import Console
 
 from envs.datasets.episodes import Episodes
+from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Steps, flatten
 from lorasp_jax.policies.policy import Policy
@@ -58,6 +59,11 @@ class Run:
     def steps(self) -> Steps:
         """All steps to train on."""
         return self.dataset or flatten(list(self.episodes.values()))
+
+    @property
+    def parameters(self) -> tuple[int, int]:
+        """Numbers of trainable parameters and of all parameters."""
+        return adaptation.count(self.policy.model)
 
     @contextlib.contextmanager
     def timed(self, phase: str) -> Iterator[None]:

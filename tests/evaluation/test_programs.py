@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 from dataclasses import field
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.base import fast_cpu
 from lorasp_jax.config import EvaluationConfig
 from lorasp_jax.evaluation import make_rollout, programs
-from lorasp_jax.evaluation.programs import compiled_rollout, prepared, split_rollout
+from lorasp_jax.evaluation.programs import compiled_rollout, split_rollout
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import Aux, LoRA, LoRASP, Method
 from lorasp_jax.policies import statistics_files
@@ -170,7 +171,7 @@ def test_the_config_says_whether_to_randomize(monkeypatch):
     ranges = Randomization(turn=(0.5, 0.5))
     plain = dataclasses.replace(CONFIG, evaluation=EvaluationConfig(execute_steps=3))
     for config, draw in ((plain, None), (dataclasses.replace(plain, scene=ranges), 0.5)):
-        _, rollout = compiled_rollout(config, "press")
+        _, rollout = compiled_rollout(SimpleNamespace(config=config), "press")
         found = rollout(policy(), jax.random.key(0)).draw
         assert found is None if draw is None else set(found.tolist()) == {draw}
 
@@ -182,7 +183,7 @@ def test_tasks_share_the_policy_and_methods_the_tasks(devices):
 
     def run(policy):
         with compilations() as counts:
-            policy = prepared(policy)
+            policy = policy.with_sampler()
             map_threads(lambda rollout: rollout(policy, jax.random.key(3)), rollouts)
         return counts
 
@@ -197,21 +198,24 @@ def test_both_forms_are_equal_in_simulation():
     """The base on its own robot, with tasks of different lengths and instructions."""
     settings = EvaluationConfig(episodes=8, num_envs=8, denoise_steps=4)
     config = dataclasses.replace(CONFIG, robot="panda", image_size=64, evaluation=settings)
+    run = SimpleNamespace(config=config)
     folder = ROOT / "assets" / "pi0_nano"
     model = models.load(folder)
     rules = [("q_proj", LoRASP(rank=8, hidden_width=8))]
     model = adaptation.adapt(model, rules, rngs=nnx.Rngs(0))
     key = jax.random.key(5)
     with compilations() as counts:
-        pairs = [compiled_rollout(config, task) for task in ("press", "open_pot")]
+        pairs = [compiled_rollout(run, task) for task in ("press", "open_pot")]
         texts = [text for env, _ in pairs for text in env.instructions]
         prompts = PromptTable.of(Offline(), texts, model.config, num_joints=7)
         statistics = statistics_files.read(folder)
         base = Policy(model, Processor.of(model.config, statistics, prompts, num_joints=7))
-        splits = map_threads(lambda rollout: rollout(prepared(base), key), [r for _, r in pairs])
+        splits = map_threads(
+            lambda rollout: rollout(base.with_sampler(), key), [r for _, r in pairs]
+        )
         pairs[0][1](base, jax.random.key(6))
     assert counts == POLICY | dict.fromkeys(WORLD, 2)
-    assert compiled_rollout(config, "press")[0] is pairs[0][0]
+    assert compiled_rollout(run, "press")[0] is pairs[0][0]
     env, split = pairs[0][0], splits[0]
     whole = fast_cpu.jit(make_rollout(env, denoise_steps=4))(base, key)
     assert split.success.any()

@@ -71,8 +71,8 @@ def test_the_run_compiles_nothing_else(prepare, monkeypatch):
         jitted = jit_steps(*arguments)
         return SimpleNamespace(lower=lower)
 
-    def compile_rollout(config, task):
-        del config, task
+    def compile_rollout(run, task):
+        del run, task
         return ROOM, split_rollout(ROOM, execute_steps=1, denoise_steps=2)
 
     monkeypatch.setattr(program, "jit_steps", recorded)

@@ -13,7 +13,7 @@ import numpy as np
 from envs.env import Env
 from lorasp_jax.config import Config
 from lorasp_jax.evaluation.metrics import position_bias
-from lorasp_jax.evaluation.programs import compiled_rollout, prepared
+from lorasp_jax.evaluation.programs import compiled_rollout
 from lorasp_jax.extras.latency.execution import Execution, Trace, delayed_rollout
 from lorasp_jax.extras.latency.smoothness import action_delta, jerk
 from lorasp_jax.extras.study import Derived
@@ -66,12 +66,13 @@ def _point(
 def _evaluate(execution: Execution, delay: int, run: Run) -> dict[str, Any]:
     """Evaluate a run's policy on its only task; see `measure_point`."""
     config, (task,) = run.config, run.config.tasks
-    env, _ = compiled_rollout(config, task)
+    env, _ = compiled_rollout(run, task)
     play = delayed_rollout(
         env, execution, denoise_steps=config.evaluation.denoise_steps, ranges=config.ranges
     )
     key = RandomStream.FINAL_EVALUATION.key(config.seed, task)
-    point = measure_point(prepared(run.policy), env, play, key, config.evaluation.episodes, delay)
+    policy, episodes = run.policy.with_sampler(), config.evaluation.episodes
+    point = measure_point(policy, env, play, key, episodes, delay)
     return {"outcomes": {task: point.pop("outcomes")}, "motion": point}
 
 

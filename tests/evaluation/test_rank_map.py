@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from envs.scene.ranges import Randomization
+from lorasp_jax.evaluation import rank_episode, rank_map
+from lorasp_jax.evaluation.rank_episode import RankEpisode
 from lorasp_jax.report import __main__ as command
-from lorasp_jax.report import rank_episode, rank_map
-from lorasp_jax.report.rank_episode import RankEpisode
 from lorasp_jax.training import export
 from lorasp_jax.training.run_folder import to_json, write_json
 from tests.runs import CONFIG, RESULTS, finish, make_run

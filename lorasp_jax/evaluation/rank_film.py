@@ -9,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from lorasp_jax.report.figures import COLORS
+from lorasp_jax.evaluation.figure_style import COLORS
 
 TINT = 0.55
 """Share of the rank's color in a tinted pixel; the rest is the gray image."""

@@ -6,9 +6,9 @@ from pathlib import Path
 import envs
 from envs.rendering.video import write_video
 from lorasp_jax.base.writing import atomic_file
+from lorasp_jax.evaluation import rank_film
+from lorasp_jax.evaluation.rank_episode import record
 from lorasp_jax.evaluation.video import render_episode
-from lorasp_jax.report import rank_film
-from lorasp_jax.report.rank_episode import record
 from lorasp_jax.training import records
 from lorasp_jax.training.export import describe, load_policy
 from lorasp_jax.training.run_folder import CONFIG_FILE, read_json

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import envs
-from lorasp_jax.evaluation import make_rollout, metrics
+from lorasp_jax.evaluation import make_rollout, metrics, rank_episode
+from lorasp_jax.evaluation.rank_episode import RankEpisode, patch_ranks
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
 from lorasp_jax.models.transformer.siglip import patches
@@ -17,8 +18,6 @@ from lorasp_jax.peft import Aux
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Offline
-from lorasp_jax.report import rank_episode
-from lorasp_jax.report.rank_episode import RankEpisode, patch_ranks
 from lorasp_jax.training.run_folder import to_json
 from tests.models.random_models import random_backbone
 from tests.runs import CONFIG, make_run

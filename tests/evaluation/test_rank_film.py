@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.colors import Normalize
 
-from lorasp_jax.report import rank_film
+from lorasp_jax.evaluation import rank_film
 
 
 def test_one_patch_changes_color_where_its_rank_changes():
