@@ -19,7 +19,7 @@ from lorasp_jax.extras.deployment.variants import BATCH_SIZE, BATCHES, VARIANTS,
 from lorasp_jax.extras.study import Derived, held_out, page, statistics
 from lorasp_jax.extras.study.held_out import Keyed
 from lorasp_jax.extras.study.statistics import Estimate
-from lorasp_jax.extras.study.study import Results
+from lorasp_jax.extras.study.study import Results, evaluated
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training.demonstrations import fresh_demonstrations
 from lorasp_jax.training.run import Run
@@ -36,12 +36,7 @@ def cells(run: Path, episodes: int = 0, prefix: str = "") -> tuple[Derived, ...]
         episodes: episodes per task; 0: as many as in the run's evaluation.
         prefix: what the names of the cells begin with, before those of the variants.
     """
-
-    def config(recorded: Config) -> Config:
-        evaluation = recorded.evaluation
-        count = episodes or evaluation.episodes
-        changed = dataclasses.replace(evaluation, episodes=count)
-        return dataclasses.replace(recorded, evaluation=changed)
+    config = functools.partial(evaluated, episodes=episodes)
 
     def transform(name: str) -> Any:
         return lambda policy, _, held: variants.transform(name, policy, held)

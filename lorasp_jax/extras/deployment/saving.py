@@ -5,9 +5,9 @@ from pathlib import Path
 from lorasp_jax.base import compilation_cache as cache
 from lorasp_jax.base.files import check_local
 from lorasp_jax.extras.deployment import variants
-from lorasp_jax.extras.study.finished_run import recorded_config
 from lorasp_jax.extras.study.held_out import held_out_demonstrations
 from lorasp_jax.training import export
+from lorasp_jax.training.finished_run import recorded_config
 
 
 def check_run(run: Path) -> None:

@@ -11,12 +11,12 @@ import jax
 import numpy as np
 
 from envs.env import Env
-from lorasp_jax.config import Config
 from lorasp_jax.evaluation.metrics import position_bias
 from lorasp_jax.evaluation.programs import compiled_rollout, prepared
 from lorasp_jax.extras.latency.execution import Execution, Trace, delayed_rollout
 from lorasp_jax.extras.latency.smoothness import action_delta, jerk
 from lorasp_jax.extras.study import Derived
+from lorasp_jax.extras.study.study import evaluated
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Run
@@ -47,14 +47,8 @@ def cells(
 def _point(
     run: Path, task: str, execution: Execution, delay: int, episodes: int, prefix: str
 ) -> Derived:
-    def config(recorded: Config) -> Config:
-        changed = dataclasses.replace(
-            recorded.evaluation,
-            episodes=episodes or recorded.evaluation.episodes,
-            execute_steps=execution.execute_steps,
-        )
-        return dataclasses.replace(recorded, tasks=(task,), evaluation=changed)
-
+    changes = {"episodes": episodes, "execute_steps": execution.execute_steps}
+    config = functools.partial(evaluated, tasks=(task,), **changes)
     settings: dict[str, Any] = {"execution": execution.name, "delay": delay}
     if execution.name == "guided":
         settings["guidance"] = execution.guidance

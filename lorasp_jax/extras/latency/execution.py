@@ -23,7 +23,6 @@ import numpy as np
 from envs.env import Env
 from envs.scene.ranges import Randomization
 from lorasp_jax.evaluation.programs import Worlds
-from lorasp_jax.models.flow_matching import first
 from lorasp_jax.policies.policy import Policy
 
 EXECUTIONS = {
@@ -131,4 +130,5 @@ def _switch(previous: jax.Array, new: jax.Array, delay: jax.Array) -> jax.Array:
     """Replace the first d actions of `new` `[W, C, J+1]` by those of `previous`."""
     rest = new.shape[1] - previous.shape[1]
     previous = jnp.pad(previous, ((0, 0), (0, rest), (0, 0)))
-    return jnp.where(first(delay, new.shape[1])[:, None], previous, new)
+    is_first = jnp.arange(new.shape[1]) < delay
+    return jnp.where(is_first[:, None], previous, new)

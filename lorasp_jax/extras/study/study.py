@@ -1,5 +1,6 @@
 """A study: named cells, most of which are training runs."""
 
+import dataclasses
 import fnmatch
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -149,6 +150,13 @@ class Study:
             group_of[cell.name] = own = own or cell.name
             groups[own] = (*groups.get(own, ()), cell)
         return groups
+
+
+def evaluated(config: Config, *, tasks: tuple[str, ...] = (), **changes: int) -> Config:
+    """Return a config that evaluates some tasks with other settings; 0 or () keeps its own."""
+    settings = {name: value for name, value in changes.items() if value}
+    evaluation = dataclasses.replace(config.evaluation, **settings)
+    return dataclasses.replace(config, tasks=tasks or config.tasks, evaluation=evaluation)
 
 
 def load(path: Path, scale: str) -> Study:
