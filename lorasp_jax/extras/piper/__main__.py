@@ -10,8 +10,8 @@ from typing import Any
 
 from rich.console import Console
 
+from lorasp_jax.base.arguments import pair
 from lorasp_jax.base.errors import parse_arguments, run_command
-from lorasp_jax.base.locks import locked
 from lorasp_jax.extras.piper import options as shared
 from lorasp_jax.extras.piper.arm import PiperArm
 from lorasp_jax.extras.piper.asking import InThread
@@ -53,7 +53,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--can", default="can0", help="CAN interface (default: %(default)s)")
     add("--bus", choices=("socketcan", "slcan"), default="socketcan", help="its kind "
         "(default: %(default)s)")  # fmt: skip
-    add("--camera", action="append", default=[], metavar="NAME=SOURCE", help="such as "
+    add("--camera", action="append", type=pair, default=[], metavar="NAME=SOURCE", help="such as "
         "side=/dev/video0; once for each of the policy's cameras")  # fmt: skip
     shared.add_shared(parser)
     return parser
@@ -76,13 +76,16 @@ def _run(options: argparse.Namespace) -> int:
         stack.callback(cameras.close)
         if server:
             server.warn([prompt])
-        recorder = _recorder(options, task, prompt, stack)
-        arm = _arm(options)
+        recorder = stack.enter_context(
+            shared.recording(options, task, prompt=prompt, image_size=options.image_size)
+        )
+        arm = PiperArm(options.can, bus=options.bus, **shared.motion(options))
         stack.callback(arm.close)
+        arm.connect()
         if not (options.dry_run or options.teach == "leader"):
             arm.enable(shared.limits(options))
         if server:
-            log = stack.enter_context(shared.opened_log(options))
+            log = stack.enter_context(contextlib.closing(shared.open_log(options)))
             problem = _execute(options, settings, (arm, cameras, server, recorder, log), seconds)
         else:
             problem = _teach(options, (arm, cameras, recorder), seconds)
@@ -99,7 +102,7 @@ def _execute(
     server.reset()
     more = {"recorder": recorder, "log": log}
     limits = shared.limits(options)
-    session = Session(arm, cameras, InThread(server), limits, settings, RealClock(), **more)
+    session = Session(arm, cameras.read, InThread(server), limits, settings, RealClock(), **more)
     shared.stop_on_signals(session)
     return session.run(seconds)
 
@@ -108,7 +111,7 @@ def _teach(options: argparse.Namespace, parts: tuple, seconds: float) -> str | N
     """Record a person; return the problem in a sentence, if there is one."""
     arm, cameras, recorder = parts
     way = {"way": options.teach, "control_dt": options.control_dt}
-    lesson = Lesson(arm, cameras, recorder, shared.limits(options), RealClock(), **way)
+    lesson = Lesson(arm, cameras.read, recorder, shared.limits(options), RealClock(), **way)
     shared.stop_on_signals(lesson)
     print("show the task, then press Ctrl-C")
     try:
@@ -145,26 +148,9 @@ def _end_prompt(number: int, _: Any) -> None:
     raise EOFError(signal.Signals(number).name)  # the terminal may be gone
 
 
-def _recorder(
-    options: argparse.Namespace, task: Any, prompt: str, stack: contextlib.ExitStack
-) -> Recording | None:
-    """Open the dataset, and keep other processes from writing it."""
-    if not options.record:
-        return None
-    stack.enter_context(locked(options.record))
-    return Recording(
-        options.record,
-        task=task.name if task else "task",
-        instructions=task.instructions if task else (),
-        prompt=prompt,
-        control_dt=options.control_dt,
-        image_size=options.image_size,
-    )
-
-
 def _cameras(options: argparse.Namespace, server: shared.Server | None) -> OpenCameras:
     """Open the cameras after checking that there are those that the policy needs."""
-    sources = dict(_pair(text) for text in options.camera)
+    sources = dict(options.camera)
     needed = server.metadata.get("cameras", []) if server else list(sources)[:1] or ["side"]
     if missing := [name for name in needed if name not in sources]:
         examples = " ".join(f"--camera {name}=SOURCE" for name in missing)
@@ -172,25 +158,6 @@ def _cameras(options: argparse.Namespace, server: shared.Server | None) -> OpenC
             f"cameras are needed for {', '.join(needed)}: pass {examples}, such as /dev/video0"
         )
     return OpenCameras(sources)
-
-
-def _arm(options: argparse.Namespace) -> PiperArm:
-    arm = PiperArm(
-        options.can,
-        bus=options.bus,
-        speed=options.speed,
-        effort=options.effort,
-        zeros=options.zeros,
-    )
-    arm.connect()
-    return arm
-
-
-def _pair(text: str) -> tuple[str, str]:
-    name, equals, source = text.partition("=")
-    if not (name and equals and source):
-        raise ValueError(f"--camera must be NAME=SOURCE, got {text!r}")
-    return name, source
 
 
 if __name__ == "__main__":

@@ -14,8 +14,10 @@ from typing import Any
 import numpy as np
 
 from envs import names
+from lorasp_jax.base.locks import locked
 from lorasp_jax.extras.piper.asking import Observation
 from lorasp_jax.extras.piper.log import Log
+from lorasp_jax.extras.piper.recording import Recording
 from lorasp_jax.extras.piper.safety import Limits
 from lorasp_jax.extras.piper.session import Session, Settings
 from lorasp_jax.extras.piper.teaching import Lesson
@@ -78,14 +80,39 @@ def task(name: str) -> Any:
     return importlib.import_module(f"envs.tasks.{name}").TASK
 
 
+def motion(options: argparse.Namespace) -> dict[str, Any]:
+    """Return what `PiperArm` needs to know of the limits."""
+    return {"speed": options.speed, "effort": options.effort, "zeros": options.zeros}
+
+
+def open_log(options: argparse.Namespace) -> Log:
+    """Open the log."""
+    return Log(options.log or Path("logs") / time.strftime("piper-%Y%m%d-%H%M%S"))
+
+
 @contextlib.contextmanager
-def opened_log(options: argparse.Namespace) -> Iterator[Log]:
-    """Open the log, and close it at the end."""
-    log = Log(options.log or Path("logs") / time.strftime("piper-%Y%m%d-%H%M%S"))
-    try:
-        yield log
-    finally:
-        log.close()
+def recording(
+    options: argparse.Namespace, task: Any, **settings: Any
+) -> Iterator[Recording | None]:
+    """Open the dataset, if there is to be one, and keep other processes from writing it.
+
+    Args:
+        options: of the command.
+        task: the `Task`, or None.
+        **settings: of `Recording`.
+    """
+    if not options.record:
+        yield None
+        return
+    name, instructions = (task.name, task.instructions) if task else ("task", ())
+    with locked(options.record):
+        yield Recording(
+            options.record,
+            task=name,
+            instructions=instructions,
+            control_dt=options.control_dt,
+            **settings,
+        )
 
 
 def stop_on_signals(session: Session | Lesson) -> None:
