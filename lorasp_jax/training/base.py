@@ -33,11 +33,8 @@ def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str
     Raises:
         ValueError: the backbone or size is unknown, or the checkpoint does not match the config.
     """
-    options, backbone_class = config.model, backbone.find(config.model.backbone)
-    sizes = [size for size in SIZES if hasattr(backbone_class, size)]
-    if options.size not in sizes:
-        raise ValueError(f"unknown size {options.size!r}: choose one of {', '.join(sizes)}")
-    model_config: BackboneConfig = getattr(backbone_class, options.size)()
+    options = config.model
+    model_config = sized(options.backbone, options.size)
     model_config = dataclasses.replace(
         model_config,
         dtype=options.dtype,
@@ -59,6 +56,15 @@ def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str
         return model, models.weights_hash(model)
     model = model_config.create(nnx.Rngs(RandomStream.BASE.key(config.seed)))
     return model, models.weights_hash(model)
+
+
+def sized(name: str, size: str) -> BackboneConfig:
+    """Return the config of a size of a backbone; raise ValueError if there is none."""
+    found = backbone.find(name)
+    sizes = [each for each in SIZES if hasattr(found, each)]
+    if size not in sizes:
+        raise ValueError(f"unknown size {size!r}: choose one of {', '.join(sizes)}")
+    return getattr(found, size)()
 
 
 def with_config(model: Backbone, **changes: Any) -> Backbone:

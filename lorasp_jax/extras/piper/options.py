@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import functools
 import importlib
 import signal
 import threading
@@ -197,7 +196,6 @@ def policy(options: argparse.Namespace) -> Iterator[Server]:
         OSError: the token cannot be read.
     """
     token = options.token_file.read_text().strip() if options.token_file else ""
-    say = functools.partial(print, flush=True)
-    say(f"connecting to {options.server}")
-    with PolicyClient(options.server, token=token, wait=_WAIT, say=say) as client:
+    print(f"connecting to {options.server}, for up to {_WAIT:g} s", flush=True)
+    with PolicyClient(options.server, token=token, wait=_WAIT) as client:
         yield Server(client, options.adapter)
