@@ -4,10 +4,13 @@ import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
+import jax
+import jax.numpy as jnp
 from flax import nnx
 
 import envs
 from lorasp_jax import models
+from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.compress import quantization
 from lorasp_jax.base import hub
 from lorasp_jax.config import Config
@@ -79,6 +82,16 @@ def with_config(model: Backbone, **changes: Any) -> Backbone:
 def quantized(model: Any, kind: quantization.Kind | Literal[""] | None) -> Any:
     """Return the model with the layers of its three towers quantized, or unchanged if no `kind`."""
     return quantization.quantize(model, [(_TOWERS, kind)]).model if kind else model
+
+
+def in_bf16(model: Any) -> Any:
+    """Return the model with its frozen weights rounded to bf16, as they are saved."""
+    graphdef, adapters, frozen = adaptation.split(model)
+    is_kernel = lambda leaf: isinstance(leaf, quantization.QuantizedKernel)  # noqa: E731
+    frozen = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), frozen, is_leaf=is_kernel)
+    model = nnx.merge(graphdef, adapters, frozen)
+    model.config = dataclasses.replace(model.config, param_dtype="bfloat16")
+    return model
 
 
 def _check_control_dt(folder: Path, control_dt: float) -> None:

@@ -1,20 +1,16 @@
 """Make the deployment variants of a LoRA-SP policy: forms of the adapters times stored bases."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
 
-import jax
-import jax.numpy as jnp
 from flax import nnx
 
 import lorasp_jax
-from envs.datasets.episodes import Episodes
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.extras.study.held_out import Keyed, forward, keyed_batches
-from lorasp_jax.kernels.quantized_weights import Kind, QuantizedKernel
-from lorasp_jax.policies.policy import Policy
-from lorasp_jax.training.base import quantized
+from lorasp_jax.extras.study.study import Demonstrations
+from lorasp_jax.training.base import in_bf16, quantized
 
 BATCH_SIZE, BATCHES = 64, 8
 """Windows per batch, and batches per task, for calibration and for the loss."""
@@ -49,7 +45,7 @@ FORMS: dict[str, Callable[[nnx.Module, Batches], nnx.Module]] = {
 }
 """Forms by name: as trained; pruned to the directions in use on calibration data, and those more
 that a kernel needs; pruned to the most used half of the bank; distilled to LoRA and merged."""
-BASES: dict[str, Kind | None] = {"bf16": None, "int8": "int8", "nf4": "nf4"}
+BASES: dict[str, Literal["int8", "nf4"] | None] = {"bf16": None, "int8": "int8", "nf4": "nf4"}
 """How the base is stored."""
 
 
@@ -58,7 +54,9 @@ WHOLE = "whole-bf16"
 VARIANTS = (WHOLE, *(f"{f}-{b}" for f in FORMS for b in BASES if f"{f}-{b}" != WHOLE))
 
 
-def transform(name: str, policy: Policy, episodes: Mapping[str, Episodes]) -> Policy:
+def transform(
+    name: str, policy: lorasp_jax.policies.Policy, episodes: Demonstrations
+) -> lorasp_jax.policies.Policy:
     """Return a variant of a LoRA-SP policy, calibrated on episodes by task; all count alike."""
     form, base = name.split("-")
     return on_base(in_form(policy, form, episodes), base)
@@ -80,7 +78,9 @@ def is_bank(method: Any) -> bool:
     return isinstance(method, lorasp_jax.LoRASP | lorasp_jax.LoRASPRelease)
 
 
-def in_form(policy: Policy, form: str, episodes: Mapping[str, Episodes]) -> Policy:
+def in_form(
+    policy: lorasp_jax.policies.Policy, form: str, episodes: Demonstrations
+) -> lorasp_jax.policies.Policy:
     """Return a policy whose adapters have another form, and whose frozen weights are in bf16.
 
     Args:
@@ -95,16 +95,6 @@ def in_form(policy: Policy, form: str, episodes: Mapping[str, Episodes]) -> Poli
     return dataclasses.replace(policy, model=FORMS[form](model, together))
 
 
-def on_base(policy: Policy, base: str) -> Policy:
+def on_base(policy: lorasp_jax.policies.Policy, base: str) -> lorasp_jax.policies.Policy:
     """Return the policy with its base stored as one of `BASES`."""
     return dataclasses.replace(policy, model=quantized(policy.model, BASES[base]))
-
-
-def in_bf16(model: Any) -> Any:
-    """Return the model with its frozen weights rounded to bf16, as they are saved."""
-    graphdef, adapters, frozen = lorasp_jax.split(model)
-    is_kernel = lambda leaf: isinstance(leaf, QuantizedKernel)  # noqa: E731
-    frozen = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), frozen, is_leaf=is_kernel)
-    model = nnx.merge(graphdef, adapters, frozen)
-    model.config = dataclasses.replace(model.config, param_dtype="bfloat16")
-    return model

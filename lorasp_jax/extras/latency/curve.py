@@ -3,21 +3,21 @@
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+import lorasp_jax
 from envs.env import Env
 from lorasp_jax.evaluation.metrics import position_bias
 from lorasp_jax.evaluation.programs import compiled_rollout, prepared
-from lorasp_jax.extras.latency.execution import Execution, Trace, delayed_rollout
+from lorasp_jax.extras.latency.execution import Execution, Rollout, Trace, delayed_rollout
 from lorasp_jax.extras.latency.smoothness import action_delta, jerk
 from lorasp_jax.extras.study import Derived
 from lorasp_jax.extras.study.study import evaluated
-from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Run
 
@@ -70,9 +70,9 @@ def _evaluate(execution: Execution, delay: int, run: Run) -> dict[str, Any]:
 
 
 def measure_point(
-    policy: Policy,
+    policy: lorasp_jax.policies.Policy,
     env: Env,
-    rollout: Callable[[Policy, jax.Array, int], Trace],
+    rollout: Rollout,
     key: jax.Array,
     episodes: int,
     delay: int,

@@ -20,7 +20,9 @@ Results: TypeAlias = Mapping[str, Mapping[str, Any]]
 """The content of cell.json by cell name."""
 Evaluate: TypeAlias = Callable[["Run"], dict[str, Any]]
 """Evaluates the policy of a cell's run; returns what cell.json records: `outcomes`, and more."""
-Measure: TypeAlias = Callable[["Run", Mapping[str, "Episodes"], "Policy | None"], dict[str, Any]]
+Demonstrations: TypeAlias = Mapping[str, "Episodes"]
+"""Demonstrations by task."""
+Measure: TypeAlias = Callable[["Run", Demonstrations, "Policy | None"], dict[str, Any]]
 """Maps a cell's run, held-out demonstrations by task, and the source's policy if the cell is
 derived, to further entries of cell.json."""
 RESERVED = ("demonstrations", "held_out", "locks", "logs", "results.json")
@@ -78,7 +80,7 @@ class Derived:
 
     name: str
     source: str | Path
-    transform: Callable[["Policy", Results, Mapping[str, "Episodes"]], "Policy"] | None = None
+    transform: Callable[["Policy", Results, Demonstrations], "Policy"] | None = None
     after: tuple[str, ...] = ()
     config: Callable[[Config], Config] = lambda config: config
     settings: Mapping[str, Any] = field(default_factory=dict)
