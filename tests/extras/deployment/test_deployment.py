@@ -59,7 +59,7 @@ def episodes(monkeypatch):
     monkeypatch.setattr(variants, "BATCHES", 1)
     monkeypatch.setattr(measurement, "BATCHES", 1)
     fake = lambda config, generation: {t: random_episodes(t, generation) for t in config.tasks}  # noqa: E731
-    monkeypatch.setattr(measurement, "fresh_demonstrations", fake)
+    monkeypatch.setattr(measurement, "_other_demonstrations", fake)
     monkeypatch.setattr(
         held_out, "demonstrations", lambda config, *_: {t: HELD_OUT for t in config.tasks}
     )

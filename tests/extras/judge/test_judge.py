@@ -8,7 +8,6 @@ import sys
 import time
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 from PIL import Image
@@ -23,6 +22,7 @@ from tests import ROOT
 from tests.cases import mostly_slow
 from tests.evaluation.line_world import TASK, Line, tasks
 from tests.evaluation.policy_servers import policy_server
+from tests.extras.serving.test_policies import noise_of, reference, request
 
 
 class Mover:
@@ -207,7 +207,6 @@ def test_an_error_of_the_server_is_one_sentence(processes, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--server", "ws://127.0.0.1:9", "--processes", "0"], "at least 1, got 0"),
         (["runs/x", "--processes", "2"], "--processes needs --server"),
         ([], "either the folder of a run or --server"),
         (["runs/x", "--server", "ws://127.0.0.1:9"], "either the folder of a run or --server"),
@@ -238,18 +237,15 @@ def test_run_without_jax_names_the_way_out(monkeypatch):
 
 
 def test_run_acts_as_its_policy(finished):
+    """With a server's noise, here of the fifth connection."""
     actor = RunActor(finished.folder, ["push the button", "push button"], num_steps=2)
-    rng = np.random.default_rng(0)
-    images = {name: rng.integers(0, 255, (32, 32, 3), np.uint8) for name in ("side", "wrist")}
-    state = rng.normal(size=7).astype(np.float32)
+    sent = request(actor._policy.spec, prompt="push the button")
+    images, state = sent.images, sent.state
     actor.reset(4)
     chunk = actor.act(images, state, "push the button")
-    observation = {"image": {k: v[None] for k, v in images.items()}, "state": state[None]}
-    key = jax.random.split(jax.random.key(4))[1]
-    row = finished.policy.processor.prompts.rows(["push the button"])
-    sample = jax.jit(lambda policy: policy.sample(key, observation, row, num_steps=2))
-    (expected,) = sample(finished.policy)
-    np.testing.assert_allclose(chunk, expected, rtol=1e-4, atol=1e-5)
+    noise = noise_of(actor._policy.spec, connection=4)
+    np.testing.assert_allclose(chunk, reference(finished.policy, [sent], noise)[0], atol=1e-5)
+    assert np.abs(actor.act(images, state, "push the button") - chunk).max() > 1e-6
     actor.reset(4)
     assert np.abs(actor.act(images, state, "push button") - chunk).max() > 1e-6
     with pytest.raises(ValueError, match="camera wrist"):

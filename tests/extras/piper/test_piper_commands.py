@@ -202,8 +202,9 @@ def test_the_real_arm_needs_a_task_cameras_and_a_bus(server, film, capsys):
     words[-1] = f"wrist={film}"
     assert real([*words, "--can", "can_nowhere"]) == 2
     assert "cannot open can_nowhere" in capsys.readouterr().err
-    assert real([*words, "--camera", "side"]) == 2
-    assert "--camera must be NAME=SOURCE" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        real([*words, "--camera", "side"])
+    assert "--camera: must be NAME=VALUE, got 'side'" in capsys.readouterr().err
 
 
 def test_the_real_arm_is_not_on_a_virtual_bus(capsys):

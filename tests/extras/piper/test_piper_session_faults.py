@@ -1,6 +1,7 @@
 """The control loop on the fake arm when the arm, the server or a camera fails."""
 
 import contextlib
+import itertools
 import types
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from websockets.exceptions import ConcurrencyError
 
 from lorasp_jax.extras.piper import session as sessions
-from lorasp_jax.extras.piper.cameras import NoPicture, Simulated
+from lorasp_jax.extras.piper.cameras import NoPicture
 from lorasp_jax.extras.piper.fake import frames
 from lorasp_jax.extras.piper.log import Log
 from lorasp_jax.extras.piper.options import Server
@@ -168,7 +169,7 @@ def test_a_policy_that_raises_anything(bench, error):
     assert_holds(run, "bad")
 
 
-@pytest.mark.parametrize("where", ["cameras", "recorder", "log", "done"])
+@pytest.mark.parametrize("where", ["look", "recorder", "log", "done"])
 @pytest.mark.parametrize("error", [OSError("it broke"), KeyboardInterrupt("it broke")])
 def test_every_other_error_brakes_and_is_raised(bench, where, error):
     broken = []
@@ -177,11 +178,11 @@ def test_every_other_error_brakes_and_is_raised(bench, where, error):
         if bench.clock.now() > due and not broken:
             broken.append(where)
             raise error
-        return where == "cameras" and bench.world.images()
+        return where == "look" and bench.world.images()
 
     due = bench.clock.now() + 0.45  # at full speed
     part = {
-        "cameras": Simulated(work),
+        "look": work,
         "recorder": types.SimpleNamespace(step=work),
         "log": types.SimpleNamespace(observation=work, line=lambda *_, **__: work()),
     }
@@ -219,29 +220,26 @@ def test_a_server_that_hangs(bench):
 
 
 def test_pictures_that_stop(bench):
-    class Blinking(Simulated):
-        seen = 0
+    looks = itertools.count(1)
 
-        def read(self):
-            self.seen += 1
-            if 1 < self.seen < 20:
-                raise NoPicture("camera wrist shows nothing new")
-            return super().read()
+    def blink():
+        if 1 < next(looks) < 20:
+            raise NoPicture("camera wrist shows nothing new")
+        return bench.world.images()
 
-    run = Run(bench, Turning(), cameras=Blinking(bench.world.images))
+    run = Run(bench, Turning(), look=blink)
     assert run(1.5) is None
     assert run.said[:2] == ["holding: camera wrist shows nothing new", "going on"]
 
 
 def test_pictures_that_stop_for_good(bench):
-    class Dying(Simulated):
-        def read(self):
-            if bench.clock.now() > due:
-                raise NoPicture("camera wrist shows nothing new")
-            return super().read()
+    def die():
+        if bench.clock.now() > due:
+            raise NoPicture("camera wrist shows nothing new")
+        return bench.world.images()
 
     due = bench.clock.now() + 0.45
-    run = Run(bench, Turning(), cameras=Dying(bench.world.images))
+    run = Run(bench, Turning(), look=die)
     assert "nothing new" in run(30.0)
     assert run.said == [run.said[0], "moving slowly to the rest pose"]
     np.testing.assert_allclose(bench.world.pose[:6], sessions.REST[:6], atol=0.03)

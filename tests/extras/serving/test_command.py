@@ -80,15 +80,20 @@ def test_checkpoints_that_do_not_say_enough(options, refusal, dummy_base):
         (["a", "--token-file", "nothing"], "nothing: No such file"),
         (["a", "--token-file", "empty"], "empty must contain a token"),
         (["a", "--max-batch", "0"], "largest batch"),
-        (["=x"], "NAME=VALUE, got '=x'"),
         (["assets/pi0_nano", "--base", "x"], "--base is for runs"),
-        (["assets/pi0_nano", "--camera", "side"], "NAME=VALUE, got 'side'"),
     ],
 )
 def test_mistakes_get_one_sentence(arguments, refusal, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").write_text("\n")
     assert refusal in refuse(capsys, *arguments, "--port", "0").replace("\n", " ")
+
+
+@pytest.mark.parametrize("words", [["=x"], ["a", "--camera", "side"], ["a", "--adapter", "b="]])
+def test_pairs_have_two_parts(words, capsys):
+    with pytest.raises(SystemExit):
+        command.main(words)
+    assert f"must be NAME=VALUE, got {words[-1]!r}" in capsys.readouterr().err
 
 
 def test_options_without_effect_are_refused(run, capsys):

@@ -123,7 +123,7 @@ def load(*words):
 
 def test_a_server_of_exported_policies(other_folder):
     policy = load(str(other_folder), "--prompt", "push the button")
-    with serving(policy, metadata=policy.metadata) as server, connect(server) as client:
+    with serving(policy) as server, connect(server) as client:
         assert client.metadata["robot"] == "piper"
         sent = observation(policy.spec)
         del sent["prompt"]
