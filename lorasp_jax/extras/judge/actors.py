@@ -82,8 +82,8 @@ class RunActor:
                 f"python -m lorasp_jax.extras.serving {run}, and give --server"
             ) from error
 
-        loaded, self._parse = loading.load_run(str(run)), requests.parse
-        policy = CompiledPolicy(loaded.policy, loaded.words, num_steps=num_steps, max_batch=1)
+        self._parse = requests.parse
+        policy = CompiledPolicy(loading.load_run(str(run)), num_steps=num_steps, max_batch=1)
         for text in instructions:
             policy.tokens(text)
         self._policy = served.ServedPolicies({"run": policy})

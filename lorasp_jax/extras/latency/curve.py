@@ -40,21 +40,17 @@ def cells(
         episodes: episodes per point, those of the run's final evaluation; 0: as many as there.
         prefix: what the names of the cells begin with.
     """
-    points = itertools.product(tasks, executions, delays)
-    return tuple(_point(run, *point, episodes, prefix) for point in points)
-
-
-def _point(
-    run: Path, task: str, execution: Execution, delay: int, episodes: int, prefix: str
-) -> Derived:
-    changes = {"episodes": episodes, "execute_steps": execution.execute_steps}
-    config = functools.partial(evaluated, tasks=(task,), **changes)
-    settings: dict[str, Any] = {"execution": execution.name, "delay": delay}
-    if execution.name == "guided":
-        settings["guidance"] = execution.guidance
-    name = f"{prefix}{task}/{execution.name}/d{delay}"
-    evaluate = functools.partial(_evaluate, execution, delay)
-    return Derived(name, run, config=config, settings=settings, evaluate=evaluate)
+    found = []
+    for task, execution, delay in itertools.product(tasks, executions, delays):
+        changes = {"episodes": episodes, "execute_steps": execution.execute_steps}
+        config = functools.partial(evaluated, tasks=(task,), **changes)
+        settings: dict[str, Any] = {"execution": execution.name, "delay": delay}
+        if execution.name == "guided":
+            settings["guidance"] = execution.guidance
+        name = f"{prefix}{task}/{execution.name}/d{delay}"
+        evaluate = functools.partial(_evaluate, execution, delay)
+        found.append(Derived(name, run, config=config, settings=settings, evaluate=evaluate))
+    return tuple(found)
 
 
 def _evaluate(execution: Execution, delay: int, run: Run) -> dict[str, Any]:

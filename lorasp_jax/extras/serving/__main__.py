@@ -147,13 +147,7 @@ def _compiled(options: argparse.Namespace, named: dict[str, str]) -> dict[str, A
     settings = {name: value for name, value in given.items() if value is not None}
     if options.execution == "guided":
         settings["guidance"] = 10.0 if options.guidance is None else options.guidance
-
-    def compiled(loaded: loading.Loaded) -> CompiledPolicy:
-        continues, metadata = loaded.continues is not False, loaded.metadata
-        return CompiledPolicy(
-            loaded.policy, loaded.words, continues=continues, metadata=metadata, **settings
-        )
-
+    compiled = functools.partial(CompiledPolicy, **settings)
     if all(map(is_run, named.values())):
         _refuse(options, CHECKPOINT_OPTIONS, "is for published checkpoints: runs record theirs")
         where = {"base": options.base, "words": options.tokenizer}

@@ -9,7 +9,6 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from lorasp_jax.config import MAX_NAME_BYTES, Config
-from lorasp_jax.training.experiment_file import call
 
 if TYPE_CHECKING:  # a finished study should load no model code
     from envs.datasets.episodes import Episodes
@@ -159,18 +158,6 @@ def evaluated(config: Config, *, tasks: tuple[str, ...] = (), **changes: int) ->
     settings = {name: value for name, value in changes.items() if value}
     evaluation = dataclasses.replace(config.evaluation, **settings)
     return dataclasses.replace(config, tasks=tasks or config.tasks, evaluation=evaluation)
-
-
-def load(path: Path, scale: str) -> Study:
-    """Load the study that a file defines.
-
-    Raises:
-        ValueError: the file is missing, its code fails, or `get_study` does not return a `Study`.
-    """
-    study = call(path, "get_study", scale)
-    if not isinstance(study, Study):
-        raise ValueError(f"get_study in {path} must return a Study, got {type(study).__name__}")
-    return study
 
 
 def select(study: Study, only: Sequence[str], shard: tuple[int, int]) -> list[str]:

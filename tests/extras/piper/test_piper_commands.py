@@ -169,7 +169,6 @@ def test_only_servers_that_continue_chunks_are_told_how_far_the_arm_is(execution
     [
         (["--task", "juggle"], "unknown task 'juggle'"),
         (["--latency", "0.2"], "--latency must be 0 to 0.15 s"),
-        (["--episodes", "0"], "--episodes must be at least 1, got 0"),
         (["--thinking", "-1"], "--thinking must be at least 0 s, got -1.0"),
         (["--speed", "9"], "at most 3 rad/s, got 9.0"),
         (["--ahead", "5"], "ahead must be 0 to 4"),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from lorasp_jax.extras.serving import policies
+from lorasp_jax.extras.serving.loading import Loaded
 from lorasp_jax.extras.serving.policies import CompiledPolicy, batch_sizes
 from lorasp_jax.extras.serving.requests import Request
 from lorasp_jax.extras.serving.served import ServedPolicies
@@ -36,8 +37,9 @@ def make_policy(config=None, *, seed=0, instructions=INSTRUCTIONS, cameras=None,
 
 
 def compiled(policies, *, max_batch=2, guidance=None, metadata=None, **options):
-    settings = {"max_batch": max_batch, "guidance": guidance, "metadata": metadata}
-    made = {n: CompiledPolicy(p, WORDS, num_steps=STEPS, **settings) for n, p in policies.items()}
+    settings = {"num_steps": STEPS, "max_batch": max_batch, "guidance": guidance}
+    loaded = {name: Loaded(each, WORDS, None, metadata or {}) for name, each in policies.items()}
+    made = {name: CompiledPolicy(each, **settings) for name, each in loaded.items()}
     return ServedPolicies(made, **options)
 
 

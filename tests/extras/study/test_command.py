@@ -8,7 +8,7 @@ import pytest
 
 from lorasp_jax.extras.study import __main__ as command
 from lorasp_jax.extras.study import results, runner, workers
-from lorasp_jax.extras.study.study import load, select
+from lorasp_jax.extras.study.study import select
 from tests import ROOT
 from tests.extras.study import fakes
 from tests.extras.study.fakes import NAMES, ran, study
@@ -135,7 +135,7 @@ def test_every_cell_is_in_one_shard():
 def test_a_file_must_return_a_study(tmp_path):
     (tmp_path / "a.py").write_text("def get_study(scale): return 7\n")
     with pytest.raises(ValueError, match=r"get_study in .*a\.py must return a Study, got int"):
-        load(tmp_path / "a.py", "smoke")
+        results.load_study(tmp_path / "a.py", "smoke")
 
 
 def test_a_finished_study_loads_no_model_and_no_simulation(start, tmp_path):

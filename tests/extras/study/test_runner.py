@@ -13,13 +13,14 @@ from tests.extras.study.fakes import NAMES, ran, run, states, study
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "POLL", 0.01)
     (tmp_path / "fake").mkdir()
     return tmp_path / "fake"
 
 
 def work(folder, names=NAMES, run_cell=run, of=None):
-    runner.work(of or study(), folder, names, run_cell, poll=0.01)
+    runner.work(of or study(), folder, names, run_cell)
 
 
 def test_cells_run_once_in_order(folder):

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from envs.rendering.video import side_by_side, write_video
 from lorasp_jax.base import compilation_cache as cache
+from lorasp_jax.base.arguments import positive
 from lorasp_jax.base.errors import parse_arguments, run_command
 from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.extras.piper import options as shared
@@ -50,7 +51,7 @@ def parser(program: str) -> argparse.ArgumentParser:
         "--task", default="press", help="open_pot, pick_place, pour or press (default: %(default)s)"
     )
     add("--expert", action="store_true", help="the scripted expert in place of a server")
-    add("--episodes", type=int, default=1, help="default: %(default)s")
+    add("--episodes", type=positive, default=1, help="default: %(default)s")
     add("--seed", type=int, default=0, help="of the first layout (default: %(default)s)")
     add("--latency", type=float, default=0.0, help="of commands on their way to the motors [s], "
         f"at most {_LARGEST_LATENCY} (default: %(default)s)")  # fmt: skip
@@ -70,8 +71,6 @@ def parser(program: str) -> argparse.ArgumentParser:
 def _run(options: argparse.Namespace, console: Console) -> None:
     if not 0 <= options.latency <= _LARGEST_LATENCY:
         raise ValueError(f"--latency must be 0 to {_LARGEST_LATENCY} s, got {options.latency}")
-    if options.episodes < 1:
-        raise ValueError(f"--episodes must be at least 1, got {options.episodes}")
     if options.thinking < 0:
         raise ValueError(f"--thinking must be at least 0 s, got {options.thinking}")
     task = shared.task(options.task)
