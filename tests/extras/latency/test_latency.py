@@ -40,12 +40,13 @@ def folder(tmp_path, monkeypatch):
     (tmp_path / "run").mkdir()
     folder = finish(tmp_path / "run")
     write_json(folder / "results.json", RESULTS | {"tasks": {"press": TASK, "pour": TASK}})
-    optim = dataclasses.replace(CONFIG.optim, rtc_max_delay=2)
+    optim = dataclasses.replace(CONFIG.optim, rtc_max_delay=1)
     config = dataclasses.replace(CONFIG, evaluation=SETTINGS, optim=optim)
     write_json(folder / "config.json", to_json(config))
     monkeypatch.setattr(run_cell, "_source", lambda run: None)
     monkeypatch.setattr(curve, "prepared", lambda policy: policy)
     monkeypatch.setattr(curve, "delayed_rollout", played)
+    monkeypatch.setattr(command, "MAX_DELAY", 2)
     monkeypatch.setattr(command, "describe", lambda run: {"policy": {"config": {"chunk": 10}}})
     played.calls = []
     return folder
@@ -66,14 +67,14 @@ def measured(folder):
 def test_every_execution_is_measured_at_every_delay(folder, capsys):
     assert command.main([str(folder), "--episodes", "4"]) == 0
     beyond, *written = capsys.readouterr().out.splitlines()
-    assert beyond.endswith("beyond d = 2 is beyond its --optim.rtc-max-delay")
+    assert beyond.endswith("beyond d = 1 is beyond its --optim.rtc-max-delay")
     assert written == [f"written: {folder / name}" for name in ("latency", "latency.svg")]
     found = measured(folder)
     assert found.keys() == {
         f"{task}/{execution}/d{delay}"
         for task in ("press", "pour")
         for execution in EXECUTIONS
-        for delay in range(6)
+        for delay in range(3)
     }
     point = found["pour/trained/d1"]
     assert (point["outcomes"], point["motion"]["steps"]) == ({"pour": "1010"}, 6)

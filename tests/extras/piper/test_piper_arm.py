@@ -5,7 +5,6 @@ import pytest
 
 from lorasp_jax.extras.piper.arm import PiperArm
 from lorasp_jax.extras.piper.fake import frames
-from lorasp_jax.extras.piper.fake.world import World
 from lorasp_jax.extras.piper.safety import (
     MAX_AGE,
     MAX_DRIVER_AGE,
@@ -18,11 +17,6 @@ from lorasp_jax.extras.piper.safety import (
 from tests.extras.piper.benches import Bench, channel
 
 LIMITS = Limits.of()
-
-
-@pytest.fixture(scope="module")
-def world():
-    return World("press")
 
 
 @pytest.fixture

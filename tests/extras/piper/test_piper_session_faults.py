@@ -81,6 +81,7 @@ def test_an_arm_with_a_fault_holds_where_it_is(bench, faults, words):
     assert np.abs(run.path[-1] - sessions.REST)[:6].max() > 0.5
 
 
+@pytest.mark.usefixtures("near_rest")
 def test_a_collision_does_not_end_by_itself(bench):
     run = Run(bench, ask := Turning())
     run.at = {
@@ -125,6 +126,7 @@ def test_chunks_too_short_for_the_settings_are_an_error_before_the_arm_moves(ben
     assert_safe(run)
 
 
+@pytest.mark.usefixtures("near_rest")
 def test_a_later_chunk_that_is_too_short_is_refused_and_the_arm_goes_to_rest(bench):
     run = Run(bench, ask := Turning(8), settings={"execute": 5, "ahead": 3})
     run.at = {0.3: lambda: setattr(ask, "change", lambda actions: actions[:7])}
@@ -133,6 +135,7 @@ def test_a_later_chunk_that_is_too_short_is_refused_and_the_arm_goes_to_rest(ben
     assert_holds(run, "at least 8 actions")
 
 
+@pytest.mark.usefixtures("near_rest")
 def test_a_server_that_dies_in_mid_chunk(bench):
     policy = StandIn()
     policy.prepare = lambda request, index: request.state
@@ -147,6 +150,7 @@ def test_a_server_that_dies_in_mid_chunk(bench):
     assert_holds(run, "closed the connection")
 
 
+@pytest.mark.usefixtures("near_rest")
 def test_a_server_that_refuses(bench):
     with serving(StandIn()) as server:
         client = PolicyClient(server.address)
@@ -156,6 +160,7 @@ def test_a_server_that_refuses(bench):
     assert_holds(run, "prompt must be text")
 
 
+@pytest.mark.usefixtures("near_rest")
 @pytest.mark.parametrize("error", [FrameError("bad"), TypeError("bad"), ConcurrencyError("bad")])
 def test_a_policy_that_raises_anything(bench, error):
     run = Run(bench, ask := Turning())
@@ -213,6 +218,7 @@ def test_a_kind_of_frame_that_stops(bench, kinds):
     assert_braked(run)
 
 
+@pytest.mark.usefixtures("near_rest")
 def test_a_server_that_hangs(bench):
     run = Run(bench, Turning(), latency=9.0, settings={"patience": 0.4})
     assert "did not answer within 0.4 s" in run(30.0)

@@ -70,7 +70,7 @@ def test_parts_of_a_study(start, folder):
 
 
 def test_a_failed_cell_is_reported_and_tried_again(start, folder, monkeypatch):
-    monkeypatch.setattr(InProcess, "run_cell", staticmethod(fail))
+    monkeypatch.setattr(InProcess, "run_cell", staticmethod(failing("sp/s1")))
     code, text = start()
     assert code == 2
     assert "sp/s1: failed RuntimeError: boom" in text
@@ -80,10 +80,15 @@ def test_a_failed_cell_is_reported_and_tried_again(start, folder, monkeypatch):
     assert sorted(ran(folder)) == sorted(NAMES)
 
 
-def fail(job):
-    if job.cell.name == "sp/s1":
-        raise RuntimeError("boom")
-    return fakes.run(job)
+def failing(name):
+    """Return a function that runs all cells but one."""
+
+    def run(job):
+        if job.cell.name == name:
+            raise RuntimeError("boom")
+        return fakes.run(job)
+
+    return run
 
 
 def test_a_damaged_cell_is_reported(start, folder):
@@ -202,18 +207,12 @@ def test_a_derived_cell_gets_its_source_again(start, folder, committed):
 def test_a_source_that_fails_again_keeps_its_results(start, folder, committed, monkeypatch):
     without(committed, "cut/s0")
     before = committed.read_bytes()
-    monkeypatch.setattr(InProcess, "run_cell", staticmethod(fail_source))
+    monkeypatch.setattr(InProcess, "run_cell", staticmethod(failing("lora/s0")))
     code, text = start("--results", str(committed))
     assert code == 2
-    assert "lora/s0: failed RuntimeError: no memory" in text
+    assert "lora/s0: failed RuntimeError: boom" in text
     assert "cut/s0: waiting for lora/s0 (failed)" in text
     assert committed.read_bytes() == before
-
-
-def fail_source(job):
-    if job.cell.name == "lora/s0":
-        raise RuntimeError("no memory")
-    return fakes.run(job)
 
 
 def test_no_result_of_the_file_is_lost(start, folder, committed, tmp_path):

@@ -104,12 +104,13 @@ def _episodes(
         ServerGone: the connection to the server ended; an episode that it cut short is not counted.
     """
     wins, (log, recorder, film) = 0, records
+    limit = shared.task(options.task).time_limit
     for episode in range(options.episodes):
         bench.reset(options.seed + episode)
         log.line(bench.clock.now(), episode=episode)
         session = _session(options, bench, server, options.seed + episode, records, console)
         world = bench.fake.world
-        problem = session.run(world.env.task.time_limit, _judge(world, film))
+        problem = session.run(limit, _judge(world, film))
         wins += world.success
         if recorder and world.success:
             recorder.keep()
