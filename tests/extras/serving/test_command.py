@@ -98,8 +98,8 @@ def test_pairs_have_two_parts(words, capsys):
 
 
 def test_options_without_effect_are_refused(run, capsys):
-    for option in ("--statistics", "--joints", "--adapter"):
-        assert f"{option} is for" in refuse(capsys, str(run), option, "1", "--port", "0")
+    for words in (["--statistics", "x"], ["--joints", "6"], ["--adapter", "a=x"]):
+        assert f"{words[0]} is for" in refuse(capsys, str(run), *words, "--port", "0")
 
 
 def test_names_of_policies(tmp_path):

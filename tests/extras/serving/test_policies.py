@@ -1,8 +1,10 @@
 """Test that a served policy gives the same actions as `Policy.sample`, alone and in batches."""
 
 import dataclasses
+import functools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -53,20 +55,27 @@ def request(spec, seed=0, prompt=INSTRUCTIONS[1], absent=(), **fields):
 
 def reference(policy, sent, noise, *, absent=(), **condition):
     """Actions of the policy itself for requests with the same prompt."""
-    processor, state = policy.processor, np.stack([each.state for each in sent])
     images = {name: np.stack([each.images[name] for each in sent]) for name in sent[0].images}
-    rows = processor.prompts.rows([each.prompt for each in sent])
-    encoded = processor.encode({"image": images, "state": state}, rows)
+    seen = {"image": images, "state": np.stack([each.state for each in sent])}
+    rows = jnp.asarray(policy.processor.prompts.rows([each.prompt for each in sent]))
+    return np.asarray(_reference(policy, seen, rows, noise, condition, absent=tuple(absent)))
+
+
+@functools.partial(jax.jit, static_argnames="absent")
+def _reference(policy, seen, rows, noise, condition, *, absent):
+    processor = policy.processor
+    encoded = processor.encode(seen, rows)
     for name in absent:
-        masks = {**encoded.image_masks, name: np.zeros(len(sent), bool)}
+        masks = {**encoded.image_masks, name: jnp.zeros(len(rows), bool)}
         pictures = {**encoded.images, name: 0 * encoded.images[name] - 1}
         encoded = dataclasses.replace(encoded, images=pictures, image_masks=masks)
     if condition:
-        condition["prefix"] = processor.normalize_actions(condition["prefix"], state)
+        prefix = processor.normalize_actions(condition["prefix"], seen["state"])
+        condition = condition | {"prefix": prefix}
     chunk = policy.model.sample_actions(
         None, encoded, num_steps=STEPS, noise=noise, slots=processor.flow_slots, **condition
     )
-    return np.asarray(processor.decode(chunk, state))
+    return processor.decode(chunk, seen["state"])
 
 
 def noise_of(spec, connection=0, request=0):
