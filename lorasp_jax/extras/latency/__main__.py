@@ -47,11 +47,7 @@ def _measure(options: argparse.Namespace) -> None:
 
 
 def _study(run: Path, options: argparse.Namespace) -> Study:
-    """Return the study of a run's points.
-
-    Raises:
-        ValueError: the run is unfinished or cannot be simulated, or the options do not fit it.
-    """
+    """Return the study of a run's points; raise ValueError if the options do not fit the run."""
     config = recorded_config(run)
     if unknown := [task for task in options.tasks if task not in config.tasks]:
         raise ValueError(f"the tasks of {run} are {', '.join(config.tasks)}, got {unknown[0]!r}")

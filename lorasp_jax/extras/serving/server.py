@@ -150,11 +150,7 @@ class PolicyServer:
     async def _answer(
         self, connection: ServerConnection, client: ClientState, frame: bytes | str
     ) -> None:
-        """Reply to one frame.
-
-        Raises:
-            ValueError, PolicyFailure: it has no answer.
-        """
+        """Reply to one frame; raise ValueError or PolicyFailure if it has no answer."""
         start = time.perf_counter()
         if isinstance(frame, str):
             raise wire.FrameError("a request must be a binary frame")

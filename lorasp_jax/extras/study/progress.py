@@ -133,11 +133,7 @@ def _is_elsewhere(cell: Cell | Derived) -> bool:
 def _config(
     cell: Cell | Derived, others: Mapping[str, Status], run_config: Callable[[Path], Config]
 ) -> Config:
-    """Return the config of a cell's run.
-
-    Raises:
-        ValueError: the source is not a finished run.
-    """
+    """Return the config of a cell's run; raise ValueError if its source is not finished."""
     if isinstance(cell, Derived):
         source = cell.source
         found = run_config(source) if isinstance(source, Path) else others[source].config

@@ -163,14 +163,6 @@ def test_refusals(run, dummy_base, tmp_path, capsys):
     assert not out.exists()
 
 
-def test_a_run_needs_its_config_and_results(dummy_base, tmp_path, capsys):
-    run = finished_run(tmp_path / "run", dummy_base)
-    write_json(run / "results.json", RESULTS | {"tasks": {}})
-    assert f"the tasks of {run} cannot be simulated" in refuse(capsys, run)
-    (run / "results.json").unlink()
-    assert f"{run} is not a finished run" in refuse(capsys, run)
-
-
 def test_quantized_base_of_a_policy_is_checked(run, tmp_path):
     policy, kind = export.load_policy(run), cast(Any, "int2")
     export.write_variant(tmp_path / "x", policy, run, quantized=kind)
