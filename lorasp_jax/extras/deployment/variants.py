@@ -1,16 +1,26 @@
-"""Make the deployment variants of a LoRA-SP policy: forms of the adapters times stored bases."""
+"""Make and save the deployment variants of a LoRA-SP policy: forms of adapters times bases."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 from flax import nnx
 
 import lorasp_jax
 from lorasp_jax.adapters import adaptation
-from lorasp_jax.extras.study.held_out import Keyed, forward, keyed_batches
+from lorasp_jax.base import compilation_cache as cache
+from lorasp_jax.base.files import check_local
+from lorasp_jax.extras.study.held_out import (
+    Keyed,
+    forward,
+    held_out_demonstrations,
+    keyed_batches,
+)
 from lorasp_jax.extras.study.study import Demonstrations
+from lorasp_jax.training import export
 from lorasp_jax.training.base import in_bf16, quantized
+from lorasp_jax.training.finished_run import recorded_config
 
 BATCH_SIZE, BATCHES = 64, 8
 """Windows per batch, and batches per task, for calibration and for the loss."""
@@ -98,3 +108,32 @@ def in_form(
 def on_base(policy: lorasp_jax.policies.Policy, base: str) -> lorasp_jax.policies.Policy:
     """Return the policy with its base stored as one of `BASES`."""
     return dataclasses.replace(policy, model=quantized(policy.model, BASES[base]))
+
+
+def check_run(run: Path) -> None:
+    """Raise ValueError unless a run is finished, can be simulated, and was trained with LoRA-SP."""
+    method = recorded_config(run).peft
+    if not is_bank(method):
+        name = type(method).__name__
+        raise ValueError(f"{run} was trained with {name}: only LoRA-SP runs have variants")
+
+
+def save(run: Path, name: str, out: Path) -> None:
+    """Make one variant of a run and write it to a new folder.
+
+    The folder has the adapters and refers to the run's base, or has the merged weights. A base in
+    int8 or nf4 is quantized whenever the folder is loaded.
+
+    Raises:
+        ValueError: the variant is unknown, or the folder exists.
+    """
+    form, base = check(name).split("-")
+    check_local(out)
+    if out.exists():
+        raise ValueError(f"{out} exists already: choose another --out")
+    cache.enable()
+    policy = export.load_policy(run)
+    # Those on which `measurement` calibrates.
+    episodes = held_out_demonstrations(run / "deployment", recorded_config(run))
+    deployed = in_form(policy, form, episodes)
+    export.write_variant(out, deployed, run, quantized=BASES[base])

@@ -1,5 +1,6 @@
 """Run episodes of tasks and count successes."""
 
+import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -131,8 +132,8 @@ def judge_task(
     progress: Progress | None = None,
 ) -> list[EpisodeResult]:
     """Run the episodes of one task; arguments and errors are those of `judge`."""
-    env, done = task.make(), list[EpisodeResult]()
-    try:
+    done = list[EpisodeResult]()
+    with contextlib.closing(task.make()) as env:
         for number in range(episodes):
             film = films is not None and number == 0
             done.append(run_episode(task, env, actor, seed + number, film=film))
@@ -140,8 +141,6 @@ def judge_task(
                 progress(task.name, len(done), sum(bool(each.success) for each in done))
         if films is not None:
             write_film(films / f"{task.name}.webp", done[0].frames, _fps(task, env))
-    finally:
-        env.close()
     return done
 
 

@@ -15,7 +15,7 @@ from lorasp_jax.base.errors import parse_arguments, run_command
 from lorasp_jax.extras.piper import options as shared
 from lorasp_jax.extras.piper.arm import PiperArm
 from lorasp_jax.extras.piper.asking import InThread
-from lorasp_jax.extras.piper.cameras import OpenCameras
+from lorasp_jax.extras.piper.cameras import open_cameras
 from lorasp_jax.extras.piper.clock import RealClock
 from lorasp_jax.extras.piper.recording import Recording
 from lorasp_jax.extras.piper.safety import Unsafe
@@ -72,8 +72,7 @@ def _run(options: argparse.Namespace) -> int:
     seconds = options.seconds or (task.time_limit if task else 60.0)
     with contextlib.ExitStack() as stack:
         server = None if options.teach else stack.enter_context(shared.policy(options))
-        cameras = _cameras(options, server)
-        stack.callback(cameras.close)
+        look = open_cameras(_sources(options, server), stack)
         if server:
             server.warn([prompt])
         recorder = stack.enter_context(
@@ -86,9 +85,9 @@ def _run(options: argparse.Namespace) -> int:
             arm.enable(shared.limits(options))
         if server:
             log = stack.enter_context(contextlib.closing(shared.open_log(options)))
-            problem = _execute(options, settings, (arm, cameras, server, recorder, log), seconds)
+            problem = _execute(options, settings, (arm, look, server, recorder, log), seconds)
         else:
-            problem = _teach(options, (arm, cameras, recorder), seconds)
+            problem = _teach(options, (arm, look, recorder), seconds)
         if recorder and not problem:
             _keep(recorder)
         return HELD if problem else 0
@@ -98,20 +97,20 @@ def _execute(
     options: argparse.Namespace, settings: Settings, parts: tuple, seconds: float
 ) -> str | None:
     """Run the policy; return the problem in a sentence, if there is one."""
-    arm, cameras, server, recorder, log = parts
+    arm, look, server, recorder, log = parts
     server.reset()
     more = {"recorder": recorder, "log": log}
     limits = shared.limits(options)
-    session = Session(arm, cameras.read, InThread(server), limits, settings, RealClock(), **more)
+    session = Session(arm, look, InThread(server), limits, settings, RealClock(), **more)
     shared.stop_on_signals(session)
     return session.run(seconds)
 
 
 def _teach(options: argparse.Namespace, parts: tuple, seconds: float) -> str | None:
     """Record a person; return the problem in a sentence, if there is one."""
-    arm, cameras, recorder = parts
+    arm, look, recorder = parts
     way = {"way": options.teach, "control_dt": options.control_dt}
-    lesson = Lesson(arm, cameras.read, recorder, shared.limits(options), RealClock(), **way)
+    lesson = Lesson(arm, look, recorder, shared.limits(options), RealClock(), **way)
     shared.stop_on_signals(lesson)
     print("show the task, then press Ctrl-C")
     try:
@@ -148,8 +147,8 @@ def _end_prompt(number: int, _: Any) -> None:
     raise EOFError(signal.Signals(number).name)  # the terminal may be gone
 
 
-def _cameras(options: argparse.Namespace, server: shared.Server | None) -> OpenCameras:
-    """Open the cameras after checking that there are those that the policy needs."""
+def _sources(options: argparse.Namespace, server: shared.Server | None) -> dict[str, str]:
+    """Return the cameras' sources after checking that there are those that the policy needs."""
     sources = dict(options.camera)
     needed = server.metadata.get("cameras", []) if server else list(sources)[:1] or ["side"]
     if missing := [name for name in needed if name not in sources]:
@@ -157,7 +156,7 @@ def _cameras(options: argparse.Namespace, server: shared.Server | None) -> OpenC
         raise ValueError(
             f"cameras are needed for {', '.join(needed)}: pass {examples}, such as /dev/video0"
         )
-    return OpenCameras(sources)
+    return sources
 
 
 if __name__ == "__main__":

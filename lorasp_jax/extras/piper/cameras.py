@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from typing import Any
 
 import av
@@ -79,28 +80,14 @@ class Camera:
         self._container.close()
 
 
-class OpenCameras:
-    """Several sources."""
+def open_cameras(sources: Mapping[str, str], stack: ExitStack) -> Look:
+    """Open camera name -> source until the stack is closed.
 
-    def __init__(self, sources: Mapping[str, str]) -> None:
-        """Open camera name -> source.
-
-        Raises:
-            ConnectionError: a source cannot be opened.
-        """
-        self._cameras: dict[str, Camera] = {}
-        try:
-            for name, source in sources.items():
-                self._cameras[name] = Camera(name, source)
-        except ConnectionError:
-            self.close()
-            raise
-
-    def read(self) -> dict[str, np.ndarray]:
-        """Return the newest picture of each camera, uint8 [H, W, 3]; raise `NoPicture` if stale."""
-        return {name: camera.read() for name, camera in self._cameras.items()}
-
-    def close(self) -> None:
-        """Stop all."""
-        for camera in self._cameras.values():
-            camera.close()
+    Raises:
+        ConnectionError: a source cannot be opened.
+    """
+    cameras: dict[str, Camera] = {}
+    for name, source in sources.items():
+        cameras[name] = Camera(name, source)
+        stack.callback(cameras[name].close)
+    return lambda: {name: camera.read() for name, camera in cameras.items()}

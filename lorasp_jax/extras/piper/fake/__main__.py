@@ -22,7 +22,7 @@ from lorasp_jax.extras.piper.asking import InThread, InTurn
 from lorasp_jax.extras.piper.fake.demonstrator import Demonstrator
 from lorasp_jax.extras.piper.fake.firmware import PERIOD, FakePiper
 from lorasp_jax.extras.piper.fake.timing import Lockstep, RealTime
-from lorasp_jax.extras.piper.fake.world import PhysicsGap, World
+from lorasp_jax.extras.piper.fake.world import TIMESTEP, World
 from lorasp_jax.extras.piper.session import Session
 from lorasp_jax.extras.serving.client import ServerGone
 
@@ -84,7 +84,7 @@ def _run(options: argparse.Namespace, console: Console) -> None:
         world.reset(options.seed)
         if server:
             server.warn([options.prompt] if options.prompt else world.env.instructions)
-        settings = {"image_size": size, "physics_dt": PhysicsGap().timestep}
+        settings = {"image_size": size, "physics_dt": TIMESTEP}
         prompt = options.prompt or task.instructions[0]
         with (
             _video(options.video) as film,
