@@ -2,23 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
-
-
-class Actor(Protocol):
-    """Returns action chunks."""
-
-    def reset(self, seed: int) -> None:
-        """Start an episode; `seed` sets the noise of its actions."""
-        ...
-
-    def act(
-        self, images: Mapping[str, np.ndarray], state: np.ndarray, instruction: str
-    ) -> np.ndarray:
-        """Return a chunk f32 `[C, A]` for pictures uint8 `[H, W, 3]` and a state `[D]`."""
-        ...
 
 
 class ServerActor:
@@ -108,3 +94,7 @@ class RunActor:
         row = self._policy.prepare(self._parse(message, spec), (self._episode, self._calls))
         self._calls += 1
         return self._policy.run("run", [row])[0]
+
+
+Actor: TypeAlias = ServerActor | RunActor
+"""Returns action chunks, f32 `[C, A]`, for pictures uint8 `[H, W, 3]` and a state `[D]`."""
