@@ -13,6 +13,7 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.compress import quantization
 from lorasp_jax.extras.deployment import __main__ as command
 from lorasp_jax.extras.deployment import measurement, variants
+from lorasp_jax.extras.deployment.measurement import call_milliseconds
 from lorasp_jax.extras.serving import loading
 from lorasp_jax.extras.study import held_out, results, run_cell
 from lorasp_jax.peft import LoRA
@@ -50,6 +51,7 @@ def episodes(monkeypatch):
     """Replace the simulation and shrink the batches."""
     monkeypatch.setattr(variants, "BATCHES", 1)
     monkeypatch.setattr(measurement, "BATCHES", 1)
+    monkeypatch.setattr(measurement, "call_milliseconds", lambda *_: 1.5)
     fake = lambda config, generation: {t: random_episodes(t, generation) for t in config.tasks}  # noqa: E731
     monkeypatch.setattr(measurement, "_other_demonstrations", fake)
     monkeypatch.setattr(
@@ -95,7 +97,7 @@ def test_table(run, capsys):
     assert found.keys() == {"whole-bf16", "half-nf4"}
     for cell in found.values():
         assert cell["config"]["evaluation"]["episodes"] == 4
-        assert cell["measures"]["milliseconds"] > 0
+        assert cell["measures"]["milliseconds"] == 1.5
         assert 0 < cell["measures"]["loss"] < 100
     assert found["half-nf4"]["measures"]["bytes"] < found["whole-bf16"]["measures"]["bytes"]
     assert command.main(arguments) == 0  # nothing is measured again
@@ -104,6 +106,12 @@ def test_table(run, capsys):
     assert "it was run with other evaluation.episodes" in other
 
 
+@pytest.mark.slow
+def test_a_call_takes_time(run):
+    assert call_milliseconds(export.load_policy(run), EPISODES) > 0
+
+
+@pytest.mark.slow
 def test_forms(run):
     policy = export.load_policy(run)
     forms = {form: variants.in_form(policy, form, EPISODES) for form in variants.FORMS}

@@ -47,6 +47,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(curve, "prepared", lambda policy: policy)
     monkeypatch.setattr(curve, "delayed_rollout", played)
     monkeypatch.setattr(command, "MAX_DELAY", 2)
+    monkeypatch.setattr(run_cell.gc, "collect", lambda: 0)  # there are no models
     monkeypatch.setattr(command, "describe", lambda run: {"policy": {"config": {"chunk": 10}}})
     played.calls = []
     return folder

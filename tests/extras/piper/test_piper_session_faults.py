@@ -102,6 +102,7 @@ def test_a_person_who_guides_the_arm_gets_it(bench):
     assert bench.fake.commands == sent < 120
 
 
+@pytest.mark.usefixtures("near_rest")
 def test_a_chunk_with_nan_is_refused_and_the_arm_goes_to_rest(bench):
     ask = Turning()
     run = Run(bench, ask)
