@@ -22,6 +22,7 @@ from rich.console import Console
 from benchmarks.measuring import print_table
 from lorasp_jax.extras.serving.client import PolicyClient
 from lorasp_jax.extras.serving.requests import PolicySpec, Request
+from lorasp_jax.extras.serving.served import ServedPolicies
 
 WARM_UP = 2
 """Calls of each client before the clock starts, as in openpi's example client."""
@@ -29,13 +30,12 @@ PERCENTILES = (25, 50, 75, 90, 95, 99)
 """As in the table that openpi's example client prints (examples/simple_client/main.py)."""
 
 
-class Waiting:
+class Waiting(ServedPolicies):
     """A policy that waits for a fixed time per batch."""
-
-    sizes = (1, 2, 4, 8)
 
     def __init__(self, image_size: int, cameras: int, seconds: float) -> None:
         names = tuple(f"camera{i}" for i in range(cameras))
+        self.sizes, self.metadata = (1, 2, 4, 8), {}
         self.spec, self._seconds = PolicySpec(names, image_size, 7, 50), seconds
         self.instructions = {"base": ()}
 

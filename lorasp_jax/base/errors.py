@@ -12,8 +12,10 @@ import re
 import select
 import sys
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
-from rich.console import Console
+if TYPE_CHECKING:  # the judge runs where Rich is not installed
+    from rich.console import Console
 
 REFUSED = 2
 """Exit code after bad input."""
@@ -53,7 +55,7 @@ def parse_arguments(
 
 def run_command(
     command: Callable[[], int | None],
-    errors: Console,
+    errors: "Console",
     interrupted: str = "interrupted",
     remedy: str = "",
 ) -> int:
@@ -75,7 +77,7 @@ def run_command(
         return INTERRUPTED
 
 
-def report_error(error: Exception, errors: Console, remedy: str = "") -> int:
+def report_error(error: Exception, errors: "Console", remedy: str = "") -> int:
     """Print why a command failed.
 
     Args:

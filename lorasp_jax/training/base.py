@@ -4,10 +4,13 @@ import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
+import jax
+import jax.numpy as jnp
 from flax import nnx
 
 import envs
 from lorasp_jax import models
+from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.compress import quantization
 from lorasp_jax.base import hub
 from lorasp_jax.config import Config
@@ -33,11 +36,8 @@ def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str
     Raises:
         ValueError: the backbone or size is unknown, or the checkpoint does not match the config.
     """
-    options, backbone_class = config.model, backbone.find(config.model.backbone)
-    sizes = [size for size in SIZES if hasattr(backbone_class, size)]
-    if options.size not in sizes:
-        raise ValueError(f"unknown size {options.size!r}: choose one of {', '.join(sizes)}")
-    model_config: BackboneConfig = getattr(backbone_class, options.size)()
+    options = config.model
+    model_config = sized(options.backbone, options.size)
     model_config = dataclasses.replace(
         model_config,
         dtype=options.dtype,
@@ -61,6 +61,15 @@ def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str
     return model, models.weights_hash(model)
 
 
+def sized(name: str, size: str) -> BackboneConfig:
+    """Return the config of a size of a backbone; raise ValueError if there is none."""
+    found = backbone.find(name)
+    sizes = [each for each in SIZES if hasattr(found, each)]
+    if size not in sizes:
+        raise ValueError(f"unknown size {size!r}: choose one of {', '.join(sizes)}")
+    return getattr(found, size)()
+
+
 def with_config(model: Backbone, **changes: Any) -> Backbone:
     """Return the model with changed config fields, which must not affect its parameters."""
     model_config = dataclasses.replace(model.config, **changes)
@@ -73,6 +82,16 @@ def with_config(model: Backbone, **changes: Any) -> Backbone:
 def quantized(model: Any, kind: quantization.Kind | Literal[""] | None) -> Any:
     """Return the model with the layers of its three towers quantized, or unchanged if no `kind`."""
     return quantization.quantize(model, [(_TOWERS, kind)]).model if kind else model
+
+
+def in_bf16(model: Any) -> Any:
+    """Return the model with its frozen weights rounded to bf16, as they are saved."""
+    graphdef, adapters, frozen = adaptation.split(model)
+    is_kernel = lambda leaf: isinstance(leaf, quantization.QuantizedKernel)  # noqa: E731
+    frozen = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), frozen, is_leaf=is_kernel)
+    model = nnx.merge(graphdef, adapters, frozen)
+    model.config = dataclasses.replace(model.config, param_dtype="bfloat16")
+    return model
 
 
 def _check_control_dt(folder: Path, control_dt: float) -> None:

@@ -154,6 +154,11 @@ def describe(folder: str | os.PathLike[str]) -> dict[str, Any]:
     return _read_metadata(Path(folder))[0]
 
 
+def is_run(folder: str | os.PathLike[str]) -> bool:
+    """Return whether this is the folder of a finished run."""
+    return (Path(folder) / BASE).is_dir() or (Path(folder) / native.DESCRIPTION).is_file()
+
+
 def _read_metadata(folder: Path) -> tuple[dict[str, Any], Path, bool]:
     """Return a run's metadata, their file, and whether the run trained its base."""
     if not folder.is_dir():

@@ -13,7 +13,7 @@ import numpy as np
 from lorasp_jax.extras.study import statistics
 from lorasp_jax.extras.study.statistics import Estimate
 from lorasp_jax.extras.study.study import Results
-from studies.paper import naming, published
+from studies.paper import estimates, naming, published
 from studies.paper.criteria import Claim, Criterion
 from studies.paper.naming import TOWERS
 
@@ -85,7 +85,7 @@ def _outcomes(
 
 
 def _over_seeds(values: Any, methods: Sequence[naming.Seeds], results: Results) -> Estimate:
-    return statistics.over_seeds(values(results, *methods))
+    return estimates.over_seeds(values(results, *methods))
 
 
 def _lead(method: str, title: str, bound: float, reason: str) -> Criteria:
@@ -102,7 +102,7 @@ def _lead(method: str, title: str, bound: float, reason: str) -> Criteria:
 def _needs_rank(make: _Maker, backbone: str) -> tuple[Criterion, ...]:
     rank = make.rank // 4
     return make.success(
-        statistics.ratio,
+        estimates.ratio,
         (f"{backbone}/multi/lora_r{rank}", f"{backbone}/multi/full"),
         measure=f"success of LoRA with r = R/4 = {rank}, relative to full fine-tuning",
         side="below",
@@ -136,7 +136,7 @@ def _multi_task(make: _Maker, backbone: str) -> tuple[Criterion, ...]:
         (*lora[0], *lora[1]),
         measure="standard deviation of LoRA's success over tasks, averaged over r = "
         f"{', '.join(map(str, paper))}: multi-task minus single-task",
-        interval=statistics.corrected,
+        interval=estimates.corrected,
         side="above",
         bound=0.0,
         reason=LESS_IS_NOTHING,
@@ -148,8 +148,8 @@ def _extra_shortfall(*rates: np.ndarray) -> np.ndarray:
     """Return the shortfall relative to full of n multi-task rates minus that of n single-task."""
     *lora, full_multi, full_single = rates
     half = len(lora) // 2
-    multi = np.mean([statistics.ratio(rate, full_multi) for rate in lora[:half]], axis=0)
-    single = np.mean([statistics.ratio(rate, full_single) for rate in lora[half:]], axis=0)
+    multi = np.mean([estimates.ratio(rate, full_multi) for rate in lora[:half]], axis=0)
+    single = np.mean([estimates.ratio(rate, full_single) for rate in lora[half:]], axis=0)
     return single - multi
 
 

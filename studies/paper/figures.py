@@ -11,7 +11,7 @@ from matplotlib.patches import Patch
 from lorasp_jax.extras.study import statistics
 from lorasp_jax.extras.study.statistics import Estimate
 from lorasp_jax.report.figures import COLORS
-from studies.paper import naming, published
+from studies.paper import estimates, naming, published
 from studies.paper.book import BACKBONES, Book
 from studies.paper.figure_style import FULL, LORA, LORA_SP, SINGLE, legend, panels, rows
 from studies.paper.naming import TOWERS
@@ -54,7 +54,7 @@ def figure_1(book: Book) -> Figure:
 def _relative_success(book: Book, backbone: str, method: str) -> Estimate:
     """Return success relative to full fine-tuning and its interval [%]."""
     pair = (book.outcomes(f"{backbone}/multi/{m}") for m in (method, "full"))
-    return _percent(statistics.bootstrap(statistics.ratio, *pair))
+    return _percent(statistics.bootstrap(estimates.ratio, *pair))
 
 
 def _percent(estimate: Estimate) -> Estimate:
@@ -88,7 +88,7 @@ def _paper_lora_sp(axes: Axes, backbone: str) -> None:
 def _paper(backbone: str, method: str) -> float | None:
     """Return the paper's success relative to full fine-tuning [%]; None if it has none."""
     prefixes = [f"{backbone}/multi/{m}" for m in (method, "full")]
-    ratio = published.compute(statistics.ratio, prefixes, RANK)
+    ratio = published.compute(estimates.ratio, prefixes, RANK)
     return None if ratio is None else 100 * float(ratio)
 
 
@@ -120,9 +120,9 @@ def figure_3(book: Book) -> Figure:
 def _deviation(outcomes: np.ndarray) -> Estimate:
     """Return the standard deviation over tasks; the correction can take it below 0, where it ends.
 
-    See `statistics.corrected`.
+    See `estimates.corrected`.
     """
-    estimate = statistics.corrected(lambda rates: rates.std(-1), outcomes)
+    estimate = estimates.corrected(lambda rates: rates.std(-1), outcomes)
     return Estimate(*(max(0.0, x) for x in estimate))
 
 

@@ -36,15 +36,15 @@ def parser(program: str) -> argparse.ArgumentParser:
 
 
 def _run(options: argparse.Namespace) -> None:
-    from lorasp_jax.extras.deployment import measurement, saving, variants
+    from lorasp_jax.extras.deployment import measurement, variants
 
     if bool(options.save) != bool(options.out):
         raise ValueError("--save and --out must be given together")
     if options.save and (options.variants or options.episodes):
         raise ValueError("--variants and --episodes are for measuring: leave out --save")
-    saving.check_run(options.run)
+    variants.check_run(options.run)
     if options.save:
-        saving.save(options.run, options.save, options.out)
+        variants.save(options.run, options.save, options.out)
         print(f"written: {options.out}")
         return
     from lorasp_jax.extras.study import Study

@@ -11,16 +11,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from envs.datasets.episodes import Episodes
+import lorasp_jax
 from lorasp_jax.base.intervals import wilson_interval
-from lorasp_jax.config import Config
 from lorasp_jax.extras.deployment import variants
 from lorasp_jax.extras.deployment.variants import BATCH_SIZE, BATCHES, VARIANTS, WHOLE
 from lorasp_jax.extras.study import Derived, held_out, page, statistics
 from lorasp_jax.extras.study.held_out import Keyed
 from lorasp_jax.extras.study.statistics import Estimate
-from lorasp_jax.extras.study.study import Results
-from lorasp_jax.policies.policy import Policy
+from lorasp_jax.extras.study.study import Demonstrations, Results, evaluated
 from lorasp_jax.training.demonstrations import fresh_demonstrations
 from lorasp_jax.training.run import Run
 
@@ -36,12 +34,7 @@ def cells(run: Path, episodes: int = 0, prefix: str = "") -> tuple[Derived, ...]
         episodes: episodes per task; 0: as many as in the run's evaluation.
         prefix: what the names of the cells begin with, before those of the variants.
     """
-
-    def config(recorded: Config) -> Config:
-        evaluation = recorded.evaluation
-        count = episodes or evaluation.episodes
-        changed = dataclasses.replace(evaluation, episodes=count)
-        return dataclasses.replace(recorded, evaluation=changed)
+    config = functools.partial(evaluated, episodes=episodes)
 
     def transform(name: str) -> Any:
         return lambda policy, _, held: variants.transform(name, policy, held)
@@ -49,7 +42,7 @@ def cells(run: Path, episodes: int = 0, prefix: str = "") -> tuple[Derived, ...]
     return tuple(Derived(prefix + n, run, transform(n), config=config) for n in VARIANTS)
 
 
-def measure(run: Run, _: Mapping[str, Episodes], __: Policy | None) -> dict[str, Any]:
+def measure(run: Run, _: Demonstrations, __: lorasp_jax.policies.Policy | None) -> dict[str, Any]:
     """Return the measures of a variant.
 
     `loss` on demonstrations that did not calibrate it, `bytes` of all weights, `milliseconds` of
@@ -57,24 +50,21 @@ def measure(run: Run, _: Mapping[str, Episodes], __: Policy | None) -> dict[str,
     """
     settings = held_out.settings(run.config)
     # Its seed and name change no demonstration.
-    episodes = _loss_episodes(dataclasses.replace(settings, name="any"))
+    episodes = _other_demonstrations(dataclasses.replace(settings, name="any"), 1)
     return {
         "measures": {
             "loss": mean_loss(run.policy, episodes),
             "bytes": weight_bytes(run.policy),
-            "milliseconds": call_milliseconds(run.policy, next(iter(episodes.values()))),
+            "milliseconds": call_milliseconds(run.policy, episodes),
             "machine": f"{jax.devices()[0].device_kind}, jax {jax.__version__}",
         }
     }
 
 
-@functools.lru_cache(maxsize=1)
-def _loss_episodes(settings: Config) -> dict[str, Episodes]:
-    """Collect the demonstrations on which losses are measured."""
-    return fresh_demonstrations(settings, 1)
+_other_demonstrations = functools.lru_cache(maxsize=1)(fresh_demonstrations)
 
 
-def mean_loss(policy: Policy, episodes: Mapping[str, Episodes]) -> float:
+def mean_loss(policy: lorasp_jax.policies.Policy, episodes: Demonstrations) -> float:
     """Return the flow-matching loss, averaged over valid action elements, then over tasks."""
     by_task = held_out.keyed_batches(policy, episodes, BATCH_SIZE, BATCHES)
     losses = [_loss(policy.model, pair) for pairs in by_task.values() for pair in pairs]
@@ -88,17 +78,17 @@ def _loss(model: Any, keyed: Keyed) -> jax.Array:
     return jnp.where(mask, per_element, 0).sum() / mask.sum()
 
 
-def weight_bytes(policy: Policy) -> int:
+def weight_bytes(policy: lorasp_jax.policies.Policy) -> int:
     """Return the size of a policy's weights [bytes]: base, codes and scales, adapters."""
     return sum(leaf.nbytes for leaf in jax.tree.leaves(policy.model) if hasattr(leaf, "nbytes"))
 
 
-def call_milliseconds(policy: Policy, episodes: Episodes) -> float:
+def call_milliseconds(policy: lorasp_jax.policies.Policy, episodes: Demonstrations) -> float:
     """Return the median time to sample one action chunk from one observation [ms]."""
-    policy = policy.with_sampler()
-    images = {name: jnp.asarray(image[0, :1]) for name, image in episodes.image.items()}
-    observation = {"image": images, "state": jnp.asarray(episodes.state[0, :1])}
-    phrase = episodes.instructions[int(episodes.instruction[0])]
+    policy, first = policy.with_sampler(), next(iter(episodes.values()))
+    images = {name: jnp.asarray(image[0, :1]) for name, image in first.image.items()}
+    observation = {"image": images, "state": jnp.asarray(first.state[0, :1])}
+    phrase = first.instructions[int(first.instruction[0])]
     row = jnp.array(policy.processor.prompts.rows([phrase]))
     arguments = policy, jax.random.key(0), observation, row
     jax.block_until_ready(_sample(*arguments))  # compiles

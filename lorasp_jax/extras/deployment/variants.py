@@ -1,20 +1,26 @@
-"""Make the deployment variants of a LoRA-SP policy: forms of the adapters times stored bases."""
+"""Make and save the deployment variants of a LoRA-SP policy: forms of adapters times bases."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
 
-import jax
-import jax.numpy as jnp
 from flax import nnx
 
 import lorasp_jax
-from envs.datasets.episodes import Episodes
 from lorasp_jax.adapters import adaptation
-from lorasp_jax.extras.study.held_out import Keyed, forward, keyed_batches
-from lorasp_jax.kernels.quantized_weights import Kind, QuantizedKernel
-from lorasp_jax.policies.policy import Policy
-from lorasp_jax.training.base import quantized
+from lorasp_jax.base import compilation_cache as cache
+from lorasp_jax.base.files import check_local
+from lorasp_jax.extras.study.held_out import (
+    Keyed,
+    forward,
+    held_out_demonstrations,
+    keyed_batches,
+)
+from lorasp_jax.extras.study.study import Demonstrations
+from lorasp_jax.training import export
+from lorasp_jax.training.base import in_bf16, quantized
+from lorasp_jax.training.finished_run import recorded_config
 
 BATCH_SIZE, BATCHES = 64, 8
 """Windows per batch, and batches per task, for calibration and for the loss."""
@@ -49,7 +55,7 @@ FORMS: dict[str, Callable[[nnx.Module, Batches], nnx.Module]] = {
 }
 """Forms by name: as trained; pruned to the directions in use on calibration data, and those more
 that a kernel needs; pruned to the most used half of the bank; distilled to LoRA and merged."""
-BASES: dict[str, Kind | None] = {"bf16": None, "int8": "int8", "nf4": "nf4"}
+BASES: dict[str, Literal["int8", "nf4"] | None] = {"bf16": None, "int8": "int8", "nf4": "nf4"}
 """How the base is stored."""
 
 
@@ -58,7 +64,9 @@ WHOLE = "whole-bf16"
 VARIANTS = (WHOLE, *(f"{f}-{b}" for f in FORMS for b in BASES if f"{f}-{b}" != WHOLE))
 
 
-def transform(name: str, policy: Policy, episodes: Mapping[str, Episodes]) -> Policy:
+def transform(
+    name: str, policy: lorasp_jax.policies.Policy, episodes: Demonstrations
+) -> lorasp_jax.policies.Policy:
     """Return a variant of a LoRA-SP policy, calibrated on episodes by task; all count alike."""
     form, base = name.split("-")
     return on_base(in_form(policy, form, episodes), base)
@@ -80,7 +88,9 @@ def is_bank(method: Any) -> bool:
     return isinstance(method, lorasp_jax.LoRASP | lorasp_jax.LoRASPRelease)
 
 
-def in_form(policy: Policy, form: str, episodes: Mapping[str, Episodes]) -> Policy:
+def in_form(
+    policy: lorasp_jax.policies.Policy, form: str, episodes: Demonstrations
+) -> lorasp_jax.policies.Policy:
     """Return a policy whose adapters have another form, and whose frozen weights are in bf16.
 
     Args:
@@ -95,16 +105,35 @@ def in_form(policy: Policy, form: str, episodes: Mapping[str, Episodes]) -> Poli
     return dataclasses.replace(policy, model=FORMS[form](model, together))
 
 
-def on_base(policy: Policy, base: str) -> Policy:
+def on_base(policy: lorasp_jax.policies.Policy, base: str) -> lorasp_jax.policies.Policy:
     """Return the policy with its base stored as one of `BASES`."""
     return dataclasses.replace(policy, model=quantized(policy.model, BASES[base]))
 
 
-def in_bf16(model: Any) -> Any:
-    """Return the model with its frozen weights rounded to bf16, as they are saved."""
-    graphdef, adapters, frozen = lorasp_jax.split(model)
-    is_kernel = lambda leaf: isinstance(leaf, QuantizedKernel)  # noqa: E731
-    frozen = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), frozen, is_leaf=is_kernel)
-    model = nnx.merge(graphdef, adapters, frozen)
-    model.config = dataclasses.replace(model.config, param_dtype="bfloat16")
-    return model
+def check_run(run: Path) -> None:
+    """Raise ValueError unless a run is finished, can be simulated, and was trained with LoRA-SP."""
+    method = recorded_config(run).peft
+    if not is_bank(method):
+        name = type(method).__name__
+        raise ValueError(f"{run} was trained with {name}: only LoRA-SP runs have variants")
+
+
+def save(run: Path, name: str, out: Path) -> None:
+    """Make one variant of a run and write it to a new folder.
+
+    The folder has the adapters and refers to the run's base, or has the merged weights. A base in
+    int8 or nf4 is quantized whenever the folder is loaded.
+
+    Raises:
+        ValueError: the variant is unknown, or the folder exists.
+    """
+    form, base = check(name).split("-")
+    check_local(out)
+    if out.exists():
+        raise ValueError(f"{out} exists already: choose another --out")
+    cache.enable()
+    policy = export.load_policy(run)
+    # Those on which `measurement` calibrates.
+    episodes = held_out_demonstrations(run / "deployment", recorded_config(run))
+    deployed = in_form(policy, form, episodes)
+    export.write_variant(out, deployed, run, quantized=BASES[base])

@@ -3,23 +3,20 @@
 import argparse
 import contextlib
 import functools
-import importlib.util
+import importlib
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from lorasp_jax.base.arguments import positive
+from lorasp_jax.base.errors import INTERRUPTED, REFUSED, describe
+from lorasp_jax.base.writing import write_text
 from lorasp_jax.extras.judge.actors import Actor, RunActor, ServerActor
 from lorasp_jax.extras.judge.judge import judge
 from lorasp_jax.extras.judge.parallel import judge_in_processes
 from lorasp_jax.extras.judge.task import GymTask, load_tasks
-
-# As in `lorasp_jax.base.errors`, which imports JAX: this command runs without it.
-REFUSED = 2
-"""Exit code after bad input."""
-INTERRUPTED = 130
-"""Exit code after Ctrl-C."""
 
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.judge") -> int:
@@ -27,8 +24,8 @@ def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.j
     options = parser(program).parse_args(arguments)
     try:
         _run(options)
-    except (ValueError, OSError) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+    except (ValueError, OSError, ModuleNotFoundError) as error:
+        print(f"error: {describe(error) or error}", file=sys.stderr)
         return REFUSED
     except KeyboardInterrupt:
         print("interrupted; nothing was written but films", file=sys.stderr)
@@ -54,9 +51,7 @@ def _run(options: argparse.Namespace) -> None:
     if options.out:
         source = options.server or str(options.run)
         described = {"policy": source, "env": options.env, "seed": options.seed, **results}
-        temporary = options.out.with_name(f".{options.out.name}.tmp")
-        temporary.write_text(json.dumps(described, indent=1))
-        temporary.replace(options.out)  # so that a file is always whole
+        write_text(options.out, json.dumps(described, indent=1))
         print(f"written: {options.out}")
 
 
@@ -64,16 +59,13 @@ def _check(options: argparse.Namespace) -> None:
     """Raise ValueError for options that cannot work, before anything is loaded."""
     if (options.run is None) == (not options.server):
         raise ValueError("give either the folder of a run or --server, and not both")
-    if options.processes < 1:
-        raise ValueError(f"--processes must be at least 1, got {options.processes}")
     if options.processes > 1 and not options.server:
         raise ValueError("--processes needs --server, whose policy all processes share")
-    if options.out and options.out.exists():
-        raise ValueError(f"{options.out} exists: choose another --out")
-    if options.films and options.films.exists():
-        raise ValueError(f"{options.films} exists: choose another --films")
-    if options.films and importlib.util.find_spec("PIL") is None:
-        raise ValueError("--films needs pip install pillow")
+    for name in ("out", "films"):
+        if (path := getattr(options, name)) and path.exists():
+            raise ValueError(f"{path} exists: choose another --{name}")
+    if options.films:
+        importlib.import_module("PIL")
 
 
 @contextlib.contextmanager
@@ -127,9 +119,9 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--env", required=True, metavar="MODULE:FACTORY", help=text)
     add("--tasks", nargs="+", default=(), metavar="TASK", help="tasks (default: all)")
     text = "episodes per task (default: %(default)s)"
-    add("--episodes", type=int, default=10, metavar="N", help=text)
+    add("--episodes", type=positive, default=10, metavar="N", help=text)
     text = "tasks judged at once, each in a process; needs --server (default: %(default)s)"
-    add("--processes", type=int, default=1, metavar="N", help=text)
+    add("--processes", type=positive, default=1, metavar="N", help=text)
     text = "seed of the first episode; the next has the next seed (default: %(default)s)"
     add("--seed", type=int, default=0, help=text)
     add("--out", type=Path, metavar="FILE", help="JSON file to write")

@@ -1,25 +1,10 @@
 """Where actions come from: a policy server, or the policy of a run in this process."""
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TypeAlias
 
 import numpy as np
-
-
-class Actor(Protocol):
-    """Returns action chunks."""
-
-    def reset(self, seed: int) -> None:
-        """Start an episode; `seed` sets the noise of its actions."""
-        ...
-
-    def act(
-        self, images: Mapping[str, np.ndarray], state: np.ndarray, instruction: str
-    ) -> np.ndarray:
-        """Return a chunk f32 `[C, A]` for pictures uint8 `[H, W, 3]` and a state `[D]`."""
-        ...
 
 
 class ServerActor:
@@ -32,14 +17,13 @@ class ServerActor:
         """Connect, trying again for `wait` seconds.
 
         Raises:
-            ValueError: the client's dependencies are not installed.
+            ModuleNotFoundError: the client's dependencies are not installed.
             ServerGone: there is no server.
         """
-        try:
-            from lorasp_jax.extras.serving.client import PolicyClient
-        except ModuleNotFoundError as error:
-            raise ValueError("--server needs pip install websockets msgpack") from error
-        self._client = PolicyClient(address, token=token, wait=wait, timeout=60)
+        from lorasp_jax.extras.serving import client
+
+        self._client = client.PolicyClient(address, token=token, wait=wait, timeout=60)
+        self._refusal = client.PolicyError
 
     def reset(self, seed: int) -> None:  # noqa: ARG002
         """Start an episode."""
@@ -54,12 +38,10 @@ class ServerActor:
             ValueError: the server refuses the observation, with its sentence.
             ServerGone: the connection is lost.
         """
-        from lorasp_jax.extras.serving.client import PolicyError
-
         request = {"image": dict(images), "state": state, "prompt": instruction}
         try:
             return np.asarray(self._client.infer(request)["actions"])
-        except PolicyError as error:
+        except self._refusal as error:
             raise ValueError(f"the policy server refused: {error}") from error
 
     def close(self) -> None:
@@ -68,45 +50,34 @@ class ServerActor:
 
 
 class RunActor:
-    """Samples the policy of a finished run in this process."""
+    """Samples the policy of a finished run in this process, as its server would."""
 
     def __init__(self, run: Path, instructions: Sequence[str], *, num_steps: int = 10) -> None:
-        """Load the policy, with prompts of any instructions.
+        """Load the policy.
 
         Raises:
             ValueError: the run has no policy, an instruction is too long for it, or this project's
                 dependencies are not installed.
         """
         try:
-            import jax
-
-            from lorasp_jax.base import hub
-            from lorasp_jax.policies.tokenizer import load_tokenizer
-            from lorasp_jax.training.export import describe, load_policy
+            from lorasp_jax.extras.serving import loading, requests, served
+            from lorasp_jax.extras.serving.policies import CompiledPolicy
         except ModuleNotFoundError as error:
             raise ValueError(
                 f"{run} needs {error.name}, which is not installed here: serve it elsewhere with "
                 f"python -m lorasp_jax.extras.serving {run}, and give --server"
             ) from error
 
-        policy = load_policy(run)
-        words = load_tokenizer(hub.resolve_portable(describe(run)["policy"]["tokenizer"]))
-        self._rows = {text: row for row, text in enumerate(dict.fromkeys(instructions))}
-        prompts = policy.processor.prompts.with_instructions(words, [*self._rows])
-        processor = dataclasses.replace(policy.processor, prompts=prompts)
-        self._policy = dataclasses.replace(policy, processor=processor).with_sampler()
-        self._sample: Any = jax.jit(
-            lambda policy, key, observation, row: policy.sample(
-                key, observation, row, num_steps=num_steps
-            )[0]
-        )
+        self._parse = requests.parse
+        policy = CompiledPolicy(loading.load_run(str(run)), num_steps=num_steps, max_batch=1)
+        for text in instructions:
+            policy.tokens(text)
+        self._policy = served.ServedPolicies({"run": policy})
         self.reset(0)
 
     def reset(self, seed: int) -> None:
         """Start an episode."""
-        import jax
-
-        self._key = jax.random.key(seed)
+        self._episode, self._calls = seed, 0
 
     def act(
         self, images: Mapping[str, np.ndarray], state: np.ndarray, instruction: str
@@ -116,12 +87,14 @@ class RunActor:
         Raises:
             ValueError: the policy needs another camera or a state of another length.
         """
-        import jax
+        spec = self._policy.spec
+        if missing := [name for name in spec.cameras if name not in images]:
+            raise ValueError(f"the policy needs the camera {missing[0]}: name it in the task")
+        message = {"image": dict(images), "state": state, "prompt": instruction}
+        row = self._policy.prepare(self._parse(message, spec), (self._episode, self._calls))
+        self._calls += 1
+        return self._policy.run("run", [row])[0]
 
-        self._key, key = jax.random.split(self._key)
-        observation = {
-            "image": {name: picture[None] for name, picture in images.items()},
-            "state": state[None],
-        }
-        row = np.array([self._rows[instruction]], np.int32)
-        return np.asarray(self._sample(self._policy, key, observation, row))
+
+Actor: TypeAlias = ServerActor | RunActor
+"""Returns action chunks, f32 `[C, A]`, for pictures uint8 `[H, W, 3]` and a state `[D]`."""

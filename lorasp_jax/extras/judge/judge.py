@@ -1,5 +1,6 @@
 """Run episodes of tasks and count successes."""
 
+import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -100,7 +101,7 @@ def judge(
     Args:
         tasks: the tasks.
         actor: source of actions.
-        episodes: episodes per task; they reset with `seed`, `seed` + 1 and so on.
+        episodes: at least 1, episodes per task; they reset with `seed`, `seed` + 1 and so on.
         seed: first seed.
         films: folder for a film of each task's first episode; None: no films.
         progress: called after each episode.
@@ -111,21 +112,14 @@ def judge(
         also have "outcomes" by seed; "steps_per_second" of the environments, policy included.
 
     Raises:
-        ValueError: `episodes` is less than 1, or task, environment and policy do not fit together.
+        ValueError: task, environment and policy do not fit together.
     """
-    check_episodes(episodes)
     started = time.perf_counter()
     runs = {
         task.name: judge_task(task, actor, episodes, seed=seed, films=films, progress=progress)
         for task in tasks
     }
     return summarize(tasks, runs, time.perf_counter() - started)
-
-
-def check_episodes(episodes: int) -> None:
-    """Raise ValueError unless there is at least one episode."""
-    if episodes < 1:
-        raise ValueError(f"episodes must be at least 1, got {episodes}")
 
 
 def judge_task(
@@ -138,8 +132,8 @@ def judge_task(
     progress: Progress | None = None,
 ) -> list[EpisodeResult]:
     """Run the episodes of one task; arguments and errors are those of `judge`."""
-    env, done = task.make(), list[EpisodeResult]()
-    try:
+    done = list[EpisodeResult]()
+    with contextlib.closing(task.make()) as env:
         for number in range(episodes):
             film = films is not None and number == 0
             done.append(run_episode(task, env, actor, seed + number, film=film))
@@ -147,8 +141,6 @@ def judge_task(
                 progress(task.name, len(done), sum(bool(each.success) for each in done))
         if films is not None:
             write_film(films / f"{task.name}.webp", done[0].frames, _fps(task, env))
-    finally:
-        env.close()
     return done
 
 
@@ -196,11 +188,5 @@ def write_film(path: Path, frames: Sequence[np.ndarray], fps: float) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     first, *rest = map(Image.fromarray, frames)
     with path.open("xb") as file:
-        first.save(
-            file,
-            format="webp",
-            save_all=True,
-            append_images=rest,
-            duration=round(1000 / fps),
-            loop=0,
-        )
+        more = {"save_all": True, "append_images": rest, "duration": round(1000 / fps), "loop": 0}
+        first.save(file, format="webp", **more)

@@ -3,8 +3,6 @@
 import contextlib
 import functools
 import multiprocessing
-import os
-import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -12,14 +10,9 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
+from lorasp_jax.base.processes import end_with_parent
 from lorasp_jax.extras.judge.actors import ServerActor
-from lorasp_jax.extras.judge.judge import (
-    EpisodeResult,
-    Progress,
-    check_episodes,
-    judge_task,
-    summarize,
-)
+from lorasp_jax.extras.judge.judge import EpisodeResult, Progress, judge_task, summarize
 from lorasp_jax.extras.judge.task import load_tasks
 
 
@@ -34,29 +27,26 @@ def judge_in_processes(
     films: Path | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Measure success on every task, several tasks at once; see `judge.judge`.
+    """Measure success on every task, several tasks at once.
 
     Args:
         env: factory of the tasks, as for `load_tasks`; each process calls it.
         names: tasks to judge; empty: all.
         connect: connects to the server, once for each task; it is sent to the processes. The
             server's noise depends on which task connects first.
-        episodes: episodes per task.
+        episodes, seed, films: see `judge.judge`.
         processes: number of processes.
-        seed: first seed.
-        films: folder for a film of each task's first episode; None: no films.
         progress: called after each task.
 
     Raises:
         ValueError: a process was killed; see also `load_tasks`, `ServerActor` and `judge`.
     """
-    check_episodes(episodes)
     started, tasks = time.perf_counter(), load_tasks(env, names)
     run = functools.partial(_run, env, connect, episodes, seed, films)
     runs = dict[str, list[EpisodeResult]]()
     context = multiprocessing.get_context("spawn")  # a copy of a process with threads may hang
     try:
-        with ProcessPoolExecutor(processes, context, initializer=_end_with_parent) as pool:
+        with ProcessPoolExecutor(processes, context, initializer=end_with_parent) as pool:
             for name, done in pool.map(run, [task.name for task in tasks]):
                 runs[name] = done
                 if progress:
@@ -64,18 +54,6 @@ def judge_in_processes(
     except BrokenProcessPool as error:
         raise ValueError("a process that judged a task was killed: lower --processes?") from error
     return summarize(tasks, runs, time.perf_counter() - started)
-
-
-def _end_with_parent() -> None:
-    """End this process once its parent has gone, since it would wait for tasks forever."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def wait() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
 
 
 def _run(

@@ -11,14 +11,13 @@ from rich.console import Console
 
 from lorasp_jax.base.errors import parse_arguments, run_command
 from lorasp_jax.base.files import check_local
-from lorasp_jax.config import Config
 from lorasp_jax.extras.latency import curve, figure
 from lorasp_jax.extras.latency.execution import EXECUTIONS, Execution, check_delay
 from lorasp_jax.extras.study import Study
-from lorasp_jax.extras.study.finished_run import recorded_config
 from lorasp_jax.extras.study.study import Results
 from lorasp_jax.extras.study.workers import run_here
 from lorasp_jax.training.export import describe
+from lorasp_jax.training.finished_run import recorded_config
 
 MAX_DELAY = 8
 """Largest delay measured by default [control steps], if chunks are long enough."""
@@ -48,11 +47,7 @@ def _measure(options: argparse.Namespace) -> None:
 
 
 def _study(run: Path, options: argparse.Namespace) -> Study:
-    """Return the study of a run's points.
-
-    Raises:
-        ValueError: the run is unfinished or cannot be simulated, or the options do not fit it.
-    """
+    """Return the study of a run's points; raise ValueError if the options do not fit the run."""
     config = recorded_config(run)
     if unknown := [task for task in options.tasks if task not in config.tasks]:
         raise ValueError(f"the tasks of {run} are {', '.join(config.tasks)}, got {unknown[0]!r}")
@@ -65,21 +60,15 @@ def _study(run: Path, options: argparse.Namespace) -> Study:
     delays = options.delays or range(min(MAX_DELAY, steps, chunk - steps) + 1)
     for delay in delays:
         check_delay(delay, steps, chunk)
-    names = _executions(run, config, options.executions)
-    if "trained" in names and max(delays) > config.optim.rtc_max_delay:
-        limit = config.optim.rtc_max_delay
+    limit = config.optim.rtc_max_delay
+    if "trained" in options.executions and not limit:
+        raise ValueError(f"{run} was not trained for execution trained: --optim.rtc-max-delay is 0")
+    names = options.executions or [name for name in EXECUTIONS if limit or name != "trained"]
+    if "trained" in names and max(delays) > limit:
         print(f"{run}: trained execution beyond d = {limit} is beyond its --optim.rtc-max-delay")
     executions = [Execution(name, steps, options.guidance) for name in names]
     tasks = options.tasks or config.tasks
     return Study("latency", curve.cells(run, tasks, executions, delays, options.episodes))
-
-
-def _executions(run: Path, config: Config, chosen: Sequence[str]) -> Sequence[str]:
-    """Return the executions to measure."""
-    trained = config.optim.rtc_max_delay > 0
-    if "trained" in chosen and not trained:
-        raise ValueError(f"{run} was not trained for execution trained: --optim.rtc-max-delay is 0")
-    return chosen or [name for name in EXECUTIONS if trained or name != "trained"]
 
 
 def parser(program: str) -> argparse.ArgumentParser:

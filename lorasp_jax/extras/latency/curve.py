@@ -3,21 +3,21 @@
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+import lorasp_jax
 from envs.env import Env
-from lorasp_jax.config import Config
 from lorasp_jax.evaluation.metrics import position_bias
 from lorasp_jax.evaluation.programs import compiled_rollout
-from lorasp_jax.extras.latency.execution import Execution, Trace, delayed_rollout
+from lorasp_jax.extras.latency.execution import Execution, Rollout, Trace, delayed_rollout
 from lorasp_jax.extras.latency.smoothness import action_delta, jerk
 from lorasp_jax.extras.study import Derived
-from lorasp_jax.policies.policy import Policy
+from lorasp_jax.extras.study.study import evaluated
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Run
 
@@ -40,27 +40,17 @@ def cells(
         episodes: episodes per point, those of the run's final evaluation; 0: as many as there.
         prefix: what the names of the cells begin with.
     """
-    points = itertools.product(tasks, executions, delays)
-    return tuple(_point(run, *point, episodes, prefix) for point in points)
-
-
-def _point(
-    run: Path, task: str, execution: Execution, delay: int, episodes: int, prefix: str
-) -> Derived:
-    def config(recorded: Config) -> Config:
-        changed = dataclasses.replace(
-            recorded.evaluation,
-            episodes=episodes or recorded.evaluation.episodes,
-            execute_steps=execution.execute_steps,
-        )
-        return dataclasses.replace(recorded, tasks=(task,), evaluation=changed)
-
-    settings: dict[str, Any] = {"execution": execution.name, "delay": delay}
-    if execution.name == "guided":
-        settings["guidance"] = execution.guidance
-    name = f"{prefix}{task}/{execution.name}/d{delay}"
-    evaluate = functools.partial(_evaluate, execution, delay)
-    return Derived(name, run, config=config, settings=settings, evaluate=evaluate)
+    found = []
+    for task, execution, delay in itertools.product(tasks, executions, delays):
+        changes = {"episodes": episodes, "execute_steps": execution.execute_steps}
+        config = functools.partial(evaluated, tasks=(task,), **changes)
+        settings: dict[str, Any] = {"execution": execution.name, "delay": delay}
+        if execution.name == "guided":
+            settings["guidance"] = execution.guidance
+        name = f"{prefix}{task}/{execution.name}/d{delay}"
+        evaluate = functools.partial(_evaluate, execution, delay)
+        found.append(Derived(name, run, config=config, settings=settings, evaluate=evaluate))
+    return tuple(found)
 
 
 def _evaluate(execution: Execution, delay: int, run: Run) -> dict[str, Any]:
@@ -77,9 +67,9 @@ def _evaluate(execution: Execution, delay: int, run: Run) -> dict[str, Any]:
 
 
 def measure_point(
-    policy: Policy,
+    policy: lorasp_jax.policies.Policy,
     env: Env,
-    rollout: Callable[[Policy, jax.Array, int], Trace],
+    rollout: Rollout,
     key: jax.Array,
     episodes: int,
     delay: int,

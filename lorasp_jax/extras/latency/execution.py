@@ -20,11 +20,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import lorasp_jax
 from envs.env import Env
 from envs.scene.ranges import Randomization
 from lorasp_jax.evaluation.programs import Worlds
-from lorasp_jax.models.flow_matching import first
-from lorasp_jax.policies.policy import Policy
 
 EXECUTIONS = {
     "synchronous": "the robot holds its last action until the chunk arrives",
@@ -65,6 +64,10 @@ class Trace:
     commands: np.ndarray
 
 
+Rollout = Callable[[lorasp_jax.policies.Policy, jax.Array, int], Trace]
+"""Runs episodes of a policy with a random key at a delay [control steps]."""
+
+
 def check_delay(delay: int, execute_steps: int, chunk: int) -> None:
     """Check that chunks are long enough for a delay.
 
@@ -81,7 +84,7 @@ def check_delay(delay: int, execute_steps: int, chunk: int) -> None:
 
 def delayed_rollout(
     env: Env, execution: Execution, *, denoise_steps: int = 10, ranges: Randomization | None = None
-) -> Callable[[Policy, jax.Array, int], Trace]:
+) -> Rollout:
     """Create a function (policy, key, d) that runs `env.num_envs` episodes with a delay of d steps.
 
     No program depends on d. Without delay, synchronous and naive execution are the rollout of
@@ -92,7 +95,7 @@ def delayed_rollout(
     """
     steps, waits = execution.execute_steps, execution.name == "synchronous"
 
-    def rollout(policy: Policy, key: jax.Array, delay: int) -> Trace:
+    def rollout(policy: lorasp_jax.policies.Policy, key: jax.Array, delay: int) -> Trace:
         check_delay(delay, steps, policy.model.config.chunk)
         worlds = Worlds(env, policy, key, ranges)
         chunk, _ = worlds.predict(0, denoise_steps=denoise_steps)
@@ -131,4 +134,5 @@ def _switch(previous: jax.Array, new: jax.Array, delay: jax.Array) -> jax.Array:
     """Replace the first d actions of `new` `[W, C, J+1]` by those of `previous`."""
     rest = new.shape[1] - previous.shape[1]
     previous = jnp.pad(previous, ((0, 0), (0, rest), (0, 0)))
-    return jnp.where(first(delay, new.shape[1])[:, None], previous, new)
+    is_first = jnp.arange(new.shape[1]) < delay
+    return jnp.where(is_first[:, None], previous, new)

@@ -10,12 +10,12 @@ from typing import Any
 
 from rich.console import Console
 
+from lorasp_jax.base.arguments import pair
 from lorasp_jax.base.errors import parse_arguments, run_command
-from lorasp_jax.base.locks import locked
 from lorasp_jax.extras.piper import options as shared
 from lorasp_jax.extras.piper.arm import PiperArm
 from lorasp_jax.extras.piper.asking import InThread
-from lorasp_jax.extras.piper.cameras import OpenCameras
+from lorasp_jax.extras.piper.cameras import open_cameras
 from lorasp_jax.extras.piper.clock import RealClock
 from lorasp_jax.extras.piper.recording import Recording
 from lorasp_jax.extras.piper.safety import Unsafe
@@ -53,7 +53,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--can", default="can0", help="CAN interface (default: %(default)s)")
     add("--bus", choices=("socketcan", "slcan"), default="socketcan", help="its kind "
         "(default: %(default)s)")  # fmt: skip
-    add("--camera", action="append", default=[], metavar="NAME=SOURCE", help="such as "
+    add("--camera", action="append", type=pair, default=[], metavar="NAME=SOURCE", help="such as "
         "side=/dev/video0; once for each of the policy's cameras")  # fmt: skip
     shared.add_shared(parser)
     return parser
@@ -72,20 +72,22 @@ def _run(options: argparse.Namespace) -> int:
     seconds = options.seconds or (task.time_limit if task else 60.0)
     with contextlib.ExitStack() as stack:
         server = None if options.teach else stack.enter_context(shared.policy(options))
-        cameras = _cameras(options, server)
-        stack.callback(cameras.close)
+        look = open_cameras(_sources(options, server), stack)
         if server:
             server.warn([prompt])
-        recorder = _recorder(options, task, prompt, stack)
-        arm = _arm(options)
+        recorder = stack.enter_context(
+            shared.recording(options, task, prompt=prompt, image_size=options.image_size)
+        )
+        arm = PiperArm(options.can, bus=options.bus, **shared.motion(options))
         stack.callback(arm.close)
+        arm.connect()
         if not (options.dry_run or options.teach == "leader"):
             arm.enable(shared.limits(options))
         if server:
-            log = stack.enter_context(shared.opened_log(options))
-            problem = _execute(options, settings, (arm, cameras, server, recorder, log), seconds)
+            log = stack.enter_context(contextlib.closing(shared.open_log(options)))
+            problem = _execute(options, settings, (arm, look, server, recorder, log), seconds)
         else:
-            problem = _teach(options, (arm, cameras, recorder), seconds)
+            problem = _teach(options, (arm, look, recorder), seconds)
         if recorder and not problem:
             _keep(recorder)
         return HELD if problem else 0
@@ -95,20 +97,20 @@ def _execute(
     options: argparse.Namespace, settings: Settings, parts: tuple, seconds: float
 ) -> str | None:
     """Run the policy; return the problem in a sentence, if there is one."""
-    arm, cameras, server, recorder, log = parts
+    arm, look, server, recorder, log = parts
     server.reset()
     more = {"recorder": recorder, "log": log}
     limits = shared.limits(options)
-    session = Session(arm, cameras, InThread(server), limits, settings, RealClock(), **more)
+    session = Session(arm, look, InThread(server), limits, settings, RealClock(), **more)
     shared.stop_on_signals(session)
     return session.run(seconds)
 
 
 def _teach(options: argparse.Namespace, parts: tuple, seconds: float) -> str | None:
     """Record a person; return the problem in a sentence, if there is one."""
-    arm, cameras, recorder = parts
+    arm, look, recorder = parts
     way = {"way": options.teach, "control_dt": options.control_dt}
-    lesson = Lesson(arm, cameras, recorder, shared.limits(options), RealClock(), **way)
+    lesson = Lesson(arm, look, recorder, shared.limits(options), RealClock(), **way)
     shared.stop_on_signals(lesson)
     print("show the task, then press Ctrl-C")
     try:
@@ -145,52 +147,16 @@ def _end_prompt(number: int, _: Any) -> None:
     raise EOFError(signal.Signals(number).name)  # the terminal may be gone
 
 
-def _recorder(
-    options: argparse.Namespace, task: Any, prompt: str, stack: contextlib.ExitStack
-) -> Recording | None:
-    """Open the dataset, and keep other processes from writing it."""
-    if not options.record:
-        return None
-    stack.enter_context(locked(options.record))
-    return Recording(
-        options.record,
-        task=task.name if task else "task",
-        instructions=task.instructions if task else (),
-        prompt=prompt,
-        control_dt=options.control_dt,
-        image_size=options.image_size,
-    )
-
-
-def _cameras(options: argparse.Namespace, server: shared.Server | None) -> OpenCameras:
-    """Open the cameras after checking that there are those that the policy needs."""
-    sources = dict(_pair(text) for text in options.camera)
+def _sources(options: argparse.Namespace, server: shared.Server | None) -> dict[str, str]:
+    """Return the cameras' sources after checking that there are those that the policy needs."""
+    sources = dict(options.camera)
     needed = server.metadata.get("cameras", []) if server else list(sources)[:1] or ["side"]
     if missing := [name for name in needed if name not in sources]:
         examples = " ".join(f"--camera {name}=SOURCE" for name in missing)
         raise ValueError(
             f"cameras are needed for {', '.join(needed)}: pass {examples}, such as /dev/video0"
         )
-    return OpenCameras(sources)
-
-
-def _arm(options: argparse.Namespace) -> PiperArm:
-    arm = PiperArm(
-        options.can,
-        bus=options.bus,
-        speed=options.speed,
-        effort=options.effort,
-        zeros=options.zeros,
-    )
-    arm.connect()
-    return arm
-
-
-def _pair(text: str) -> tuple[str, str]:
-    name, equals, source = text.partition("=")
-    if not (name and equals and source):
-        raise ValueError(f"--camera must be NAME=SOURCE, got {text!r}")
-    return name, source
+    return sources
 
 
 if __name__ == "__main__":

@@ -76,7 +76,7 @@ class PiperArm:
             clock: measures the age of frames.
 
         Raises:
-            ValueError: the effort is out of range, or piper_sdk is not installed.
+            ValueError: the effort is out of range.
             ConnectionError: there is no such interface, it is down or has another bitrate.
         """
         if not 0 < effort <= MAX_EFFORT:
@@ -222,10 +222,8 @@ def _angles(joints: Any) -> np.ndarray:
 
 
 def _open(can: str, bus: str) -> Any:
-    try:
-        from piper_sdk import C_PiperInterface_V2, LogLevel
-    except ImportError as error:
-        raise ValueError("the PiPER needs piper_sdk: pip install 'lorasp_jax[piper]'") from error
+    from piper_sdk import C_PiperInterface_V2, LogLevel
+
     checked = bus == "socketcan"
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # the SDK's use of python-can

@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -16,12 +16,26 @@ Ask = Callable[[Observation], Any]
 """Return actions [C, 7] for an observation; may raise anything."""
 
 
-class Asker(Protocol):
-    """One question at a time."""
+class InThread:
+    """Asks one question at a time in a thread; answers arrive when they do."""
+
+    def __init__(self, ask: Ask) -> None:
+        """Wrap a function that waits for the answer."""
+        self._ask = ask
+        self._outcome: list[tuple[Any, Exception | None]] = []
 
     def ask(self, observation: Observation) -> None:
         """Send a question."""
-        ...
+        self._outcome = outcome = []  # an answer to an earlier question has a list of its own
+
+        def work() -> None:
+            try:
+                outcome.append((np.asarray(self._ask(observation)), None))
+            except Exception as error:  # raised again in the control loop
+                outcome.append((None, error))
+
+        self._thread = threading.Thread(target=work, daemon=True)
+        self._thread.start()
 
     def answer(self) -> Any | None:
         """Return the actions once they are there, else None.
@@ -29,65 +43,28 @@ class Asker(Protocol):
         Raises:
             PolicyError: asking raised something.
         """
-        ...
+        if not self._outcome:
+            return None
+        actions, error = self._outcome[0]
+        if error:
+            raise PolicyError(str(error) or type(error).__name__) from error
+        return actions
 
 
-class InThread:
-    """Asks in a thread; answers arrive when they do."""
-
-    def __init__(self, ask: Ask) -> None:
-        """Wrap a function that waits for the answer."""
-        self._ask = ask
-        self._outcome: list | None = None
-
-    def ask(self, observation: Observation) -> None:
-        """Send a question."""
-        self._outcome = outcome = []
-        self._thread = threading.Thread(
-            target=lambda: outcome.append(_outcome(self._ask, observation)), daemon=True
-        )
-        self._thread.start()
-
-    def answer(self) -> Any | None:
-        """Return the actions once they are there, else None; raise `PolicyError`."""
-        return _unpack(self._outcome)
-
-
-class InTurn:
+class InTurn(InThread):
     """Asks while simulated time stands still; answers arrive after a chosen latency."""
 
     def __init__(self, ask: Ask, clock: Clock, latency: float = 0.0) -> None:
-        """Wrap a function, on a simulated clock.
-
-        Args:
-            ask: the function.
-            clock: measures the latency.
-            latency: time from question to answer [s].
-        """
-        self._ask, self._clock, self._latency = ask, clock, latency
-        self._outcome, self._due = [], 0.0
+        """Wrap a function; `latency` is the time from question to answer [s] on the clock."""
+        super().__init__(ask)
+        self._clock, self._latency, self._due = clock, latency, 0.0
 
     def ask(self, observation: Observation) -> None:
         """Send a question."""
-        self._outcome = [_outcome(self._ask, observation)]
+        super().ask(observation)
+        self._thread.join()
         self._due = self._clock.now() + self._latency
 
     def answer(self) -> Any | None:
         """Return the actions once they are due, else None; raise `PolicyError`."""
-        return _unpack(self._outcome) if self._clock.now() >= self._due - 1e-9 else None
-
-
-def _outcome(ask: Ask, observation: Observation) -> tuple[Any, Exception | None]:
-    try:
-        return np.asarray(ask(observation)), None
-    except Exception as error:  # raised again in the control loop
-        return None, error
-
-
-def _unpack(outcome: list | None) -> Any | None:
-    if not outcome:
-        return None
-    actions, error = outcome[0]
-    if error:
-        raise PolicyError(str(error) or type(error).__name__) from error
-    return actions
+        return super().answer() if self._clock.now() >= self._due - 1e-9 else None

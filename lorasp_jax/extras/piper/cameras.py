@@ -3,7 +3,8 @@
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from contextlib import ExitStack
+from typing import Any
 
 import av
 import numpy as np
@@ -16,43 +17,29 @@ MAX_AGE = 0.3
 
 
 class NoPicture(Unsafe):
-    """A picture is missing or stale."""
+    """A picture is stale."""
 
 
-class Cameras(Protocol):
-    """What a session looks through."""
-
-    def read(self) -> dict[str, np.ndarray]:
-        """Return the newest picture of each camera, uint8 [H, W, 3].
-
-        Raises:
-            NoPicture: a picture is missing or stale.
-        """
-        ...
-
-    def close(self) -> None:
-        """Stop."""
-        ...
+Look = Callable[[], dict[str, np.ndarray]]
+"""Returns the newest picture of each camera, uint8 [H, W, 3]; raises `NoPicture` if it is stale."""
 
 
 class Camera:
     """One source of pictures, decoded in a thread that keeps only the newest."""
 
-    def __init__(self, name: str, source: str, size: str = "640x480", rate: int = 30) -> None:
+    def __init__(self, name: str, source: str) -> None:
         """Open a source and wait for its first picture.
 
         Args:
             name: of the camera, such as wrist.
             source: a device such as /dev/video0, or a file or address that ffmpeg can read.
-            size: width x height asked of a device.
-            rate: pictures per second asked of a device.
 
         Raises:
             ConnectionError: the source cannot be opened, or shows nothing.
         """
         self._name, self._newest, self._stop = name, (-np.inf, None), False
         device = source.startswith("/dev/")
-        options = {"video_size": size, "framerate": str(rate)} if device else {}
+        options = {"video_size": "640x480", "framerate": "30"} if device else {}
         try:
             self._container: Any = av.open(
                 source, format="v4l2" if device else None, options=options
@@ -93,43 +80,14 @@ class Camera:
         self._container.close()
 
 
-class OpenCameras:
-    """Several sources."""
+def open_cameras(sources: Mapping[str, str], stack: ExitStack) -> Look:
+    """Open camera name -> source until the stack is closed.
 
-    def __init__(self, sources: Mapping[str, str]) -> None:
-        """Open camera name -> source.
-
-        Raises:
-            ConnectionError: a source cannot be opened.
-        """
-        self._cameras: dict[str, Camera] = {}
-        try:
-            for name, source in sources.items():
-                self._cameras[name] = Camera(name, source)
-        except ConnectionError:
-            self.close()
-            raise
-
-    def read(self) -> dict[str, np.ndarray]:
-        """Return the newest picture of each camera, uint8 [H, W, 3]; raise `NoPicture` if stale."""
-        return {name: camera.read() for name, camera in self._cameras.items()}
-
-    def close(self) -> None:
-        """Stop all."""
-        for camera in self._cameras.values():
-            camera.close()
-
-
-class Simulated:
-    """Cameras of a simulated world."""
-
-    def __init__(self, render: Callable[[], dict[str, np.ndarray]]) -> None:
-        """Wrap a function that renders all cameras."""
-        self._render = render
-
-    def read(self) -> dict[str, np.ndarray]:
-        """Return a picture of each camera, uint8 [H, W, 3]."""
-        return self._render()
-
-    def close(self) -> None:
-        """Do nothing."""
+    Raises:
+        ConnectionError: a source cannot be opened.
+    """
+    cameras: dict[str, Camera] = {}
+    for name, source in sources.items():
+        cameras[name] = Camera(name, source)
+        stack.callback(cameras[name].close)
+    return lambda: {name: camera.read() for name, camera in cameras.items()}

@@ -1,10 +1,8 @@
 """A session on disk: every reading, command, chunk and event, and every picture that was sent."""
 
-import functools
 import json
-import queue
-import threading
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -33,14 +31,12 @@ class Log:
         folder.mkdir(parents=True, exist_ok=True)
         self._file = open(folder / FILE, "w")  # noqa: SIM115
         self._folder, self._observations = folder, 0
-        self._queue: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._error: Exception | None = None
-        self._thread = threading.Thread(target=self._write)
-        self._thread.start()
+        self._writer = ThreadPoolExecutor(1)
+        self._error: BaseException | None = None
 
     def line(self, time: float, **values: Any) -> None:
         """Append a line."""
-        self._queue.put({"t": round(time, 4)} | values)
+        self._later(self._write, {"t": round(time, 4)} | values)
 
     def observation(self, time: float, observation: Mapping[str, Any]) -> None:
         """Append an observation with its pictures."""
@@ -48,7 +44,7 @@ class Log:
         values = {"observation": number, "state": observation["state"]}
         self.line(time, **values, prompt=observation["prompt"])
         for camera, image in observation["image"].items():
-            self._queue.put((f"{number:06}_{camera}.png", image))
+            self._later(self._save, f"{number:06}_{camera}.png", image)
 
     def close(self) -> None:
         """Wait until all is written.
@@ -56,29 +52,23 @@ class Log:
         Raises:
             OSError: something could not be written, for example to a full disk.
         """
-        self._queue.put(None)
-        self._thread.join()
+        self._later(self._file.close)
+        self._writer.shutdown()
         if self._error:
             problem = f"the log in {self._folder} is incomplete: {self._error}"
             raise OSError(problem) from self._error
 
-    def _write(self) -> None:
-        while (item := self._queue.get()) is not None:
-            self._attempt(functools.partial(self._write_item, item))
-        self._attempt(self._file.close)
+    def _later(self, write: Callable[..., None], *arguments: Any) -> None:
+        self._writer.submit(write, *arguments).add_done_callback(self._note)
 
-    def _attempt(self, write: Callable[[], None]) -> None:
-        try:
-            write()
-        except Exception as error:  # raised by `close`; the arm goes on
-            self._error = self._error or error
+    def _note(self, written: Future) -> None:
+        self._error = self._error or written.exception()  # raised by `close`; the arm goes on
 
-    def _write_item(self, item: Any) -> None:
-        if isinstance(item, dict):
-            self._file.write(json.dumps(item, default=_plain) + "\n")
-        else:
-            name, image = item
-            Image.fromarray(image).save(self._folder / name, compress_level=1)
+    def _write(self, values: dict[str, Any]) -> None:
+        self._file.write(json.dumps(values, default=_plain) + "\n")
+
+    def _save(self, name: str, image: np.ndarray) -> None:
+        Image.fromarray(image).save(self._folder / name, compress_level=1)
 
 
 def _plain(value: Any) -> Any:

@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import functools
 import importlib
 import signal
 import threading
@@ -14,8 +13,10 @@ from typing import Any
 import numpy as np
 
 from envs import names
+from lorasp_jax.base.locks import locked
 from lorasp_jax.extras.piper.asking import Observation
 from lorasp_jax.extras.piper.log import Log
+from lorasp_jax.extras.piper.recording import Recording
 from lorasp_jax.extras.piper.safety import Limits
 from lorasp_jax.extras.piper.session import Session, Settings
 from lorasp_jax.extras.piper.teaching import Lesson
@@ -78,14 +79,39 @@ def task(name: str) -> Any:
     return importlib.import_module(f"envs.tasks.{name}").TASK
 
 
+def motion(options: argparse.Namespace) -> dict[str, Any]:
+    """Return what `PiperArm` needs to know of the limits."""
+    return {"speed": options.speed, "effort": options.effort, "zeros": options.zeros}
+
+
+def open_log(options: argparse.Namespace) -> Log:
+    """Open the log."""
+    return Log(options.log or Path("logs") / time.strftime("piper-%Y%m%d-%H%M%S"))
+
+
 @contextlib.contextmanager
-def opened_log(options: argparse.Namespace) -> Iterator[Log]:
-    """Open the log, and close it at the end."""
-    log = Log(options.log or Path("logs") / time.strftime("piper-%Y%m%d-%H%M%S"))
-    try:
-        yield log
-    finally:
-        log.close()
+def recording(
+    options: argparse.Namespace, task: Any, **settings: Any
+) -> Iterator[Recording | None]:
+    """Open the dataset, if there is to be one, and keep other processes from writing it.
+
+    Args:
+        options: of the command.
+        task: the `Task`, or None.
+        **settings: of `Recording`.
+    """
+    if not options.record:
+        yield None
+        return
+    name, instructions = (task.name, task.instructions) if task else ("task", ())
+    with locked(options.record):
+        yield Recording(
+            options.record,
+            task=name,
+            instructions=instructions,
+            control_dt=options.control_dt,
+            **settings,
+        )
 
 
 def stop_on_signals(session: Session | Lesson) -> None:
@@ -170,7 +196,6 @@ def policy(options: argparse.Namespace) -> Iterator[Server]:
         OSError: the token cannot be read.
     """
     token = options.token_file.read_text().strip() if options.token_file else ""
-    say = functools.partial(print, flush=True)
-    say(f"connecting to {options.server}")
-    with PolicyClient(options.server, token=token, wait=_WAIT, say=say) as client:
+    print(f"connecting to {options.server}, for up to {_WAIT:g} s", flush=True)
+    with PolicyClient(options.server, token=token, wait=_WAIT) as client:
         yield Server(client, options.adapter)

@@ -9,15 +9,17 @@ Signals and all other errors stop it where it is.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from lorasp_jax.extras.piper.asking import Asker
-from lorasp_jax.extras.piper.cameras import Cameras, NoPicture
+from lorasp_jax.extras.piper.arm import PiperArm
+from lorasp_jax.extras.piper.asking import InThread
+from lorasp_jax.extras.piper.cameras import Look, NoPicture
 from lorasp_jax.extras.piper.clock import Clock
 from lorasp_jax.extras.piper.interpolation import Path
 from lorasp_jax.extras.piper.log import Log
+from lorasp_jax.extras.piper.recording import Recording
 from lorasp_jax.extras.piper.safety import (
     CAN_CONTROL,
     MAX_AGE,
@@ -39,28 +41,6 @@ _APPROACH_TIME = 20.0  # s that the way to the first action may take
 _REST_TIME = 60.0  # s that the way to the rest pose may take
 _INSTANT = 1e-6  # control steps that rounding may take from a clock's time
 _LATE = 0.05  # s of delay after which ticks are skipped instead of made up for
-
-
-class Arm(Protocol):
-    """The part of `PiperArm` that a session uses."""
-
-    def read(self) -> Reading: ...  # noqa: D102
-    def command(self, pose: np.ndarray) -> None: ...  # noqa: D102
-
-
-class Recorder(Protocol):
-    """Receives what was observed and commanded at every control step.
-
-    Attributes:
-        steps: number of control steps received.
-    """
-
-    @property
-    def steps(self) -> int: ...  # noqa: D102
-
-    def step(self, images: dict[str, np.ndarray], state: np.ndarray, action: np.ndarray) -> None:
-        """Take a control step: pictures, measured pose [7], action [7]."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -108,19 +88,19 @@ class Session:
 
     def __init__(
         self,
-        arm: Arm,
-        cameras: Cameras,
-        asker: Asker,
+        arm: PiperArm,
+        look: Look,
+        asker: InThread,
         limits: Limits,
         settings: Settings,
         clock: Clock,
         *,
         log: Log | None = None,
-        recorder: Recorder | None = None,
+        recorder: Recording | None = None,
         say: Callable[[str], None] = print,
     ) -> None:
         """Prepare a session; the arm is enabled, unless it is a dry run."""
-        self._arm, self._cameras, self._asker, self._clock = arm, cameras, asker, clock
+        self._arm, self._look, self._asker, self._clock = arm, look, asker, clock
         self._limits, self._settings, self._log, self._say = limits, settings, log, say
         self._recorder = recorder
         self._governor = Governor(limits, PERIOD)
@@ -186,7 +166,7 @@ class Session:
         if self.problem:
             if self._governor.velocity.any():
                 return  # it brakes to the end, whatever comes back
-            self._cameras.read()  # still no picture: it goes on holding
+            self._look()  # still no picture: it goes on holding
             self._say("going on")
             self._governor.start(self._governor.pose)
             self.problem = None
@@ -218,7 +198,7 @@ class Session:
         return command
 
     def _ask(self, reading: Reading, now: float) -> None:
-        images = self._cameras.read()
+        images = self._look()
         state = reading.pose.astype(np.float32)
         observation = {"image": images, "state": state, "prompt": self._settings.prompt}
         if self._path:
@@ -343,7 +323,7 @@ class Session:
         step = int(self._position(now) + _INSTANT)
         if self._recorded < step < self._path.steps:
             action = self._path.action(step)
-            self._recorder.step(self._cameras.read(), reading.pose, action)
+            self._recorder.step(self._look(), reading.pose, action)
             self._recorded = step
 
     def _forget(self) -> None:

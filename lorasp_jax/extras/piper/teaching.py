@@ -6,26 +6,19 @@ With a leader, both arms are on the same bus and were set up once with piper_sdk
 """
 
 from collections.abc import Callable
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
-from lorasp_jax.extras.piper.cameras import Cameras
+from lorasp_jax.extras.piper.arm import PiperArm
+from lorasp_jax.extras.piper.cameras import Look
 from lorasp_jax.extras.piper.clock import Clock
+from lorasp_jax.extras.piper.recording import Recording
 from lorasp_jax.extras.piper.safety import CAN_CONTROL, Limits, Reading, Unsafe, fault
-from lorasp_jax.extras.piper.session import Recorder
 
 Way = Literal["hand", "leader"]
 _TEACHING = 11  # arm_status in teaching mode
 _STILL = 0.002  # rad or m; a pose this close to the last has not moved
-
-
-class TaughtArm(Protocol):
-    """The part of `PiperArm` that teaching uses."""
-
-    def read(self) -> Reading: ...  # noqa: D102
-    def leader(self) -> np.ndarray | None: ...  # noqa: D102
-    def teach(self, on: bool) -> None: ...  # noqa: D102
 
 
 class Lesson:
@@ -33,9 +26,9 @@ class Lesson:
 
     def __init__(
         self,
-        arm: TaughtArm,
-        cameras: Cameras,
-        recorder: Recorder,
+        arm: PiperArm,
+        look: Look,
+        recorder: Recording,
         limits: Limits,
         clock: Clock,
         *,
@@ -43,7 +36,7 @@ class Lesson:
         control_dt: float,
     ) -> None:
         """Prepare a demonstration; for guiding by hand, the arm must be enabled."""
-        self._arm, self._cameras, self._recorder = arm, cameras, recorder
+        self._arm, self._look, self._recorder = arm, look, recorder
         self._limits, self._clock, self._way, self._dt = limits, clock, way, control_dt
         self._stopped = False
 
@@ -81,7 +74,7 @@ class Lesson:
                     self._recorder.step(
                         *before, np.clip(target, self._limits.lower, self._limits.upper)
                     )
-            before = self._cameras.read(), reading.pose
+            before = self._look(), reading.pose
             due += self._dt
             self._clock.wait_until(due)
 

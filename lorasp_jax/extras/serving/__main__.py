@@ -14,6 +14,7 @@ from typing import Any
 
 from rich.console import Console
 
+from lorasp_jax.base.arguments import pair
 from lorasp_jax.base.errors import parse_arguments, run_command
 
 CHECKPOINT_OPTIONS = ("statistics", "dataset", "joints", "size", "dtype", "camera", "adapter")
@@ -38,6 +39,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     add(
         "policy",
         nargs="+",
+        type=_named,
         metavar="[NAME=]POLICY",
         help="folder of a finished run or an exported policy, or a published checkpoint (folder, "
         "hf://owner/name or gs://bucket/folder). Several runs: requests choose by NAME, the first "
@@ -73,9 +75,9 @@ def _add_checkpoint_options(group: Any) -> None:
     checkpoint("--joints", type=int, default=0, help="the robot's number of joints")
     checkpoint("--size", default="", help="size of an openpi checkpoint, such as base_pi05")
     checkpoint("--dtype", default="", choices=("", "float32", "bfloat16"), help="of the weights")
-    pair = {"action": "append", "default": [], "metavar": "NAME=VALUE"}
-    checkpoint("--camera", **pair, help="the backbone's camera = the robot's camera, repeatedly")
-    checkpoint("--adapter", **pair, help="name = adapter folder, repeatedly; see docs/serving.md")
+    pairs: Any = {"action": "append", "type": pair, "default": [], "metavar": "NAME=VALUE"}
+    checkpoint("--camera", **pairs, help="the backbone's camera = the robot's camera, repeatedly")
+    checkpoint("--adapter", **pairs, help="name = adapter folder, repeatedly; see docs/serving.md")
 
 
 def _serve(options: argparse.Namespace, console: Console) -> None:
@@ -84,7 +86,7 @@ def _serve(options: argparse.Namespace, console: Console) -> None:
     token = _read_token(options.token_file)
     with server.bind(options.host, options.port, token=token) as port:  # before what takes long
         policy = _load(options, console)
-        policy_server = server.PolicyServer(policy, policy.metadata, token=token)
+        policy_server = server.PolicyServer(policy, token=token)
         asyncio.run(_run(policy_server, port, console))
 
 
@@ -108,12 +110,12 @@ def _load(options: argparse.Namespace, console: Console) -> Any:
     from lorasp_jax.extras.serving.exported import is_exported
     from lorasp_jax.extras.serving.served import ServedPolicies
 
-    named, start = dict(map(_named, options.policy)), time.monotonic()
+    named, start = dict(options.policy), time.monotonic()
     if len(named) < len(options.policy):
         raise ValueError("the policies must have different names: pass NAME=POLICY")
     cache.enable()
     seed = secrets.randbelow(2**31) if options.seed is None else options.seed
-    _say(console, f"loading {', '.join(options.policy)} with --seed {seed}")
+    _say(console, f"loading {', '.join(named.values())} with --seed {seed}")
     policies = (_exported if all(map(is_exported, named.values())) else _compiled)(options, named)
     settings = {"prompt": options.prompt, "execution": options.execution}
     policy = ServedPolicies(policies, seed=seed, **settings)
@@ -137,6 +139,7 @@ def _compiled(options: argparse.Namespace, named: dict[str, str]) -> dict[str, A
     """Load runs or a checkpoint."""
     from lorasp_jax.extras.serving import loading
     from lorasp_jax.extras.serving.policies import CompiledPolicy, batch_sizes
+    from lorasp_jax.training.export import is_run
 
     if options.max_batch is not None:
         batch_sizes(options.max_batch)  # an invalid one is refused before what takes long
@@ -144,14 +147,8 @@ def _compiled(options: argparse.Namespace, named: dict[str, str]) -> dict[str, A
     settings = {name: value for name, value in given.items() if value is not None}
     if options.execution == "guided":
         settings["guidance"] = 10.0 if options.guidance is None else options.guidance
-
-    def compiled(loaded: loading.Loaded) -> CompiledPolicy:
-        continues, metadata = loaded.continues is not False, loaded.metadata
-        return CompiledPolicy(
-            loaded.policy, loaded.words, continues=continues, metadata=metadata, **settings
-        )
-
-    if all(map(loading.is_run, named.values())):
+    compiled = functools.partial(CompiledPolicy, **settings)
+    if all(map(is_run, named.values())):
         _refuse(options, CHECKPOINT_OPTIONS, "is for published checkpoints: runs record theirs")
         where = {"base": options.base, "words": options.tokenizer}
         # One at a time, as the prepared weights are copies.
@@ -163,8 +160,8 @@ def _compiled(options: argparse.Namespace, named: dict[str, str]) -> dict[str, A
     loaded = loading.load_checkpoint(
         *named.values(),
         **{name: getattr(options, name) for name in names},
-        cameras=dict(map(_pair, options.camera)),
-        adapters=dict(map(_pair, options.adapter)),
+        cameras=dict(options.camera),
+        adapters=dict(options.adapter),
     )
     return {name: compiled(each) for name, each in loaded.items()}
 
@@ -180,14 +177,7 @@ def _named(text: str) -> tuple[str, str]:
     """Split NAME=POLICY; without a name, the last part of the path is the name."""
     if "=" not in text or Path(text).exists():  # a path may contain the character
         return Path(text).name, text
-    return _pair(text)
-
-
-def _pair(text: str) -> tuple[str, str]:
-    name, equals, value = text.partition("=")
-    if not (name and equals and value):
-        raise ValueError(f"expected NAME=VALUE, got {text!r}")
-    return name, value
+    return pair(text)
 
 
 def _read_token(path: Path | None) -> str:

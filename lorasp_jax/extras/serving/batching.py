@@ -14,14 +14,14 @@ import queue
 import threading
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lorasp_jax.extras.serving.requests import PolicySpec, Request
+if TYPE_CHECKING:  # which imports JAX
+    from lorasp_jax.extras.serving.served import ServedPolicies
 
 WAIT = 0.003
 """Longest time to wait for the clients of the previous batch [s]."""
@@ -30,44 +30,6 @@ _log = logging.getLogger(__name__)
 
 class PolicyFailure(RuntimeError):
     """The policy could not answer; the message is for the client."""
-
-
-class BatchPolicy(Protocol):
-    """A policy as the server sees it."""
-
-    @property
-    def spec(self) -> PolicySpec:
-        """What the policy needs and returns."""
-        ...
-
-    @property
-    def instructions(self) -> Mapping[str, Sequence[str]]:
-        """Adapters that a request may choose, and the instructions that each was trained with.
-
-        The first adapter is the default.
-        """
-        ...
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Batch sizes, ascending."""
-        ...
-
-    def prepare(self, request: Request, index: tuple[int, int]) -> Any:
-        """Convert a request to a row of a batch.
-
-        Args:
-            request: a request.
-            index: numbers of the connection and of the request on it, for the flow's noise.
-
-        Raises:
-            ValueError: the request does not fit the policy.
-        """
-        ...
-
-    def run(self, adapter: str, rows: Sequence[Any]) -> np.ndarray:
-        """Return actions f32 `[B, C, J+1]`; B is one of `sizes`."""
-        ...
 
 
 @dataclass(eq=False)
@@ -81,7 +43,7 @@ class _Job:
 class Batcher:
     """Collects rows and runs them in batches, in its own thread until `close`."""
 
-    def __init__(self, policy: BatchPolicy, counts: Counter[str]) -> None:
+    def __init__(self, policy: "ServedPolicies", counts: Counter[str]) -> None:
         """Start the thread.
 
         Args:

@@ -11,7 +11,7 @@ Needs only NumPy, msgpack and websockets. Works with openpi's servers too.
 import asyncio
 import threading
 import time
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Coroutine, Mapping
 from typing import Any, Self, TypeVar
 
 from websockets.asyncio.client import ClientConnection, connect
@@ -22,8 +22,6 @@ from lorasp_jax.extras.serving import wire
 T = TypeVar("T")
 RETRY_EVERY = 0.2
 """Time between attempts to connect [s]."""
-SILENCE = 3.0
-"""Time without a server after which a waiting client says so [s]; our choice."""
 
 
 class PolicyError(RuntimeError):
@@ -52,7 +50,6 @@ class PolicyClient:
         token: str = "",
         timeout: float = 10.0,
         wait: float = 0.0,
-        say: Callable[[str], None] = lambda _: None,
     ) -> None:
         """Connect to a server.
 
@@ -62,7 +59,6 @@ class PolicyClient:
             token: the server's token, if it requires one.
             timeout: how long to wait for the connection and for each reply [s].
             wait: how long to try again if there is no server yet [s].
-            say: called once, in another thread, with a sentence if that takes long.
 
         Raises:
             ServerGone: there is no server at this address, it requires another token, or its
@@ -84,7 +80,7 @@ class PolicyClient:
         self._thread.start()
         self._socket: ClientConnection | None = None
         try:
-            self._socket = self._run(self._connect(wait, say))
+            self._socket = self._run(self._connect(wait))
             self.metadata: dict[str, Any] = self._exchange(None, timeout)
         except BaseException:
             self.close()
@@ -142,19 +138,15 @@ class PolicyClient:
         """Run a coroutine in the connection's thread."""
         return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result()
 
-    async def _connect(self, wait: float, say: Callable[[str], None]) -> ClientConnection:
+    async def _connect(self, wait: float) -> ClientConnection:
         """Connect, trying again for some time while the address refuses connections."""
-        start, said = time.monotonic(), False
+        end = time.monotonic() + wait
         while True:
             try:
                 return await connect(self.address, **self._options)
             except ConnectionRefusedError as error:
-                waited = time.monotonic() - start
-                if waited > wait:
+                if time.monotonic() > end:
                     raise ServerGone(f"no policy server at {self.address}: {error}") from error
-                if waited > SILENCE and not said:
-                    say(f"no server there yet: trying for up to {wait:g} s")
-                    said = True
                 await asyncio.sleep(RETRY_EVERY)
             except InvalidStatus as error:
                 code, body = error.response.status_code, error.response.body or b""

@@ -1,15 +1,13 @@
 """Load what a server serves: finished runs, or a published checkpoint with or without adapters."""
 
 import dataclasses
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lorasp_jax.adapters.io import native
+import lorasp_jax
 from lorasp_jax.base import hub
-from lorasp_jax.models import backbone
 from lorasp_jax.models.checkpoints import loading
 from lorasp_jax.policies import statistics_files
 from lorasp_jax.policies.policy import Policy
@@ -17,7 +15,7 @@ from lorasp_jax.policies.processor import Processor
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Tokenizer, load_tokenizer
 from lorasp_jax.training import export
-from lorasp_jax.training.base import SIZES
+from lorasp_jax.training.base import sized
 from lorasp_jax.training.run_folder import CONFIG_FILE, read_json
 
 UNADAPTED = "base"
@@ -39,12 +37,6 @@ class Loaded:
     words: Tokenizer
     continues: bool | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
-
-
-def is_run(where: str | os.PathLike[str]) -> bool:
-    """Return whether `where` is the folder of a run, as opposed to a checkpoint."""
-    path = Path(where)
-    return (path / native.DESCRIPTION).is_file() or (path / export.BASE).is_dir()
 
 
 def load_run(folder: str, *, base: str = "", words: str = "") -> Loaded:
@@ -91,7 +83,7 @@ def load_checkpoint(
             and `Processor.of`.
     """
     found = loading.find(where)
-    config = _config(size) if size else found.config
+    config = sized("pi0", size) if size else found.config
     if dtype:
         config = dataclasses.replace(config, dtype=dtype, param_dtype=dtype)
     moments = statistics_files.read(statistics or found.folder, dataset=dataset)
@@ -105,16 +97,7 @@ def load_checkpoint(
     prompts = dataclasses.replace(prompts, instructions=())
     processor = Processor.of(config, moments, prompts, num_joints=joints, cameras=cameras or None)
     model = found.load(config)
-    models = {name: native.load_adapters(path, model) for name, path in (adapters or {}).items()}
-    return {
-        name: Loaded(Policy(adapted, processor), words)
-        for name, adapted in {UNADAPTED: model, **models}.items()
-    }
-
-
-def _config(size: str) -> Any:
-    pi0 = backbone.find("pi0")
-    if not hasattr(pi0, size) or size not in SIZES:
-        known = ", ".join(name for name in SIZES if hasattr(pi0, name))
-        raise ValueError(f"unknown size {size!r}: choose one of {known}")
-    return getattr(pi0, size)()
+    models = {UNADAPTED: model}
+    for name, path in (adapters or {}).items():
+        models[name] = lorasp_jax.load_adapters(path, model)
+    return {name: Loaded(Policy(each, processor), words) for name, each in models.items()}

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from lorasp_jax.extras.serving.exported import Description, sampling_options
+from lorasp_jax.extras.serving.loading import Loaded
 from lorasp_jax.policies.policy import Observation, Policy
 from lorasp_jax.policies.processor import Processor
 from lorasp_jax.policies.prompt_table import Ids
-from lorasp_jax.policies.tokenizer import Tokenizer
 
 CACHED_PROMPTS = 1024
 """Number of instructions whose tokens are kept."""
@@ -28,35 +28,30 @@ class CompiledPolicy:
 
     def __init__(
         self,
-        policy: Policy,
-        words: Tokenizer,
+        loaded: Loaded,
         *,
         num_steps: int = 10,
         max_batch: int = 8,
         guidance: float | None = None,
-        continues: bool = True,
-        metadata: Mapping[str, Any] | None = None,
     ) -> None:
         """Prepare the policy's weights.
 
         Args:
-            policy: any policy.
-            words: its tokenizer.
+            loaded: any policy, with its tokenizer.
             num_steps: Euler steps of the flow-matching sampler.
             max_batch: largest batch.
             guidance: β of guided execution, see `real_time_chunking.sample`; None: no guidance.
-            continues: whether the policy may have been trained to continue chunks.
-            metadata: what the run says of its robot.
         """
+        policy = loaded.policy
         self.description: Description = describe(
             policy,
             num_steps=num_steps,
             batch_sizes=batch_sizes(max_batch),
-            continues=continues,
-            metadata=metadata or {},
+            continues=loaded.continues is not False,  # its files may not say it
+            metadata=loaded.metadata,
         )
         self.instructions: tuple[str, ...] = policy.processor.prompts.instructions
-        self._table, self._words = policy.processor.prompts, words
+        self._table, self._words = policy.processor.prompts, loaded.words
         self._policy = without_prompts(policy)
         self._guidance = None if guidance is None else np.float32(guidance)
         self.tokens = functools.lru_cache(CACHED_PROMPTS)(self._tokenize)

@@ -15,12 +15,19 @@ from lorasp_jax.extras.serving.requests import PolicySpec, Request
 
 
 class ServedPolicies:
-    """Policies of one robot by adapter name. See `BatchPolicy`.
+    """Policies of one robot by adapter name.
 
     The noise of the flow depends only on the server's seed and on the numbers of the connection and
     of the request on it, so the n-th connection to a server can be repeated exactly. Neither a
     reset nor a new connection starts the noise again: an unlucky draw would be that of every
     episode.
+
+    Attributes:
+        spec: what requests must have, and what is returned.
+        metadata: what the first policy's run says of its robot.
+        instructions: adapters that a request may choose, the default first, and the instructions
+            that each was trained with.
+        sizes: batch sizes, ascending.
     """
 
     def __init__(
@@ -72,6 +79,10 @@ class ServedPolicies:
     def prepare(self, request: Request, index: tuple[int, int]) -> dict[str, Any]:
         """Convert a request to a row of a batch.
 
+        Args:
+            request: a request.
+            index: numbers of the connection and of the request on it, for the flow's noise.
+
         Raises:
             ValueError: there is no instruction, or the policy does not know it.
         """
@@ -92,7 +103,7 @@ class ServedPolicies:
         return {**row, "index": np.array(index, np.int32)}
 
     def run(self, adapter: str, rows: Sequence[dict[str, Any]]) -> np.ndarray:
-        """Return actions f32 `[B, C, J+1]`."""
+        """Return actions f32 `[B, C, J+1]`; B is one of `sizes`."""
         policy = self._policies[adapter]
         batch = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
         shape = (policy.description.chunk, policy.description.action_dim)

@@ -17,9 +17,9 @@ import logging
 import socket
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from websockets.asyncio.server import Server, ServerConnection, serve
@@ -30,8 +30,11 @@ from websockets.http11 import Response
 
 import lorasp_jax
 from lorasp_jax.extras.serving import wire
-from lorasp_jax.extras.serving.batching import Batcher, BatchPolicy, PolicyFailure
+from lorasp_jax.extras.serving.batching import Batcher, PolicyFailure
 from lorasp_jax.extras.serving.requests import Request, parse
+
+if TYPE_CHECKING:  # which imports JAX
+    from lorasp_jax.extras.serving.served import ServedPolicies
 
 MAX_CLIENTS = 64
 """Maximum number of connections."""
@@ -55,7 +58,7 @@ class ClientState:
     previous_ms: float | None = None
 
     def advance(self, request: Request) -> tuple[Request, tuple[int, int]]:
-        """Return the request with the previous chunk, and its index as in `BatchPolicy.prepare`.
+        """Return the request with the previous chunk, and its index as in `ServedPolicies.prepare`.
 
         Raises:
             ValueError: it should continue a chunk, but is the first of its episode.
@@ -76,21 +79,18 @@ class PolicyServer:
         counts: numbers of connections, open connections, requests, errors and batches.
     """
 
-    def __init__(
-        self, policy: BatchPolicy, metadata: Mapping[str, Any] | None = None, *, token: str = ""
-    ) -> None:
+    def __init__(self, policy: "ServedPolicies", *, token: str = "") -> None:
         """Start the policy's thread; `listen` opens the port.
 
         Args:
             policy: already compiled.
-            metadata: more entries for the metadata frame.
             token: if not empty, clients must send it in the header "Authorization: Api-Key TOKEN".
         """
         names = ("connections", "open_connections", "requests", "errors")
         self.counts: Counter[str] = Counter(dict.fromkeys(names, 0))
         self._policy, self._token = policy, token
         self._batcher = Batcher(policy, self.counts)
-        self._metadata = wire.pack(describe(policy) | dict(metadata or {}))
+        self._metadata = wire.pack(describe(policy))
         self._clients = itertools.count()
 
     @contextlib.asynccontextmanager
@@ -150,11 +150,7 @@ class PolicyServer:
     async def _answer(
         self, connection: ServerConnection, client: ClientState, frame: bytes | str
     ) -> None:
-        """Reply to one frame.
-
-        Raises:
-            ValueError, PolicyFailure: it has no answer.
-        """
+        """Reply to one frame; raise ValueError or PolicyFailure if it has no answer."""
         start = time.perf_counter()
         if isinstance(frame, str):
             raise wire.FrameError("a request must be a binary frame")
@@ -191,7 +187,7 @@ class PolicyServer:
             await connection.close(CloseCode.INTERNAL_ERROR, "the previous frame says why")
 
 
-def describe(policy: BatchPolicy) -> dict[str, Any]:
+def describe(policy: "ServedPolicies") -> dict[str, Any]:
     """Return the metadata that clients receive first."""
     spec = policy.spec
     return {
@@ -203,6 +199,7 @@ def describe(policy: BatchPolicy) -> dict[str, Any]:
         "adapters": list(policy.instructions),
         "instructions": {name: list(texts) for name, texts in policy.instructions.items()},
         "execution": spec.execution,
+        **policy.metadata,
     }
 
 

@@ -34,8 +34,7 @@ class FrameError(ValueError):
 def pack(message: Any) -> bytes:
     """Encode a message of maps, lists, numbers, text and arrays.
 
-    bfloat16 and float8 arrays, which NumPy does not know, are sent as float32. JAX arrays are
-    copied to the host.
+    JAX arrays are copied to the host.
 
     Raises:
         TypeError: a value that the protocol cannot carry.
@@ -92,11 +91,6 @@ def _encode(value: Any) -> Any:
     if not hasattr(value, "__array__"):
         raise TypeError(f"a message cannot contain a {type(value).__name__}")
     array = np.asarray(value)
-    if array.dtype.kind == "V" and array.dtype.names is None and array.dtype.subdtype is None:
-        try:
-            array = array.astype(np.float32)
-        except (TypeError, ValueError) as error:
-            raise TypeError(f"a message cannot contain an array of {array.dtype}") from error
     if array.dtype.kind not in "biufUS":
         raise TypeError(f"a message cannot contain an array of {array.dtype}")
     if isinstance(value, np.generic):

@@ -1,21 +1,19 @@
 """Demonstrations that cells share: those to train on, and held-out ones that no cell trains on."""
 
-import contextlib
 import dataclasses
-import functools
 import hashlib
 import json
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
 from envs.datasets.episodes import Episodes
 from lorasp_jax.base.locks import locked
 from lorasp_jax.config import Config
-from lorasp_jax.data.batches import Batch, encode, flatten, gather
+from lorasp_jax.data.batches import Batch, flatten, sample_batch
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training.demonstrations import Progress, demonstrations, map_threads
 
@@ -29,7 +27,8 @@ Sample = Callable[[jax.Array], Batch]
 Keyed = tuple[jax.Array, Batch]
 """A batch with the key of its loss."""
 
-_encode = functools.partial(jax.jit, static_argnames="state_noise")(encode)
+_SIZES = ("batch_size", "chunk", "state_noise")
+_sample = jax.jit(sample_batch, static_argnames=_SIZES)  # seeds share its programs
 
 
 def shared_demonstrations(
@@ -69,17 +68,10 @@ def sampler(policy: Policy, episodes: Episodes, batch_size: int) -> Sample:
     Raises:
         ValueError: the policy has no prompt for one of the instructions.
     """
-    processor, chunk = policy.processor, policy.model.config.chunk
-    rows = processor.prompts.rows(episodes.instructions)
-    steps = flatten([episodes])
-    steps = dataclasses.replace(steps, instruction=rows[steps.instruction])
-
-    def sample(key: jax.Array) -> Batch:
-        start_key, noise_key = jax.random.split(key)
-        start = np.asarray(jax.random.randint(start_key, (batch_size,), 0, len(steps.end)))
-        return _encode(noise_key, gather(steps, start, chunk), processor, state_noise=0.0)
-
-    return sample
+    rows, steps = policy.processor.prompts.rows(episodes.instructions), flatten([episodes])
+    steps = jax.device_put(dataclasses.replace(steps, instruction=rows[steps.instruction]))
+    sizes = {"batch_size": batch_size, "chunk": policy.model.config.chunk, "state_noise": 0.0}
+    return lambda key: _sample(key, steps, policy.processor, **sizes)
 
 
 def keyed_batches(
@@ -120,12 +112,9 @@ def _shared(
 
     def one(task: str) -> Episodes:
         single = dataclasses.replace(config, tasks=(task,))
-        with _alone(folder / "cache" / f"{task}.npz"):
+        file = folder / "cache" / f"{task}.npz"
+        alone = nullcontext() if file.exists() else locked(file, waiting=lambda: None)
+        with alone:  # one process at a time makes a file; nobody waits once it exists
             return demonstrations(single, folder, progress)[task]
 
     return dict(zip(config.tasks, map_threads(one, config.tasks), strict=True))
-
-
-def _alone(file: Path) -> contextlib.AbstractContextManager[None]:
-    """Let one process at a time make a file; nobody waits once it exists."""
-    return contextlib.nullcontext() if file.exists() else locked(file, waiting=lambda: None)

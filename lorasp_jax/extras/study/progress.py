@@ -12,9 +12,9 @@ from typing import Any
 from lorasp_jax.base.errors import describe
 from lorasp_jax.base.writing import TEMPORARY_SUFFIX, write_text
 from lorasp_jax.config import Config
-from lorasp_jax.extras.study.finished_run import recorded_config
 from lorasp_jax.extras.study.study import Cell, Derived, Study
 from lorasp_jax.training import records
+from lorasp_jax.training.finished_run import recorded_config
 from lorasp_jax.training.run_folder import CONFIG_FILE, changed_settings, read_json, to_json
 
 CELL_FILE, FAILED_FILE = "cell.json", "failed.txt"
@@ -133,11 +133,7 @@ def _is_elsewhere(cell: Cell | Derived) -> bool:
 def _config(
     cell: Cell | Derived, others: Mapping[str, Status], run_config: Callable[[Path], Config]
 ) -> Config:
-    """Return the config of a cell's run.
-
-    Raises:
-        ValueError: the source is not a finished run.
-    """
+    """Return the config of a cell's run; raise ValueError if its source is not finished."""
     if isinstance(cell, Derived):
         source = cell.source
         found = run_config(source) if isinstance(source, Path) else others[source].config

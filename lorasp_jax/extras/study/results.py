@@ -13,7 +13,7 @@ from lorasp_jax.base.json_values import check
 from lorasp_jax.base.writing import write_text
 from lorasp_jax.extras.study.progress import SCHEMA
 from lorasp_jax.extras.study.study import Results, Study
-from lorasp_jax.extras.study.study import load as load_file
+from lorasp_jax.training.experiment_file import call
 
 RESULTS_FILE = "results.json"
 
@@ -35,13 +35,16 @@ def write(path: Path, study: str, results: Results) -> None:
     write_text(path, '{"cells":{\n' + ",\n".join(lines) + f"\n}},\n{_dump(rest)[1:]}\n")
 
 
-def load_study(config: Path, scale: str, path: Path | None) -> Study:
+def load_study(config: Path, scale: str, path: Path | None = None) -> Study:
     """Load the study that a file defines; it starts from the results in `path`, if given.
 
     Raises:
-        ValueError: see `study.load` and `load`.
+        ValueError: the file is missing, its code fails, or `get_study` does not return a `Study`;
+            see also `load`.
     """
-    study = load_file(config, scale)
+    study = call(config, "get_study", scale)
+    if not isinstance(study, Study):
+        raise ValueError(f"get_study in {config} must return a Study, got {type(study).__name__}")
     return dataclasses.replace(study, finished=load(path, study.name)) if path else study
 
 

@@ -63,7 +63,6 @@ def work(
     names: Collection[str],
     run_cell: RunCell,
     say: Say = print,
-    poll: float = POLL,
 ) -> None:
     """Run the named cells, in the study's order, until none of them can run.
 
@@ -86,7 +85,7 @@ def work(
         # The best cell that is free; then look again, because it may have enabled better ones.
         ran = next((name for name in runnable if run(name)), "")
         if not ran:
-            time.sleep(poll)
+            time.sleep(POLL)
         last = ran or last
 
 

@@ -15,9 +15,6 @@ Three seeds say little about the spread between seeds, and no resampling can add
 tasks of 256 episodes at 90 %, the 95 % interval contains the true rate in 99 % of studies if seeds
 do not differ, in 88 % if they differ by a standard deviation of 2 points, and in 80 % at 4 points
 (400 simulated studies; five seeds: 91 and 84 %). For paired differences it is 100, 87 and 79 %.
-
-A standard deviation over tasks needs a correction: the noise of finite samples adds to it, most
-where it is small, and resampling adds the same noise again. See `corrected`.
 """
 
 import functools
@@ -27,8 +24,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 DRAWS, LEVEL = 10_000, 0.95
-_T_QUANTILES = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
-"""97.5 % quantiles of Student's t for 1, 2, ... 9 degrees of freedom."""
 
 
 class Estimate(NamedTuple):
@@ -65,27 +60,11 @@ def bootstrap(statistic: Callable[..., Any], *methods: np.ndarray) -> Estimate:
     Raises:
         ValueError: the methods differ in their seeds, tasks or layouts.
     """
-    value, draws = _draw(statistic, methods)
-    low, high = _quantiles(draws)
-    return Estimate(value, low, high)
+    value, draws = draw(statistic, methods)
+    return Estimate(value, *percentiles(draws))
 
 
-def corrected(statistic: Callable[..., Any], *methods: np.ndarray) -> Estimate:
-    """Estimate a biased statistic, such as a standard deviation; arguments are as for `bootstrap`.
-
-    How far draws lie from the estimate on average tells its bias, which is subtracted. The interval
-    is the basic one, the percentiles mirrored at the estimate (Davison and Hinkley,
-    Bootstrap Methods and their Application, 1997, section 5.2). For the difference of two mean
-    standard deviations over four tasks, it contains the truth in 93 to 99 % of studies, that of
-    `bootstrap` in 80 to 100 % (150 simulated studies each: equal or different deviations, rates
-    near 100 % or not, seeds that do not differ or by 2 points).
-    """
-    value, draws = _draw(statistic, methods)
-    low, high = _quantiles(draws)
-    return Estimate(2 * value - float(np.mean(draws)), 2 * value - high, 2 * value - low)
-
-
-def _draw(statistic: Callable[..., Any], methods: Sequence[np.ndarray]) -> tuple[float, np.ndarray]:
+def draw(statistic: Callable[..., Any], methods: Sequence[np.ndarray]) -> tuple[float, np.ndarray]:
     """Return a statistic of the methods' rates, and of those of every draw, `[DRAWS]`."""
     if len({method.shape for method in methods}) != 1:
         shapes = ", ".join(str(method.shape) for method in methods)
@@ -94,7 +73,8 @@ def _draw(statistic: Callable[..., Any], methods: Sequence[np.ndarray]) -> tuple
     return value, statistic(*_resampled(np.stack(methods)))
 
 
-def _quantiles(draws: np.ndarray) -> tuple[float, float]:
+def percentiles(draws: np.ndarray) -> tuple[float, float]:
+    """Return the ends of the 95 % interval of draws."""
     tail = (1 - LEVEL) / 2
     low, high = np.quantile(draws, [tail, 1 - tail], method="inverted_cdf")
     return float(low), float(high)
@@ -118,25 +98,6 @@ def success(method: np.ndarray) -> Estimate:
 def difference(a: np.ndarray, b: np.ndarray) -> Estimate:
     """Estimate the paired difference of success rates, a - b, averaged over tasks."""
     return bootstrap(minus, a, b)
-
-
-def ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Ratio of mean success rates; the floor of one in a thousand avoids 0 / 0."""
-    return mean(a) / np.maximum(mean(b), 1e-3)
-
-
-def over_seeds(values: Sequence[float]) -> Estimate:
-    """Estimate the mean of a quantity with one value a seed, such as a rank, by Student's t.
-
-    Raises:
-        ValueError: fewer than 2 or more than 10 values.
-    """
-    count = len(values)
-    if not 2 <= count <= len(_T_QUANTILES) + 1:
-        raise ValueError(f"from 2 to {len(_T_QUANTILES) + 1} seeds are needed, got {count}")
-    center = float(np.mean(values))
-    spread = _T_QUANTILES[count - 2] * float(np.std(values, ddof=1)) / count**0.5
-    return Estimate(center, center - spread, center + spread)
 
 
 def _resampled(methods: np.ndarray) -> np.ndarray:

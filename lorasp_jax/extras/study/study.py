@@ -1,5 +1,6 @@
 """A study: named cells, most of which are training runs."""
 
+import dataclasses
 import fnmatch
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -8,7 +9,6 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from lorasp_jax.config import MAX_NAME_BYTES, Config
-from lorasp_jax.training.experiment_file import call
 
 if TYPE_CHECKING:  # a finished study should load no model code
     from envs.datasets.episodes import Episodes
@@ -19,7 +19,9 @@ Results: TypeAlias = Mapping[str, Mapping[str, Any]]
 """The content of cell.json by cell name."""
 Evaluate: TypeAlias = Callable[["Run"], dict[str, Any]]
 """Evaluates the policy of a cell's run; returns what cell.json records: `outcomes`, and more."""
-Measure: TypeAlias = Callable[["Run", Mapping[str, "Episodes"], "Policy | None"], dict[str, Any]]
+Demonstrations: TypeAlias = Mapping[str, "Episodes"]
+"""Demonstrations by task."""
+Measure: TypeAlias = Callable[["Run", Demonstrations, "Policy | None"], dict[str, Any]]
 """Maps a cell's run, held-out demonstrations by task, and the source's policy if the cell is
 derived, to further entries of cell.json."""
 RESERVED = ("demonstrations", "held_out", "locks", "logs", "results.json")
@@ -77,7 +79,7 @@ class Derived:
 
     name: str
     source: str | Path
-    transform: Callable[["Policy", Results, Mapping[str, "Episodes"]], "Policy"] | None = None
+    transform: Callable[["Policy", Results, Demonstrations], "Policy"] | None = None
     after: tuple[str, ...] = ()
     config: Callable[[Config], Config] = lambda config: config
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -151,16 +153,11 @@ class Study:
         return groups
 
 
-def load(path: Path, scale: str) -> Study:
-    """Load the study that a file defines.
-
-    Raises:
-        ValueError: the file is missing, its code fails, or `get_study` does not return a `Study`.
-    """
-    study = call(path, "get_study", scale)
-    if not isinstance(study, Study):
-        raise ValueError(f"get_study in {path} must return a Study, got {type(study).__name__}")
-    return study
+def evaluated(config: Config, *, tasks: tuple[str, ...] = (), **changes: int) -> Config:
+    """Return a config that evaluates some tasks with other settings; 0 or () keeps its own."""
+    settings = {name: value for name, value in changes.items() if value}
+    evaluation = dataclasses.replace(config.evaluation, **settings)
+    return dataclasses.replace(config, tasks=tasks or config.tasks, evaluation=evaluation)
 
 
 def select(study: Study, only: Sequence[str], shard: tuple[int, int]) -> list[str]:

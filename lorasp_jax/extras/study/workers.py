@@ -6,13 +6,13 @@ import multiprocessing
 import os
 import signal
 import sys
-import threading
 from collections.abc import Callable, Collection, Iterator
 from multiprocessing import connection
 from pathlib import Path
 from typing import Any
 
 from lorasp_jax.base.errors import INTERRUPTED
+from lorasp_jax.base.processes import end_with_parent
 from lorasp_jax.extras.study import progress, results
 from lorasp_jax.extras.study.progress import CellState
 from lorasp_jax.extras.study.runner import Job, RunCell, Say, work
@@ -104,7 +104,7 @@ def _work(
 ) -> None:
     """Run cells in a process of its own, which ends with its parent."""
     os.setpgid(0, 0)  # Ctrl-C reaches only the parent, which then sends SIGTERM
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
 
     def run(job: Job) -> dict[str, Any]:
         cell.value = job.cell.name.encode()
@@ -116,14 +116,6 @@ def _work(
             work(load(), folder, names, run, lambda text: print(text, flush=True))
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
-
-
-def _end_with_parent() -> None:
-    """Wait until the parent has gone, then exit at once."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
 
 
 def run_here(

@@ -13,14 +13,13 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.compress import quantization
 from lorasp_jax.extras.deployment import __main__ as command
 from lorasp_jax.extras.deployment import measurement, variants
+from lorasp_jax.extras.deployment.measurement import call_milliseconds
 from lorasp_jax.extras.serving import loading
 from lorasp_jax.extras.study import held_out, results, run_cell
-from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import LoRA
 from lorasp_jax.training import export
 from lorasp_jax.training.run_folder import to_json, write_json
 from tests.cases import mostly_slow
-from tests.models.random_models import random_backbone
 from tests.runs import CONFIG, RESULTS, make_run, random_episodes
 from tests.studies.paper.updates import add_noise
 
@@ -31,7 +30,8 @@ EPISODES = {"press": HELD_OUT}
 
 def finished_run(folder, base, method=CONFIG.peft):
     options = dataclasses.replace(CONFIG.model, checkpoint=str(base))
-    config = dataclasses.replace(CONFIG, model=options, peft=method, tasks=("press",))
+    settings = {"peft": method, "tasks": ("press",), "targets": ("action/blocks/q_proj",)}
+    config = dataclasses.replace(CONFIG, model=options, **settings)
     run = make_run(folder, config, models.load(base))
     run.policy = dataclasses.replace(run.policy, model=add_noise(run.policy.model, 0.1))
     run.base_hash = models.weights_hash(base)
@@ -42,15 +42,8 @@ def finished_run(folder, base, method=CONFIG.peft):
 
 
 @pytest.fixture(scope="module")
-def base(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("base")
-    models.save(folder, random_backbone(Pi0Config.dummy()))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory, base):
-    return finished_run(tmp_path_factory.mktemp("runs") / "trained", base)
+def run(tmp_path_factory, dummy_base):
+    return finished_run(tmp_path_factory.mktemp("runs") / "trained", dummy_base)
 
 
 @pytest.fixture(autouse=True)
@@ -58,8 +51,9 @@ def episodes(monkeypatch):
     """Replace the simulation and shrink the batches."""
     monkeypatch.setattr(variants, "BATCHES", 1)
     monkeypatch.setattr(measurement, "BATCHES", 1)
+    monkeypatch.setattr(measurement, "call_milliseconds", lambda *_: 1.5)
     fake = lambda config, generation: {t: random_episodes(t, generation) for t in config.tasks}  # noqa: E731
-    monkeypatch.setattr(measurement, "fresh_demonstrations", fake)
+    monkeypatch.setattr(measurement, "_other_demonstrations", fake)
     monkeypatch.setattr(
         held_out, "demonstrations", lambda config, *_: {t: HELD_OUT for t in config.tasks}
     )
@@ -103,7 +97,7 @@ def test_table(run, capsys):
     assert found.keys() == {"whole-bf16", "half-nf4"}
     for cell in found.values():
         assert cell["config"]["evaluation"]["episodes"] == 4
-        assert cell["measures"]["milliseconds"] > 0
+        assert cell["measures"]["milliseconds"] == 1.5
         assert 0 < cell["measures"]["loss"] < 100
     assert found["half-nf4"]["measures"]["bytes"] < found["whole-bf16"]["measures"]["bytes"]
     assert command.main(arguments) == 0  # nothing is measured again
@@ -112,6 +106,12 @@ def test_table(run, capsys):
     assert "it was run with other evaluation.episodes" in other
 
 
+@pytest.mark.slow
+def test_a_call_takes_time(run):
+    assert call_milliseconds(export.load_policy(run), EPISODES) > 0
+
+
+@pytest.mark.slow
 def test_forms(run):
     policy = export.load_policy(run)
     forms = {form: variants.in_form(policy, form, EPISODES) for form in variants.FORMS}
@@ -153,7 +153,7 @@ def test_a_saved_variant_is_served(run, tmp_path, capsys, name):
     assert np.abs(actions(served) - actions(policy)).max() > 1e-4
 
 
-def test_refusals(run, base, tmp_path, capsys):
+def test_refusals(run, dummy_base, tmp_path, capsys):
     out = tmp_path / "policy"
     save = run, "--save", "half-bf16", "--out"
     (tmp_path / "taken").mkdir()
@@ -165,18 +165,10 @@ def test_refusals(run, base, tmp_path, capsys):
     assert "are for measuring" in refuse(capsys, *save, out, "--episodes", "4")
     unfinished = refuse(capsys, tmp_path, *save[1:], out)
     assert f"{tmp_path} is not a finished run" in unfinished
-    lora = finished_run(tmp_path / "lora", base, LoRA(rank=2))
+    lora = finished_run(tmp_path / "lora", dummy_base, LoRA(rank=2))
     error = refuse(capsys, lora, *save[1:], out)
     assert "was trained with LoRA: only LoRA-SP runs have variants" in error
     assert not out.exists()
-
-
-def test_a_run_needs_its_config_and_results(base, tmp_path, capsys):
-    run = finished_run(tmp_path / "run", base)
-    write_json(run / "results.json", RESULTS | {"tasks": {}})
-    assert f"the tasks of {run} cannot be simulated" in refuse(capsys, run)
-    (run / "results.json").unlink()
-    assert f"{run} is not a finished run" in refuse(capsys, run)
 
 
 def test_quantized_base_of_a_policy_is_checked(run, tmp_path):

@@ -3,12 +3,12 @@
 import dataclasses
 import json
 import os
+import re
 import subprocess
 import sys
 import time
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 from PIL import Image
@@ -23,6 +23,7 @@ from tests import ROOT
 from tests.cases import mostly_slow
 from tests.evaluation.line_world import TASK, Line, tasks
 from tests.evaluation.policy_servers import policy_server
+from tests.extras.serving.test_policies import noise_of, reference, request
 
 
 class Mover:
@@ -207,7 +208,6 @@ def test_an_error_of_the_server_is_one_sentence(processes, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--server", "ws://127.0.0.1:9", "--processes", "0"], "at least 1, got 0"),
         (["runs/x", "--processes", "2"], "--processes needs --server"),
         ([], "either the folder of a run or --server"),
         (["runs/x", "--server", "ws://127.0.0.1:9"], "either the folder of a run or --server"),
@@ -218,38 +218,32 @@ def test_options_that_do_not_fit_are_refused(arguments, message, capsys):
     assert message in capsys.readouterr().err
 
 
-def test_client_needs_no_jax():
+def test_only_a_run_needs_jax():
     program = (
-        "import sys; sys.modules.update(dict.fromkeys(['jax', 'mujoco', 'flax', 'envs']))\n"
-        "import lorasp_jax.extras.serving.client\n"
+        "import sys\n"
+        "sys.modules.update(dict.fromkeys(['jax', 'mujoco', 'flax', 'envs', 'rich']))\n"
         "from lorasp_jax.extras.judge.__main__ import main\n"
-        "sys.exit(main(['--server', 'ws://127.0.0.1:9', '--env', 'nowhere:tasks']))"
+        f"for policy in (['--server', 'ws://127.0.0.1:9'], ['runs/x']):\n"
+        f"    assert main([*policy, '--env', '{HERE}:tasks']) == 2"
     )
     command = [sys.executable, "-c", program]
     process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert process.returncode == 2
-    assert process.stderr.startswith("error: there is no module nowhere")
-
-
-def test_run_without_jax_names_the_way_out(monkeypatch):
-    monkeypatch.setitem(sys.modules, "jax", None)
-    with pytest.raises(ValueError, match=r"needs jax, .* give --server"):
-        RunActor(Path("runs/x"), ["go"])
+    assert process.returncode == 0, process.stderr
+    server, run = process.stderr.splitlines()
+    assert server.startswith("error: no policy server at")
+    assert re.fullmatch(r"error: runs/x needs jax.* give --server", run)
 
 
 def test_run_acts_as_its_policy(finished):
+    """With a server's noise, here of the fifth connection."""
     actor = RunActor(finished.folder, ["push the button", "push button"], num_steps=2)
-    rng = np.random.default_rng(0)
-    images = {name: rng.integers(0, 255, (32, 32, 3), np.uint8) for name in ("side", "wrist")}
-    state = rng.normal(size=7).astype(np.float32)
+    sent = request(actor._policy.spec, prompt="push the button")
+    images, state = sent.images, sent.state
     actor.reset(4)
     chunk = actor.act(images, state, "push the button")
-    observation = {"image": {k: v[None] for k, v in images.items()}, "state": state[None]}
-    key = jax.random.split(jax.random.key(4))[1]
-    row = finished.policy.processor.prompts.rows(["push the button"])
-    sample = jax.jit(lambda policy: policy.sample(key, observation, row, num_steps=2))
-    (expected,) = sample(finished.policy)
-    np.testing.assert_allclose(chunk, expected, rtol=1e-4, atol=1e-5)
+    noise = noise_of(actor._policy.spec, connection=4)
+    np.testing.assert_allclose(chunk, reference(finished.policy, [sent], noise)[0], atol=1e-5)
+    assert np.abs(actor.act(images, state, "push the button") - chunk).max() > 1e-6
     actor.reset(4)
     assert np.abs(actor.act(images, state, "push button") - chunk).max() > 1e-6
     with pytest.raises(ValueError, match="camera wrist"):

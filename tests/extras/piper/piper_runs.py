@@ -3,7 +3,6 @@
 import numpy as np
 
 from lorasp_jax.extras.piper.asking import InTurn
-from lorasp_jax.extras.piper.cameras import Simulated
 from lorasp_jax.extras.piper.safety import Limits
 from lorasp_jax.extras.piper.session import PERIOD, Session, Settings
 
@@ -26,14 +25,13 @@ class Turning:
 class Run:
     """A session whose sentences are kept; `at` calls functions at times since the start."""
 
-    def __init__(self, bench, ask, *, cameras=None, latency=0.0, **options):
+    def __init__(self, bench, ask, *, look=None, latency=0.0, **options):
         self.bench, self.said, self.at, self.commands, self.sent = bench, [], {}, [], []
         settings = Settings("turn", hold=options.pop("hold", 0.5), **options.pop("settings", {}))
         asker = options.pop("asker", None) or InTurn(ask, bench.clock, latency)
-        cameras = cameras or Simulated(bench.world.images)
         self.session = Session(
             bench.arm,
-            cameras,
+            look or bench.world.images,
             asker,
             LIMITS,
             settings,

@@ -1,13 +1,14 @@
 """Cameras: newest picture, missing and silent sources."""
 
 import time
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
 
 from envs.rendering.video import write_video
 from lorasp_jax.extras.piper import cameras
-from lorasp_jax.extras.piper.cameras import Camera, NoPicture, OpenCameras
+from lorasp_jax.extras.piper.cameras import Camera, NoPicture, open_cameras
 
 
 @pytest.fixture
@@ -20,16 +21,16 @@ def film(tmp_path):
 
 def test_the_newest_picture_counts(film, monkeypatch):
     monkeypatch.setattr(cameras, "MAX_AGE", 60.0)
-    opened = OpenCameras({"side": film, "wrist": film})
-    for camera in opened._cameras.values():
-        camera._thread.join(60)  # until the last picture
-    images = opened.read()
+    with ExitStack() as stack:
+        look, deadline = open_cameras({"side": film, "wrist": film}, stack), time.monotonic() + 60
+        while look()["side"].mean() < 187 and time.monotonic() < deadline:
+            time.sleep(0.01)  # until the last picture
+        images = look()
     assert {name: (x.shape, x.dtype) for name, x in images.items()} == {
         "side": ((48, 64, 3), np.uint8),
         "wrist": ((48, 64, 3), np.uint8),
     }
     assert images["side"].mean() == pytest.approx(190, abs=3)
-    opened.close()
 
 
 def test_a_source_that_stops_is_stale(film, monkeypatch):
@@ -45,7 +46,7 @@ def test_a_source_that_stops_is_stale(film, monkeypatch):
 @pytest.mark.parametrize("source", ["/dev/video_nowhere", "nowhere.mp4"])
 def test_a_missing_source_is_one_sentence(source):
     with pytest.raises(ConnectionError, match=f"cannot open camera side at {source}: "):
-        OpenCameras({"side": source})
+        open_cameras({"side": source}, ExitStack())
 
 
 def test_a_source_without_pictures(tmp_path):

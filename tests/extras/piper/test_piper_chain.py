@@ -4,7 +4,6 @@ import pytest
 
 from envs.names import names
 from lorasp_jax.extras.piper.asking import InTurn
-from lorasp_jax.extras.piper.cameras import Simulated
 from lorasp_jax.extras.piper.fake.demonstrator import Demonstrator
 from lorasp_jax.extras.piper.fake.world import World
 from lorasp_jax.extras.piper.safety import Limits
@@ -24,9 +23,9 @@ def test_the_expert_solves_every_task(task, latency):
         bench.fake.reset(seed)
         bench.wait(0.3)
         asker = InTurn(Demonstrator(world, bench.clock, seed), bench.clock)
-        settings, cameras = Settings(world.instruction), Simulated(world.images)
+        settings = Settings(world.instruction)
         session = Session(
-            bench.arm, cameras, asker, limits, settings, bench.clock, say=problems.append
+            bench.arm, world.images, asker, limits, settings, bench.clock, say=problems.append
         )
         session.run(world.env.task.time_limit, bench.every_control_step(world.judge))
         wins += world.success

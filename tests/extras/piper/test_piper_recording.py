@@ -7,7 +7,6 @@ import pytest
 from envs.robots.piper import SDK_OFFSET
 from lorasp_jax.data.opening import open_source
 from lorasp_jax.extras.piper.asking import InTurn
-from lorasp_jax.extras.piper.cameras import Simulated
 from lorasp_jax.extras.piper.fake import frames
 from lorasp_jax.extras.piper.fake.demonstrator import Demonstrator
 from lorasp_jax.extras.piper.recording import Recording
@@ -24,8 +23,8 @@ def recording(folder, prompt="push it", **more):
 
 
 def lesson(bench, recorder, way):
-    cameras = Simulated(bench.world.images)
-    return Lesson(bench.arm, cameras, recorder, LIMITS, bench.clock, way=way, control_dt=0.1)
+    look = bench.world.images
+    return Lesson(bench.arm, look, recorder, LIMITS, bench.clock, way=way, control_dt=0.1)
 
 
 def only_episode(folder):
@@ -37,10 +36,10 @@ def only_episode(folder):
 def test_a_policys_episode_is_recorded_as_it_was_executed(bench, tmp_path):
     recorder = recording(tmp_path / "data")
     expert = Demonstrator(bench.world, bench.clock, seed=0)
-    cameras, asker = Simulated(bench.world.images), InTurn(expert, bench.clock)
+    look, asker = bench.world.images, InTurn(expert, bench.clock)
     settings = Settings("push it")
     session = Session(
-        bench.arm, cameras, asker, LIMITS, settings, bench.clock, recorder=recorder, say=pytest.fail
+        bench.arm, look, asker, LIMITS, settings, bench.clock, recorder=recorder, say=pytest.fail
     )
     assert session.run(2.0) is None
     assert recorder.steps == 20

@@ -1,6 +1,7 @@
 """The control loop on the fake arm when the arm, the server or a camera fails."""
 
 import contextlib
+import itertools
 import types
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from websockets.exceptions import ConcurrencyError
 
 from lorasp_jax.extras.piper import session as sessions
-from lorasp_jax.extras.piper.cameras import NoPicture, Simulated
+from lorasp_jax.extras.piper.cameras import NoPicture
 from lorasp_jax.extras.piper.fake import frames
 from lorasp_jax.extras.piper.log import Log
 from lorasp_jax.extras.piper.options import Server
@@ -80,6 +81,7 @@ def test_an_arm_with_a_fault_holds_where_it_is(bench, faults, words):
     assert np.abs(run.path[-1] - sessions.REST)[:6].max() > 0.5
 
 
+@pytest.mark.usefixtures("near_rest")
 def test_a_collision_does_not_end_by_itself(bench):
     run = Run(bench, ask := Turning())
     run.at = {
@@ -100,6 +102,7 @@ def test_a_person_who_guides_the_arm_gets_it(bench):
     assert bench.fake.commands == sent < 120
 
 
+@pytest.mark.usefixtures("near_rest")
 def test_a_chunk_with_nan_is_refused_and_the_arm_goes_to_rest(bench):
     ask = Turning()
     run = Run(bench, ask)
@@ -124,6 +127,7 @@ def test_chunks_too_short_for_the_settings_are_an_error_before_the_arm_moves(ben
     assert_safe(run)
 
 
+@pytest.mark.usefixtures("near_rest")
 def test_a_later_chunk_that_is_too_short_is_refused_and_the_arm_goes_to_rest(bench):
     run = Run(bench, ask := Turning(8), settings={"execute": 5, "ahead": 3})
     run.at = {0.3: lambda: setattr(ask, "change", lambda actions: actions[:7])}
@@ -132,6 +136,7 @@ def test_a_later_chunk_that_is_too_short_is_refused_and_the_arm_goes_to_rest(ben
     assert_holds(run, "at least 8 actions")
 
 
+@pytest.mark.usefixtures("near_rest")
 def test_a_server_that_dies_in_mid_chunk(bench):
     policy = StandIn()
     policy.prepare = lambda request, index: request.state
@@ -146,6 +151,7 @@ def test_a_server_that_dies_in_mid_chunk(bench):
     assert_holds(run, "closed the connection")
 
 
+@pytest.mark.usefixtures("near_rest")
 def test_a_server_that_refuses(bench):
     with serving(StandIn()) as server:
         client = PolicyClient(server.address)
@@ -155,6 +161,7 @@ def test_a_server_that_refuses(bench):
     assert_holds(run, "prompt must be text")
 
 
+@pytest.mark.usefixtures("near_rest")
 @pytest.mark.parametrize("error", [FrameError("bad"), TypeError("bad"), ConcurrencyError("bad")])
 def test_a_policy_that_raises_anything(bench, error):
     run = Run(bench, ask := Turning())
@@ -168,7 +175,7 @@ def test_a_policy_that_raises_anything(bench, error):
     assert_holds(run, "bad")
 
 
-@pytest.mark.parametrize("where", ["cameras", "recorder", "log", "done"])
+@pytest.mark.parametrize("where", ["look", "recorder", "log", "done"])
 @pytest.mark.parametrize("error", [OSError("it broke"), KeyboardInterrupt("it broke")])
 def test_every_other_error_brakes_and_is_raised(bench, where, error):
     broken = []
@@ -177,11 +184,11 @@ def test_every_other_error_brakes_and_is_raised(bench, where, error):
         if bench.clock.now() > due and not broken:
             broken.append(where)
             raise error
-        return where == "cameras" and bench.world.images()
+        return where == "look" and bench.world.images()
 
     due = bench.clock.now() + 0.45  # at full speed
     part = {
-        "cameras": Simulated(work),
+        "look": work,
         "recorder": types.SimpleNamespace(step=work),
         "log": types.SimpleNamespace(observation=work, line=lambda *_, **__: work()),
     }
@@ -212,6 +219,7 @@ def test_a_kind_of_frame_that_stops(bench, kinds):
     assert_braked(run)
 
 
+@pytest.mark.usefixtures("near_rest")
 def test_a_server_that_hangs(bench):
     run = Run(bench, Turning(), latency=9.0, settings={"patience": 0.4})
     assert "did not answer within 0.4 s" in run(30.0)
@@ -219,29 +227,26 @@ def test_a_server_that_hangs(bench):
 
 
 def test_pictures_that_stop(bench):
-    class Blinking(Simulated):
-        seen = 0
+    looks = itertools.count(1)
 
-        def read(self):
-            self.seen += 1
-            if 1 < self.seen < 20:
-                raise NoPicture("camera wrist shows nothing new")
-            return super().read()
+    def blink():
+        if 1 < next(looks) < 20:
+            raise NoPicture("camera wrist shows nothing new")
+        return bench.world.images()
 
-    run = Run(bench, Turning(), cameras=Blinking(bench.world.images))
+    run = Run(bench, Turning(), look=blink)
     assert run(1.5) is None
     assert run.said[:2] == ["holding: camera wrist shows nothing new", "going on"]
 
 
 def test_pictures_that_stop_for_good(bench):
-    class Dying(Simulated):
-        def read(self):
-            if bench.clock.now() > due:
-                raise NoPicture("camera wrist shows nothing new")
-            return super().read()
+    def die():
+        if bench.clock.now() > due:
+            raise NoPicture("camera wrist shows nothing new")
+        return bench.world.images()
 
     due = bench.clock.now() + 0.45
-    run = Run(bench, Turning(), cameras=Dying(bench.world.images))
+    run = Run(bench, Turning(), look=die)
     assert "nothing new" in run(30.0)
     assert run.said == [run.said[0], "moving slowly to the rest pose"]
     np.testing.assert_allclose(bench.world.pose[:6], sessions.REST[:6], atol=0.03)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lorasp_jax.extras.piper.fake.world import PhysicsGap, World
+from lorasp_jax.extras.piper.fake.world import TIMESTEP, World
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def test_pictures_follow_the_arm(world):
 def test_physics_differ_from_training(world):
     world.reset(1)
     own, trained = world.model, world.env.model
-    assert own.opt.timestep == PhysicsGap().timestep != trained.opt.timestep
+    assert own.opt.timestep == TIMESTEP != trained.opt.timestep
     assert (own.actuator_gainprm[:6, 0] > trained.actuator_gainprm[:6, 0]).all()
     assert (own.dof_frictionloss[:6] > 0).all()
     assert (own.geom_friction[:, 0] < trained.geom_friction[:, 0]).all()

@@ -22,7 +22,8 @@ class StandIn:
     answer.
     """
 
-    def __init__(self, spec=SPEC, *, seconds=0.0, adapters=("base",), instructions=()):
+    def __init__(self, spec=SPEC, *, seconds=0.0, adapters=("base",), instructions=(), metadata=()):
+        self.metadata = dict(metadata)
         self.spec, self.sizes, self.seconds = spec, (1, 2, 4, 8), seconds
         self.instructions = dict.fromkeys(adapters, instructions)
         self.gate, self.failure = threading.Event(), None

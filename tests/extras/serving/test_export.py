@@ -15,7 +15,6 @@ from lorasp_jax.models.smolvla import SmolVLAConfig
 from lorasp_jax.training import load_policy
 from lorasp_jax.training.run_folder import to_json, write_json
 from studies.paper import transforms
-from tests.cases import mostly_slow
 from tests.extras.serving.test_exported import arguments, in_process
 from tests.extras.serving.test_policies import make_policy
 from tests.runs import CONFIG, random_episodes
@@ -145,7 +144,8 @@ POLICIES = {
 }
 
 
-@pytest.mark.parametrize("name", mostly_slow(POLICIES, ["int8"]))
+@pytest.mark.slow  # test_exported.py has a plain policy
+@pytest.mark.parametrize("name", POLICIES)
 def test_all_kinds_of_policies_are_exported(name, run, tmp_path):
     policy = POLICIES[name](run)
     exporting.write(policy, tmp_path / "policy", num_steps=2, max_batch=1)

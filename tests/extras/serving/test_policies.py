@@ -1,12 +1,15 @@
 """Test that a served policy gives the same actions as `Policy.sample`, alone and in batches."""
 
 import dataclasses
+import functools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from lorasp_jax.extras.serving import policies
+from lorasp_jax.extras.serving.loading import Loaded
 from lorasp_jax.extras.serving.policies import CompiledPolicy, batch_sizes
 from lorasp_jax.extras.serving.requests import Request
 from lorasp_jax.extras.serving.served import ServedPolicies
@@ -36,8 +39,9 @@ def make_policy(config=None, *, seed=0, instructions=INSTRUCTIONS, cameras=None,
 
 
 def compiled(policies, *, max_batch=2, guidance=None, metadata=None, **options):
-    settings = {"max_batch": max_batch, "guidance": guidance, "metadata": metadata}
-    made = {n: CompiledPolicy(p, WORDS, num_steps=STEPS, **settings) for n, p in policies.items()}
+    settings = {"num_steps": STEPS, "max_batch": max_batch, "guidance": guidance}
+    loaded = {name: Loaded(each, WORDS, None, metadata or {}) for name, each in policies.items()}
+    made = {name: CompiledPolicy(each, **settings) for name, each in loaded.items()}
     return ServedPolicies(made, **options)
 
 
@@ -51,20 +55,27 @@ def request(spec, seed=0, prompt=INSTRUCTIONS[1], absent=(), **fields):
 
 def reference(policy, sent, noise, *, absent=(), **condition):
     """Actions of the policy itself for requests with the same prompt."""
-    processor, state = policy.processor, np.stack([each.state for each in sent])
     images = {name: np.stack([each.images[name] for each in sent]) for name in sent[0].images}
-    rows = processor.prompts.rows([each.prompt for each in sent])
-    encoded = processor.encode({"image": images, "state": state}, rows)
+    seen = {"image": images, "state": np.stack([each.state for each in sent])}
+    rows = jnp.asarray(policy.processor.prompts.rows([each.prompt for each in sent]))
+    return np.asarray(_reference(policy, seen, rows, noise, condition, absent=tuple(absent)))
+
+
+@functools.partial(jax.jit, static_argnames="absent")
+def _reference(policy, seen, rows, noise, condition, *, absent):
+    processor = policy.processor
+    encoded = processor.encode(seen, rows)
     for name in absent:
-        masks = {**encoded.image_masks, name: np.zeros(len(sent), bool)}
+        masks = {**encoded.image_masks, name: jnp.zeros(len(rows), bool)}
         pictures = {**encoded.images, name: 0 * encoded.images[name] - 1}
         encoded = dataclasses.replace(encoded, images=pictures, image_masks=masks)
     if condition:
-        condition["prefix"] = processor.normalize_actions(condition["prefix"], state)
+        prefix = processor.normalize_actions(condition["prefix"], seen["state"])
+        condition = condition | {"prefix": prefix}
     chunk = policy.model.sample_actions(
         None, encoded, num_steps=STEPS, noise=noise, slots=processor.flow_slots, **condition
     )
-    return np.asarray(processor.decode(chunk, state))
+    return processor.decode(chunk, seen["state"])
 
 
 def noise_of(spec, connection=0, request=0):

@@ -21,7 +21,7 @@ from tests.extras.serving.stand_in import SPEC, StandIn, connect, observation, s
 
 @pytest.fixture(scope="module")
 def server():
-    with serving(StandIn(adapters=("base", "pour")), metadata={"robot": "piper"}) as server:
+    with serving(StandIn(adapters=("base", "pour"), metadata={"robot": "piper"})) as server:
         yield server
 
 

@@ -26,12 +26,11 @@ def test_other_values_survive():
     assert unpack(pack(message)) == message
     scalar = unpack(pack(np.float32(1.5)))
     assert (scalar, type(scalar)) == (1.5, np.float32)
-    result = unpack(pack(np.array([1.5, -2], ml_dtypes.bfloat16)))
-    assert (result.dtype, result.tolist()) == (np.float32, [1.5, -2])
 
 
 @pytest.mark.parametrize(
-    "value", [object(), {1, 2}, 1j, np.array(1j), np.array([None]), np.zeros(2, "f4,i4")]
+    "value",
+    [object(), {1, 2}, 1j, np.array([None]), np.zeros(2, "f4,i4"), np.ones(2, ml_dtypes.bfloat16)],
 )
 def test_other_values_are_refused(value):
     with pytest.raises(TypeError, match=r"a message cannot contain an? "):

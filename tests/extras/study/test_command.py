@@ -8,7 +8,7 @@ import pytest
 
 from lorasp_jax.extras.study import __main__ as command
 from lorasp_jax.extras.study import results, runner, workers
-from lorasp_jax.extras.study.study import load, select
+from lorasp_jax.extras.study.study import select
 from tests import ROOT
 from tests.extras.study import fakes
 from tests.extras.study.fakes import NAMES, ran, study
@@ -70,7 +70,7 @@ def test_parts_of_a_study(start, folder):
 
 
 def test_a_failed_cell_is_reported_and_tried_again(start, folder, monkeypatch):
-    monkeypatch.setattr(InProcess, "run_cell", staticmethod(fail))
+    monkeypatch.setattr(InProcess, "run_cell", staticmethod(failing("sp/s1")))
     code, text = start()
     assert code == 2
     assert "sp/s1: failed RuntimeError: boom" in text
@@ -80,10 +80,15 @@ def test_a_failed_cell_is_reported_and_tried_again(start, folder, monkeypatch):
     assert sorted(ran(folder)) == sorted(NAMES)
 
 
-def fail(job):
-    if job.cell.name == "sp/s1":
-        raise RuntimeError("boom")
-    return fakes.run(job)
+def failing(name):
+    """Return a function that runs all cells but one."""
+
+    def run(job):
+        if job.cell.name == name:
+            raise RuntimeError("boom")
+        return fakes.run(job)
+
+    return run
 
 
 def test_a_damaged_cell_is_reported(start, folder):
@@ -135,7 +140,7 @@ def test_every_cell_is_in_one_shard():
 def test_a_file_must_return_a_study(tmp_path):
     (tmp_path / "a.py").write_text("def get_study(scale): return 7\n")
     with pytest.raises(ValueError, match=r"get_study in .*a\.py must return a Study, got int"):
-        load(tmp_path / "a.py", "smoke")
+        results.load_study(tmp_path / "a.py", "smoke")
 
 
 def test_a_finished_study_loads_no_model_and_no_simulation(start, tmp_path):
@@ -202,18 +207,12 @@ def test_a_derived_cell_gets_its_source_again(start, folder, committed):
 def test_a_source_that_fails_again_keeps_its_results(start, folder, committed, monkeypatch):
     without(committed, "cut/s0")
     before = committed.read_bytes()
-    monkeypatch.setattr(InProcess, "run_cell", staticmethod(fail_source))
+    monkeypatch.setattr(InProcess, "run_cell", staticmethod(failing("lora/s0")))
     code, text = start("--results", str(committed))
     assert code == 2
-    assert "lora/s0: failed RuntimeError: no memory" in text
+    assert "lora/s0: failed RuntimeError: boom" in text
     assert "cut/s0: waiting for lora/s0 (failed)" in text
     assert committed.read_bytes() == before
-
-
-def fail_source(job):
-    if job.cell.name == "lora/s0":
-        raise RuntimeError("no memory")
-    return fakes.run(job)
 
 
 def test_no_result_of_the_file_is_lost(start, folder, committed, tmp_path):

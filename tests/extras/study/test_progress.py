@@ -36,31 +36,11 @@ def test_nothing_has_run(folder):
     assert found["lora/s0"].config is None
 
 
-def test_a_damaged_result_is_named(folder):
-    finish(folder)
-    file = folder / "sp/s0/cell.json"
-    file.write_text(file.read_text().replace("123", "124"))
-    found = progress.read(study(), folder)
-    assert found["sp/s0"].state is CellState.DAMAGED
-    assert str(file) in found["sp/s0"].reason
-    assert found["lora/s0"].state is CellState.FINISHED
-    assert found["lr"].state is CellState.FINISHED
-
-
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"digest": ""}'])
 def test_a_damaged_config_is_named(folder, content):
     begin(folder / "sp/s0", CONFIG)
     (folder / "sp/s0/config.json").write_text(content)
     assert states(folder)["sp/s0"] == CellState.DAMAGED
-
-
-def test_changed_settings_are_named(folder):
-    finish(folder)
-    found = progress.read(other(seed=5, log_every=7), folder)["sp/s0"]
-    assert (found.state, found.reason) == (
-        CellState.CHANGED,
-        "it was run with other log_every, seed",
-    )
 
 
 def test_changed_settings_of_an_unfinished_cell_are_named(folder):

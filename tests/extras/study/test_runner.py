@@ -13,13 +13,23 @@ from tests.extras.study.fakes import NAMES, ran, run, states, study
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "POLL", 0.01)
     (tmp_path / "fake").mkdir()
     return tmp_path / "fake"
 
 
 def work(folder, names=NAMES, run_cell=run, of=None):
-    runner.work(of or study(), folder, names, run_cell, poll=0.01)
+    runner.work(of or study(), folder, names, run_cell)
+
+
+def work_together(count, *arguments):
+    """Work in threads."""
+    threads = [threading.Thread(target=work, args=arguments) for _ in range(count)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
 
 
 def test_cells_run_once_in_order(folder):
@@ -62,29 +72,8 @@ def test_a_failed_cell_does_not_stop_the_others(folder):
     assert sorted(ran(folder)) == sorted(NAMES)
 
 
-def test_shards_are_merged(folder):
-    first = ["sp/s0", "sp/s1"]
-    work(folder, first)
-    assert states(folder)["lora/s0"] == CellState.RUNNABLE
-    work(folder, set(NAMES) - {*first})
-    assert sorted(ran(folder)) == sorted(NAMES)
-
-
-def test_a_cell_of_another_shard_is_waited_for(folder):
-    work(folder, ["lora/s0", "cut/s0"])
-    assert ran(folder) == []
-    assert states(folder)["lora/s0"] == CellState.WAITING
-
-
 def test_several_workers_run_every_cell_once(folder):
-    threads = [
-        threading.Thread(target=work, args=(folder,), kwargs={"run_cell": fakes.run_slowly})
-        for _ in range(4)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    work_together(4, folder, NAMES, fakes.run_slowly)
     assert sorted(ran(folder)) == sorted(NAMES)
     assert set(states(folder).values()) == {CellState.FINISHED}
 
@@ -98,13 +87,7 @@ def test_workers_share_a_group_that_others_wait_for(folder):
             both.wait()  # afterwards, as a worker could go on before the other has noted its run
         return result
 
-    threads = [
-        threading.Thread(target=work, args=(folder,), kwargs={"run_cell": meet}) for _ in range(2)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    work_together(2, folder, NAMES, meet)
     assert {*ran(folder)[:2]} == {"sp/s0", "sp/s1"}
     assert set(states(folder).values()) == {CellState.FINISHED}
 
@@ -128,14 +111,7 @@ def test_workers_run_a_missing_source_once(folder, tmp_path):
     second = Derived("cut/again", "lora/s0", study()["cut/s0"].transform, ("sp/s0",))
     started = dataclasses.replace(study(), cells=(*study().cells, second), finished=finished)
     names = ["cut/s0", "cut/again"]
-    threads = [
-        threading.Thread(target=work, args=(empty, names, fakes.run_slowly, started))
-        for _ in range(3)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    work_together(3, empty, names, fakes.run_slowly, started)
     assert sorted(ran(empty)) == ["cut/again", "cut/s0", "lora/s0"]
 
 

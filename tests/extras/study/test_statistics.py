@@ -44,28 +44,6 @@ def test_pairing_removes_what_seeds_and_layouts_do_to_both():
     assert statistics.difference(a, a) == (0, 0, 0)
 
 
-def test_a_corrected_standard_deviation_covers_the_true_one():
-    """Tasks at 80, 90, 90 and 100 %, three seeds that do not differ."""
-    rng = np.random.default_rng(0)
-    rates = np.array([0.8, 0.9, 0.9, 1.0])
-    spread = lambda rates: rates.std(-1)  # noqa: E731
-    methods = rng.random((60, 3, 4, 256)) < rates[:, None]
-    found = [statistics.corrected(spread, method) for method in methods]
-    truth = rates.std()
-    assert sum(e.low <= truth <= e.high for e in found) >= 54
-    assert np.mean([e.value for e in found]) == pytest.approx(truth, abs=0.002)
-    assert all(e.low < e.value < e.high for e in found)
-
-
-def test_a_correction_leaves_means_as_they_are():
-    (method,) = studies(1, spread=0.05)
-    plain, mended = (
-        f(statistics.mean, method) for f in (statistics.bootstrap, statistics.corrected)
-    )
-    assert mended.value == pytest.approx(plain.value, abs=1e-3)
-    assert mended.high - mended.low == pytest.approx(plain.high - plain.low)
-
-
 def test_a_sure_method_has_an_interval_of_no_width():
     assert statistics.success(np.ones((3, 4, 16), bool)) == (1, 1, 1)
 
@@ -101,10 +79,3 @@ def test_unequal_cells_are_errors():
         statistics.outcomes([[{"outcomes": {"press": "10"}}], [{"outcomes": {"press": "1"}}]])
     with pytest.raises(ValueError, match="methods need the same seeds"):
         statistics.difference(np.ones((3, 2, 4), bool), np.ones((2, 2, 4), bool))
-
-
-def test_student_interval():
-    estimate = statistics.over_seeds([1.0, 2.0, 3.0])
-    assert estimate == pytest.approx((2, 2 - 4.303 / 3**0.5, 2 + 4.303 / 3**0.5))
-    with pytest.raises(ValueError, match="from 2 to 10 seeds are needed, got 1"):
-        statistics.over_seeds([1.0])

@@ -29,11 +29,6 @@ def test_groups_keep_the_order_of_cells():
     assert groups == {"a": ["a/s0", "a/s1", "cut/s0"], "b": ["b/s0"], "c": ["c"]}
 
 
-def test_a_derived_cell_needs_its_source():
-    study = Study("x", (cell("a"), cell("b"), cut("c", "a", "b")))
-    assert study["c"].needs == ("a", "b")
-
-
 @pytest.mark.parametrize("name", ["pi0/multi/lora_sp/s0", "r=2", "a.b", "0", "eta_.9"])
 def test_valid_names(name):
     assert Study("x", (cell(name),))[name].name == name

@@ -4,7 +4,7 @@ import argparse
 import itertools
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,18 +13,16 @@ from rich.console import Console
 
 from envs.rendering.video import side_by_side, write_video
 from lorasp_jax.base import compilation_cache as cache
+from lorasp_jax.base.arguments import positive
 from lorasp_jax.base.errors import parse_arguments, run_command
 from lorasp_jax.base.intervals import wilson_interval
-from lorasp_jax.base.locks import locked
 from lorasp_jax.extras.piper import options as shared
 from lorasp_jax.extras.piper.arm import PiperArm
 from lorasp_jax.extras.piper.asking import InThread, InTurn
-from lorasp_jax.extras.piper.cameras import Simulated
 from lorasp_jax.extras.piper.fake.demonstrator import Demonstrator
 from lorasp_jax.extras.piper.fake.firmware import PERIOD, FakePiper
 from lorasp_jax.extras.piper.fake.timing import Lockstep, RealTime
-from lorasp_jax.extras.piper.fake.world import PhysicsGap, World
-from lorasp_jax.extras.piper.recording import Recording
+from lorasp_jax.extras.piper.fake.world import TIMESTEP, World
 from lorasp_jax.extras.piper.session import Session
 from lorasp_jax.extras.serving.client import ServerGone
 
@@ -53,7 +51,7 @@ def parser(program: str) -> argparse.ArgumentParser:
         "--task", default="press", help="open_pot, pick_place, pour or press (default: %(default)s)"
     )
     add("--expert", action="store_true", help="the scripted expert in place of a server")
-    add("--episodes", type=int, default=1, help="default: %(default)s")
+    add("--episodes", type=positive, default=1, help="default: %(default)s")
     add("--seed", type=int, default=0, help="of the first layout (default: %(default)s)")
     add("--latency", type=float, default=0.0, help="of commands on their way to the motors [s], "
         f"at most {_LARGEST_LATENCY} (default: %(default)s)")  # fmt: skip
@@ -73,25 +71,25 @@ def parser(program: str) -> argparse.ArgumentParser:
 def _run(options: argparse.Namespace, console: Console) -> None:
     if not 0 <= options.latency <= _LARGEST_LATENCY:
         raise ValueError(f"--latency must be 0 to {_LARGEST_LATENCY} s, got {options.latency}")
-    if options.episodes < 1:
-        raise ValueError(f"--episodes must be at least 1, got {options.episodes}")
     if options.thinking < 0:
         raise ValueError(f"--thinking must be at least 0 s, got {options.thinking}")
-    shared.task(options.task)
+    task = shared.task(options.task)
     shared.limits(options)
     shared.settings(options, "")
     cache.enable()
     source = nullcontext() if options.expert else shared.policy(options)
-    with source as server, shared.opened_log(options) as log:
+    with source as server, closing(shared.open_log(options)) as log:
         size = (server and server.metadata.get("image_size")) or options.image_size
         world = World(options.task, image_size=size)
         world.reset(options.seed)
         if server:
             server.warn([options.prompt] if options.prompt else world.env.instructions)
+        settings = {"image_size": size, "physics_dt": TIMESTEP}
+        prompt = options.prompt or task.instructions[0]
         with (
             _video(options.video) as film,
             _bench(options, world) as bench,
-            _recorder(options, world, size) as recorder,
+            shared.recording(options, task, prompt=prompt, **settings) as recorder,
         ):
             bench.arm.connect()
             _episodes(options, bench, server, (log, recorder, film), console)
@@ -106,12 +104,13 @@ def _episodes(
         ServerGone: the connection to the server ended; an episode that it cut short is not counted.
     """
     wins, (log, recorder, film) = 0, records
+    limit = shared.task(options.task).time_limit
     for episode in range(options.episodes):
         bench.reset(options.seed + episode)
         log.line(bench.clock.now(), episode=episode)
         session = _session(options, bench, server, options.seed + episode, records, console)
         world = bench.fake.world
-        problem = session.run(world.env.task.time_limit, _judge(world, film))
+        problem = session.run(limit, _judge(world, film))
         wins += world.success
         if recorder and world.success:
             recorder.keep()
@@ -164,29 +163,9 @@ def _session(
     if recorder:
         recorder.say(settings.prompt)
     more = {"log": log, "recorder": recorder, "say": console.print}
-    cameras = Simulated(world.images)
-    session = Session(bench.arm, cameras, asker, limits, settings, clock, **more)
+    session = Session(bench.arm, world.images, asker, limits, settings, clock, **more)
     shared.stop_on_signals(session)
     return session
-
-
-@contextmanager
-def _recorder(options: argparse.Namespace, world: World, size: int) -> Iterator[Recording | None]:
-    """Open the dataset, if there is to be one, and keep other processes from writing it."""
-    if not options.record:
-        yield None
-        return
-    with locked(options.record):
-        instructions = world.env.task.instructions
-        yield Recording(
-            options.record,
-            task=world.env.task.name,
-            instructions=instructions,
-            prompt=options.prompt or instructions[0],
-            control_dt=options.control_dt,
-            image_size=size,
-            physics_dt=PhysicsGap().timestep,
-        )
 
 
 class Bench(NamedTuple):
@@ -209,14 +188,7 @@ def _bench(options: argparse.Namespace, world: World) -> Iterator[Bench]:
     noise = {"noise": options.noise, "seed": options.seed}
     fake = FakePiper(channel, world, latency=options.latency, **noise)
     clock = RealTime(fake) if options.realtime else Lockstep(fake)
-    arm = PiperArm(
-        channel,
-        bus="virtual",
-        speed=options.speed,
-        effort=options.effort,
-        zeros=options.zeros,
-        clock=clock,
-    )
+    arm = PiperArm(channel, bus="virtual", clock=clock, **shared.motion(options))
     try:
         clock.start(arm)
         yield Bench(arm, fake, clock)

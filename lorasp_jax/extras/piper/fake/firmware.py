@@ -1,12 +1,11 @@
 """The fake arm's controller: CAN frames in, servo targets out, feedback at 200 Hz.
 
 It imitates what matters to a client: drivers that must be switched on, control modes, the speed
-percentage, the last target that stays in force, delays, noise, and faults on demand.
+percentage, the last target that stays in force, delays and noise.
 """
 
 import threading
 from collections import deque
-from dataclasses import dataclass
 from typing import Any
 
 import can
@@ -25,36 +24,14 @@ _MIT = 0xAD
 _EMERGENCY, _GUIDED = 1, 11  # arm_status
 
 
-@dataclass
-class Faults:
-    """What goes wrong; may be changed at any time.
-
-    Attributes:
-        silent: no frames are sent.
-        zeros: all joints are reported as zero.
-        status: arm_status that is reported, such as 7 for a collision; the arm then stands still.
-        ctrl_mode: control mode that is reported in place of the true one.
-        corrupted: the firmware's joint limits are those of a known defect: all -0.1 degrees.
-        clock_step: added to the frames' time stamps [s], as when the system's clock is set.
-        dead_driver: number from 0 of a joint whose driver does not switch on.
-    """
-
-    silent: bool = False
-    zeros: bool = False
-    status: int = 0
-    ctrl_mode: int | None = None
-    corrupted: bool = False
-    dead_driver: int | None = None
-    clock_step: float = 0.0
-
-
 class FakePiper:
     """A PiPER on one end of a virtual bus.
 
     Attributes:
         world: the simulated scene.
-        faults: what goes wrong.
         time: simulated time [s].
+        stamp: time stamp of the latest frames [s].
+        reported: when the latest feedback was sent [s].
         commands: number of joint targets received.
         hand: pose [7] to which a person guides the arm while it is in teaching mode.
         unsafe: everything received that a client must never send, in words.
@@ -78,7 +55,7 @@ class FakePiper:
             noise: standard deviation of measured angles [rad]; our choice.
             seed: of the noise.
         """
-        self.world, self.faults, self.time = world, Faults(), 1.0
+        self.world, self.time, self.stamp, self.reported = world, 1.0, 1.0, 0.0
         self.unsafe: list[str] = []
         self.commands, self.hand = 0, None
         self._latency, self._noise = latency, noise
@@ -107,24 +84,18 @@ class FakePiper:
             self._take_turn()
 
     def _take_turn(self) -> None:
-        self.time = round(self.time + PERIOD, 6)
+        self.time = self.stamp = round(self.time + PERIOD, 6)
         self._receive()
         while self._waiting and self._waiting[0][0] <= self.time + 1e-9:
             self._obey(self._waiting.popleft()[1])
         self._move()
         self.world.advance(PERIOD)
         self._tick += 1
-        if not self.faults.silent:
-            self._report()
+        self._report()
 
     def _receive(self) -> None:
         while (message := self._bus.recv(0)) is not None:
             self._waiting.append((self.time + self._latency, message))
-
-    @property
-    def stamp(self) -> float:
-        """Time stamp of the latest frames [s]."""
-        return self.time + self.faults.clock_step
 
     def close(self) -> None:
         """Leave the bus."""
@@ -179,7 +150,7 @@ class FakePiper:
         """Let the servos' targets follow the last target, as fast as the percentage allows."""
         if self._ctrl_mode == _TEACHING:
             self._setpoint = self.world.pose if self.hand is None else np.array(self.hand)
-        elif self._enabled.all() and not (self.faults.status or self._stopped):
+        elif self._enabled.all() and not self._stopped:
             speed = np.append(np.full(6, _FASTEST * self._percent / 100), _GRIPPER_SPEED) * PERIOD
             self._setpoint = self._setpoint + np.clip(self._target - self._setpoint, -speed, speed)
         self.world.command(self._setpoint)
@@ -187,23 +158,21 @@ class FakePiper:
     def _report(self) -> None:
         pose = self.world.pose
         angles = pose[:6] + self._noise * self._random.standard_normal(6) - SDK_OFFSET
-        counts = np.zeros(6) if self.faults.zeros else np.rad2deg(angles) * 1000
+        counts = np.rad2deg(angles) * 1000
         for i, kind in enumerate(frames.JOINTS):
             self._send(kind, frames.pair(*counts[2 * i : 2 * i + 2]))
         self._send(frames.GRIPPER, frames.gripper(1e6 * pose[6], 0, bool(self._enabled.all())))
         if self._tick % _SLOW == 0:
             for i, kind in enumerate(frames.DRIVERS):
-                on = bool(self._enabled[i]) and i != self.faults.dead_driver
-                self._send(kind, frames.driver(on))
-        mode = self._ctrl_mode if self.faults.ctrl_mode is None else self.faults.ctrl_mode
+                self._send(kind, frames.driver(bool(self._enabled[i])))
         teaching = int(self._ctrl_mode == _TEACHING)
-        status = self.faults.status or self._stopped or (_GUIDED if teaching else 0)
-        self._send(frames.STATUS, frames.status(mode, status, teaching))
+        status = self._stopped or (_GUIDED if teaching else 0)
+        self._send(frames.STATUS, frames.status(self._ctrl_mode, status, teaching))
+        self.reported = self.time
 
     def _tell_limits(self, joint: int) -> None:
         low, high = np.rad2deg([ROBOT.lower[joint - 1], ROBOT.upper[joint - 1]])
-        limits = (-0.1, -0.1, _FASTEST) if self.faults.corrupted else (low, high, _FASTEST)
-        self._send(frames.FIRMWARE_LIMITS, frames.firmware_limits(joint, *limits))
+        self._send(frames.FIRMWARE_LIMITS, frames.firmware_limits(joint, low, high, _FASTEST))
 
     def _send(self, kind: int, data: bytes) -> None:
         message = can.Message(arbitration_id=kind, data=data, is_extended_id=False)

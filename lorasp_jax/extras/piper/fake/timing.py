@@ -4,6 +4,7 @@ import threading
 import time
 
 from lorasp_jax.extras.piper.arm import PiperArm
+from lorasp_jax.extras.piper.clock import RealClock
 from lorasp_jax.extras.piper.fake import frames
 from lorasp_jax.extras.piper.fake.firmware import PERIOD, FakePiper
 
@@ -41,17 +42,17 @@ class Lockstep:
 
     def _wait_for_reader(self) -> None:
         """Wait for the status frame, which is the last of every tick."""
-        if self._arm is None or self._fake.faults.silent:
+        if self._arm is None:
             return
         _discard(self._arm)
         end = time.monotonic() + _PATIENCE
-        while self._arm.heard.get(frames.STATUS) != self._fake.time:
+        while self._arm.heard.get(frames.STATUS, 0.0) != self._fake.reported:
             if time.monotonic() > end:
                 raise TimeoutError("piper_sdk does not read the virtual bus")
             time.sleep(0)
 
 
-class RealTime:
+class RealTime(RealClock):
     """The machine's monotonic clock; the fake arm lives in a thread of its own."""
 
     def __init__(self, fake: FakePiper) -> None:
@@ -70,21 +71,13 @@ class RealTime:
         if self._thread:
             self._thread.join()
 
-    def now(self) -> float:
-        """Return the time since an arbitrary start [s]."""
-        return time.monotonic()
-
-    def wait_until(self, seconds: float) -> None:
-        """Sleep until a time on this clock."""
-        time.sleep(max(0.0, seconds - time.monotonic()))
-
     def _run(self, arm: PiperArm) -> None:
-        due = time.monotonic()
+        due = self.now()
         while not self._stop.is_set():
             self._fake.tick()
             _discard(arm)
             due += PERIOD
-            time.sleep(max(0.0, due - time.monotonic()))
+            self.wait_until(due)
 
 
 def _discard(arm: PiperArm) -> None:

@@ -6,7 +6,6 @@ judge success. Physics differ from training: the engine, its time step, gains, f
 
 import functools
 import threading
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -23,21 +22,12 @@ _FIELDS = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "xpos", "xmat", "si
 _MATRICES = ("geom_xmat", "cam_xmat", "xmat", "site_xmat")
 
 
-@dataclass(frozen=True)
-class PhysicsGap:
-    """How the fake arm's physics differ from the simulation's; all our choices.
-
-    Attributes:
-        timestep: physics period [s].
-        gains: factor on the servos' stiffness and damping.
-        friction: factor on the friction of all contacts.
-        dry_friction: friction torque in the arm's joints [N m].
-    """
-
-    timestep: float = 0.0025
-    gains: float = 1.15
-    friction: float = 0.9
-    dry_friction: float = 0.05
+# How the fake arm's physics differ from the simulation's; all our choices.
+TIMESTEP = 0.0025
+"""Physics period [s]."""
+_GAINS = 1.15  # factor on the servos' stiffness and damping
+_FRICTION = 0.9  # factor on the friction of all contacts
+_DRY_FRICTION = 0.05  # N m, friction torque in the arm's joints
 
 
 class World:
@@ -51,16 +41,13 @@ class World:
         instruction: the request in words.
     """
 
-    def __init__(
-        self, task: str, *, image_size: int = 64, physics: PhysicsGap | None = None
-    ) -> None:
+    def __init__(self, task: str, *, image_size: int = 64) -> None:
         """Build a task's scene; call `reset` before anything else.
 
         Raises:
             ValueError: the task is unknown.
         """
         self.env: envs.Env = envs.make(task, robot="piper", num_envs=1, image_size=image_size)
-        self._physics = physics or PhysicsGap()
         self._render = jax.jit(self.env.render)
         self._check = jax.jit(functools.partial(_check, self.env))
         self._lock = threading.Lock()  # the arm may live in a thread of its own
@@ -73,11 +60,11 @@ class World:
     def _reset(self, seed: int) -> None:
         self.state: State = self.env.reset(jax.random.key(seed))
         self.model = placing.world_model(self.env.model, self.state.info["layout"], 0)
-        self.model.opt.timestep = self._physics.timestep
-        self.model.actuator_gainprm *= self._physics.gains
-        self.model.actuator_biasprm *= self._physics.gains
-        self.model.geom_friction *= self._physics.friction
-        self.model.dof_frictionloss[:6] = self._physics.dry_friction
+        self.model.opt.timestep = TIMESTEP
+        self.model.actuator_gainprm *= _GAINS
+        self.model.actuator_biasprm *= _GAINS
+        self.model.geom_friction *= _FRICTION
+        self.model.dof_frictionloss[:6] = _DRY_FRICTION
         self.data = mujoco.MjData(self.model)
         self.data.qpos[:] = np.asarray(self.state.data.qpos[0])
         self.command(self.pose)
@@ -97,7 +84,7 @@ class World:
     def advance(self, seconds: float) -> None:
         """Simulate a multiple of the time step."""
         with self._lock:
-            mujoco.mj_step(self.model, self.data, round(seconds / self._physics.timestep))
+            mujoco.mj_step(self.model, self.data, round(seconds / TIMESTEP))
 
     def judge(self) -> bool:
         """Test for success, as the environment does after every control step."""

@@ -4,10 +4,10 @@ import pytest
 
 from envs.scene.ranges import Randomization
 from lorasp_jax.extras.study import progress
-from lorasp_jax.extras.study.finished_run import recorded_config
 from lorasp_jax.extras.study.progress import CellState
 from lorasp_jax.extras.study.study import Derived, Study
 from lorasp_jax.peft import AdaLoRA, FullFineTuning, LoRASP
+from lorasp_jax.training.finished_run import recorded_config
 from lorasp_jax.training.run_folder import to_json, write_json
 from tests.runs import CONFIG, RESULTS
 

@@ -1,4 +1,4 @@
-"""Read a finished run, from which derived cells start."""
+"""Read the config of a finished run."""
 
 from collections.abc import Mapping
 from pathlib import Path
