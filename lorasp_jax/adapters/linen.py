@@ -11,7 +11,6 @@ remat, vmap) also apply to it.
 
 import dataclasses
 import functools
-import operator
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
@@ -24,7 +23,6 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from lorasp_jax.adapters import _compat
 from lorasp_jax.adapters.adaptation import init_stack, over_stack
 from lorasp_jax.adapters.layers import nnx_layers
-from lorasp_jax.adapters.layers.einsum import to_matrices
 from lorasp_jax.adapters.layers.linen_layers import layer_call, supported_class, with_lora
 from lorasp_jax.adapters.layers.nnx_layers import Einsums
 from lorasp_jax.adapters.paths import (
@@ -175,30 +173,6 @@ class LinenAdapter:
         with nn.intercept_methods(interceptor):
             _, changed = _apply(self.model, variables, *args, mutable=True, **kwargs)
         return flax.core.unfreeze(changed["params"])
-
-    def kernel_shapes(
-        self, variables: Mapping[str, Any], *args: Any, **kwargs: Any
-    ) -> dict[str, tuple[int, ...]]:
-        """Kernel shapes `[..., *batch, I, O]` of dense layers and einsums, by path.
-
-        The arguments are those of the bare model, which is called once to find its layers.
-        """
-        shapes: dict[str, tuple[int, ...]] = {}
-
-        def visit(module: nn.Module, args: Any, kwargs: Any) -> None:
-            if not self._supported_class(module):
-                return
-            layer = layer_call(module, self.einsums, args, kwargs)
-            if layer.equation is None:
-                return
-            params = functools.reduce(operator.getitem, module.path, variables["params"])
-            kernel = nn.meta.unbox(params[layer.name])  # with the axes of a scanned stack
-            shaped = jax.ShapeDtypeStruct(kernel.shape, kernel.dtype)
-            matrices = functools.partial(to_matrices, layer.equation)
-            shapes["/".join(module.path)] = jax.eval_shape(matrices, shaped).shape
-
-        self._visit_layers(visit, validate.variables(variables), *args, **kwargs)
-        return shapes
 
     def _supported_class(self, module: nn.Module) -> type[nn.Module] | None:
         """`supported_class`, or None if the module does not belong to the model."""

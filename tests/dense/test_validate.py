@@ -78,7 +78,6 @@ def with_kernel(value):
             '"params" must hold arrays, got None at kernel',
         ),
         (lambda: LINEN.merge(with_kernel("x"), X), "must hold arrays, got 'x' at kernel"),
-        (lambda: LINEN.kernel_shapes({"params": {"a": [None]}}, X), "got None at a/0"),
         (
             lambda: LinenDense(4, param_dtype=int).init(KEY, X),
             "param_dtype must be a floating-point dtype",

@@ -88,13 +88,14 @@ def load_peft(
     """
     nnx_layers.check_einsums(einsums)
     root = nnx.List([validate.module(model)])
+    folder, names = _local_folder(folder), checked_names(names)
     shapes = {
         location.path: nnx_layers.matrices_shape(location.child, einsums)
         for location in paths.locate_matmul_layers(root, einsums)
     }
     parameters = [p for p in paths.locate(root, nnx.Param) if p.name != "adapter"]
     sizes = {location.path: location.child.get_value().shape for location in parameters}
-    rules, values, full_values = match_folder(folder, shapes, sizes, names)
+    rules, values, full_values = _match_folder(folder, shapes, sizes, names)
     adapted = adaptation.adapt(model, rules, rngs=nnx.Rngs(0), einsums=einsums)
     for location in paths.locate(nnx.List([adapted]), AdapterParam):
         if location.path in full_values:
@@ -105,28 +106,17 @@ def load_peft(
     return adapted
 
 
-def match_folder(
-    folder: str | os.PathLike[str],
+def _match_folder(
+    folder: pathlib.Path,
     shapes: Mapping[str, Sequence[int]],
     sizes: Mapping[str, Sequence[int]],
     names: Names,
 ) -> tuple[paths.Rules, dict[str, Adapter], Adapter]:
-    """Match a PEFT folder against a model's layers and parameters.
+    """Match a folder against the kernel matrices `[..., I, O]` and the parameters of a model.
 
-    Args:
-        folder: as for `load_peft`.
-        shapes: shape `[..., I, O]` of the kernel matrices of each layer, by path.
-        sizes: shape of each parameter, by path.
-        names: as for `load_peft`.
-
-    Returns:
-        Rules for `adapt`, the adapters' parameters by path, and the fully trained parameters by
-        path.
-
-    Raises:
-        ValueError: as for `load_peft`.
+    Returns rules for `adapt`, the adapters' parameters by path, and the fully trained parameters
+    by path.
     """
-    folder, names = _local_folder(folder), checked_names(names)
     config, modules, full = read_folder(folder)
     kind = DoRA if config.get("use_dora") else LoRA
     dropout = config.get("lora_dropout") or 0.0

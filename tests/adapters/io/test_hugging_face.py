@@ -7,13 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import safetensors.numpy
-from flax import linen as nn
 from flax import nnx
-from flax.traverse_util import flatten_dict, unflatten_dict
 
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io import hugging_face
-from lorasp_jax.adapters.io.hugging_face_linen import load_peft_linen
 from lorasp_jax.peft import AdaLoRA, DoRA, LoRA
 from tests import GOLDEN
 from tests.adapters.io.peft_folder import (
@@ -228,29 +225,6 @@ def test_attention_with_head_axes_and_user_defined_einsums(tmp_path):
         np.testing.assert_array_equal(ours[name], value)
     with pytest.raises(ValueError, match=r"'model.head', .* model\."):
         hugging_face.load_peft(tmp_path, base, names=torch_names)
-
-
-def test_linen_attention_loads_the_same_folder(tmp_path):
-    """Outputs match those of merged parameters."""
-
-    class Linen(nn.Module):
-        @nn.compact
-        def __call__(self, x):
-            x = nn.MultiHeadDotProductAttention(2, name="attn")(x)
-            return nn.Dense(4, use_bias=False, name="own")(x)
-
-    updates, x = attention_folder(tmp_path), jax.random.normal(jax.random.key(0), (1, 5, 6))
-    variables = Linen().init(jax.random.key(1), x)
-    adapter, loaded = load_peft_linen(tmp_path, Linen(), variables, x, names=torch_names)
-    by_path = {("attn", "query"): "q_proj", ("attn", "out"): "out_proj", ("own",): "head"}
-    flat = flatten_dict(variables["params"])
-    for path, name in by_path.items():
-        kernel = flat[(*path, "kernel")]
-        flat[(*path, "kernel")] = kernel + updates[name].reshape(kernel.shape)
-    expected = Linen().apply({"params": unflatten_dict(flat)}, x)
-    np.testing.assert_allclose(adapter.apply(loaded, x), expected, rtol=1e-4, atol=1e-4)
-    with pytest.raises(ValueError, match="NNX module"):
-        hugging_face.load_peft(tmp_path, Linen())
 
 
 def test_adapters_on_other_layers_are_kept():
