@@ -133,7 +133,8 @@ def _match_folder(
             _check_fits(folder, name, adapter, d_in, d_out)
         scale, values[path] = _stacked(adapters, leading)
         rank = values[path]["lora_a"].shape[-1]
-        rules.append((f"^{re.escape(path)}$", kind(rank, scale * rank, dropout=dropout)))
+        with paths.naming("load", folder):
+            rules.append((f"^{re.escape(path)}$", kind(rank, scale * rank, dropout=dropout)))
     _check_used(folder, modules, unused, candidates)
     check_biases(folder, config.get("bias", "none"), full, sizes, values)
     full_values = full_parameters(folder, full, shapes, sizes, names)
