@@ -50,7 +50,6 @@ def test_pruning_inactive_directions_preserves_outputs(method, batches):
         before, after = call(model, x), call(smaller, x)
         np.testing.assert_allclose(after, before, rtol=1e-4, atol=1e-4)
     assert report.output_error < 1e-5
-    assert all((error < 1e-5).all() for error in report.layer_errors.values())
 
 
 @pytest.mark.slow
@@ -114,8 +113,7 @@ def test_a_tolerance_drops_rarely_active_directions_and_reports_the_error(batche
 
 
 @pytest.mark.slow
-def test_layer_errors_ignore_padding():
-    """For a single layer, the layer error equals the output error, over valid tokens only."""
+def test_padding_is_ignored():
     layer = Dense(5, 4, use_bias=False, method=VARIANTS[0], rngs=nnx.Rngs(0))
     model = perturbed(nnx.List([layer]))
     x = jax.random.normal(jax.random.key(3), (2, 20, 5))
@@ -128,7 +126,6 @@ def test_layer_errors_ignore_padding():
     _, clean = lorasp_jax.prune(model, [x], 0.4, forward=valid)
     garbage = jnp.where(mask[..., None], x, 1e3)
     _, padded = lorasp_jax.prune(model, [garbage], 0.4, forward=valid)
-    assert clean.layer_errors["0"] == pytest.approx(clean.output_error, rel=1e-5)
     assert clean.output_error > 1e-3
     assert padded.output_error == pytest.approx(clean.output_error, rel=1e-4)
     np.testing.assert_array_equal(clean.ranks["0"], padded.ranks["0"])
