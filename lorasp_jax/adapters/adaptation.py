@@ -81,7 +81,10 @@ def adapt(
     used = _attach_all(root, rules, key, einsums, statistics) | unfreeze(root, rules)
     for i, (pattern, _) in enumerate(rules):
         if i not in used:
-            raise ValueError(_no_match_message(pattern, root, einsums))
+            known = [location.path for location in paths.locate_layers(root, einsums)]
+            others = paths.locate_other_matrices(root, einsums)
+            classes = {p.path.rpartition("/")[0]: type(p.parent).__name__ for p in others}
+            raise ValueError(paths.no_match_message(pattern, known, classes))
     return root[0]
 
 
@@ -308,13 +311,6 @@ def over_stack(function: Callable[..., Any], kernel: jax.Array) -> Callable[...,
     for _ in kernel.shape[:-2]:
         function = jax.vmap(function)
     return function
-
-
-def _no_match_message(pattern: str, root: nnx.List[Any], einsums: nnx_layers.Einsums) -> str:
-    known = [location.path for location in paths.locate_layers(root, einsums)]
-    others = paths.locate_other_matrices(root, einsums)
-    classes = {p.path.rpartition("/")[0]: type(p.parent).__name__ for p in others}
-    return paths.no_match_message(pattern, known, classes)
 
 
 def _size(tree: Any) -> int:

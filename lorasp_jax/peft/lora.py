@@ -14,8 +14,6 @@ from lorasp_jax.peft.auxiliary import Aux
 from lorasp_jax.peft.fields import check_kernel
 from lorasp_jax.peft.method import Kernel, Method, Params, kaiming_uniform
 
-_SPLIT_INITIALIZATIONS = ("pissa", "olora")
-
 
 @dataclasses.dataclass(frozen=True)
 class LoRA(Method):
@@ -55,7 +53,7 @@ class LoRA(Method):
     @property
     def splits_kernel(self) -> bool:
         """True if the initial A B is split off the kernel."""
-        return self.initialization in _SPLIT_INITIALIZATIONS
+        return self.initialization in ("pissa", "olora")
 
     @property
     def needs_statistics(self) -> bool:
@@ -93,10 +91,13 @@ class LoRA(Method):
                 f"initialization {self.initialization!r} needs the kernel's values and a rank of "
                 f"at most min(I, O), got rank {self.rank} and {given} {list(kernel.shape)}"
             )
-        split = principal_part if self.initialization == "pissa" else orthogonal_part
-        a, b = split(kernel.astype(jnp.float32), self.rank, self.scale)
-        params = {"lora_a": a, "lora_b": b}
-        return params, (kernel.astype(jnp.float32) - self.scale * (a @ b)).astype(kernel.dtype)
+        exact = kernel.astype(jnp.float32)
+        if self.initialization == "pissa":
+            a, b = principal_part(exact, self.rank, self.scale)
+        else:
+            a, b = orthogonal_part(exact, self.rank)
+        residual = (exact - self.scale * (a @ b)).astype(kernel.dtype)
+        return {"lora_a": a, "lora_b": b}, residual
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
         """Initialize A randomly and B to zero; the delta is exactly zero."""
@@ -157,12 +158,11 @@ def principal_part(kernel: jax.Array, rank: int, scale: float) -> tuple[jax.Arra
     return left[:, :rank] * root, root[:, None] * right[:rank]
 
 
-def orthogonal_part(kernel: jax.Array, rank: int, scale: float) -> tuple[jax.Array, jax.Array]:
+def orthogonal_part(kernel: jax.Array, rank: int) -> tuple[jax.Array, jax.Array]:
     """A [I, R] and B [R, O] from a rank-R QR of the kernel's transpose; B's rows are orthonormal.
 
     As in OLoRA (Büyükakyüz, arXiv 2406.01775, algorithm 1), A B does not depend on the scale.
     """
-    del scale
     orthonormal, triangular = jnp.linalg.qr(kernel.T)
     return triangular[:rank].T, orthonormal[:, :rank].T
 

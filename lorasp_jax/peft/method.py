@@ -58,11 +58,7 @@ class Method(Bottleneck):
 
     def __post_init__(self) -> None:
         """Raise ValueError for a field of the wrong type or out of range."""
-        for field in dataclasses.fields(self):  # pyright: ignore[reportArgumentType]
-            value = getattr(self, field.name)
-            if type(value) is int and value > MAX_SIZE:
-                raise ValueError(f"{field.name} must be at most {MAX_SIZE}, got {value}")
-        fields.check_fields(self)
+        fields.check_fields(self, maximum=MAX_SIZE)
         alpha = getattr(self, "alpha", None)
         if alpha is not None and not 1 / MAX_ALPHA <= abs(alpha) <= MAX_ALPHA:
             raise ValueError(

@@ -23,7 +23,7 @@ NET = nnx.Dict(inp=nnx.Linear(5, 4, rngs=nnx.Rngs(0)))
         ({"rank": 0}, "rank must be at least 1, got 0"),
         ({"rank": 1.5}, "rank must be int, got 1.5"),
         ({"rank": 10**12}, "rank must be at most 1048576"),
-        ({"rank": -(10**12)}, "rank must be at least -2147483647"),
+        ({"rank": -(10**12)}, "rank must be at least -1048576"),
         ({"alpha": float("nan")}, "alpha must be a finite number or None, got nan"),
         ({"alpha": 1e308}, "alpha must be a finite number or None, got 1e+308"),
         ({"alpha": 1e35}, "|alpha| must be between 1e-30 and 1e+30, got 1e+35"),

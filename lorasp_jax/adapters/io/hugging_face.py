@@ -177,7 +177,10 @@ def save_peft(
     folder, names = validate.folder(folder), checked_names(names)
     validate.with_values(model)
     layers = _supported_layers(model)
-    use_dora, lora_dropout = _common_settings([layer.method for layer in layers.values()])
+    settings = {(isinstance(x.method, DoRA), dropout_rate(x.method)) for x in layers.values()}
+    if len(settings) != 1:
+        raise ValueError(f"PEFT needs one use_dora and lora_dropout, got {sorted(settings)}")
+    ((use_dora, lora_dropout),) = settings
     modules = {
         names(path, index): _to_peft(layer, index)
         for path, layer in layers.items()
@@ -199,23 +202,20 @@ def save_peft(
 
 def _supported_layers(model: nnx.Module) -> dict[str, AdaptedLayer]:
     """Adapted layers by path; raise ValueError for one that PEFT does not support."""
-    methods = adaptation.methods(model).items()
-    adapted = {p for p, method in methods if not method.trains_base and _is_supported(p, method)}
     layers = {}
-    for location in paths.locate(nnx.List([model]), AdaptedLayer):
-        if location.path in adapted:
-            if isinstance(location.child, nnx_layers.LoRALayer):
-                raise ValueError(f"PEFT cannot store {location.path}: not dense and no einsum")
-            layers[location.path] = location.child
+    for path, _, _, layer in paths.locate(nnx.List([model]), AdaptedLayer):
+        if not isinstance(layer.adapter, AdapterParam):
+            continue
+        if not isinstance(layer.method, LoRA | AdaLoRA):
+            raise ValueError(
+                f"{path} uses {layer.method.name}, which Hugging Face PEFT does not support"
+            )
+        if layer.method.splits_kernel:
+            raise ValueError(f"the adapter of {path} split the kernel: merge it instead")
+        if isinstance(layer, nnx_layers.LoRALayer):
+            raise ValueError(f"PEFT cannot store {path}: not dense and no einsum")
+        layers[path] = layer
     return layers
-
-
-def _common_settings(methods: Collection[Any]) -> tuple[bool, float]:
-    """`use_dora` and `lora_dropout`; raise ValueError unless all methods agree on both."""
-    settings = {(isinstance(method, DoRA), dropout_rate(method)) for method in methods}
-    if len(settings) != 1:
-        raise ValueError(f"PEFT needs one use_dora and lora_dropout, got {sorted(settings)}")
-    return settings.pop()
 
 
 def _check_fits(folder: pathlib.Path, module: str, adapter: Adapter, d_in: int, d_out: int) -> None:
@@ -253,15 +253,6 @@ def _stacked(adapters: list[Adapter], leading: list[int]) -> tuple[float, Adapte
     padded_adapters = [padded(adapter) for adapter in adapters]
     stacked = {name: np.stack([a[name] for a in padded_adapters]) for name in padded_adapters[0]}
     return scale, {name: x.reshape(*leading, *x.shape[1:]) for name, x in stacked.items()}
-
-
-def _is_supported(path: str, method: Any) -> bool:
-    """Return True, or raise ValueError if PEFT does not support the method."""
-    if not isinstance(method, LoRA | AdaLoRA):
-        raise ValueError(f"{path} uses {method.name}, which Hugging Face PEFT does not support")
-    if method.splits_kernel:
-        raise ValueError(f"the adapter of {path} split the kernel: merge it instead")
-    return True
 
 
 def _to_peft(layer: AdaptedLayer, index: tuple[int, ...]) -> tuple[float, Adapter]:
