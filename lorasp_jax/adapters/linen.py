@@ -20,18 +20,11 @@ import jax
 import jax.numpy as jnp
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from lorasp_jax.adapters import _compat
+from lorasp_jax.adapters import _compat, paths
 from lorasp_jax.adapters.adaptation import init_stack, over_stack
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.adapters.layers.linen_layers import layer_call, supported_class, with_lora
 from lorasp_jax.adapters.layers.nnx_layers import Einsums
-from lorasp_jax.adapters.paths import (
-    Rules,
-    check_method_rules,
-    find_rule,
-    naming,
-    no_match_message,
-)
 from lorasp_jax.dense import AUX_NAME, validate
 from lorasp_jax.peft import Method
 from lorasp_jax.peft.fields import checked_key
@@ -64,11 +57,11 @@ class LinenAdapter:
     """
 
     model: nn.Module
-    rules: Rules
+    rules: paths.Rules
     einsums: Einsums = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        check_method_rules(self.rules)
+        paths.check_method_rules(self.rules)
         nnx_layers.check_einsums(self.einsums)
 
     def init(self, key: Any, *args: Any, **kwargs: Any) -> dict[str, Any]:
@@ -108,7 +101,7 @@ class LinenAdapter:
         base, trained = self._partition(flatten_dict(params), record)
         for i, (pattern, _) in enumerate(self.rules):
             if i not in record.used:
-                raise ValueError(no_match_message(pattern, record.layers, record.others))
+                raise ValueError(paths.no_match_message(pattern, record.layers, record.others))
         trained = flatten_dict(variables.get("adapters", {})) | trained
         return {**variables, "params": unflatten_dict(base), "adapters": unflatten_dict(trained)}
 
@@ -180,7 +173,7 @@ class LinenAdapter:
 
     def _rule(self, module: nn.Module) -> tuple[int, Method] | None:
         """Index and method of the rule that adapts the layer, or None."""
-        i = find_rule(self.rules, "/".join(module.path))
+        i = paths.find_rule(self.rules, "/".join(module.path))
         method = None if i is None else self.rules[i][1]
         return None if i is None or method is None or method.trains_base else (i, method)
 
@@ -197,7 +190,7 @@ class LinenAdapter:
         if rule is None or module.has_variable("params", ADAPTER):
             return
         i, method = rule
-        with naming("adapt", path):
+        with paths.naming("adapt", path):
             layer = layer_call(module, self.einsums, args, kwargs)
             init, key = layer.adapter_init(method), module.make_rng("params")
             params, rest = init_stack(key, init, layer.matrices())
@@ -214,7 +207,7 @@ class LinenAdapter:
             return
         layer = layer_call(module, self.einsums, args, kwargs)
         matrices = layer.matrices()
-        with naming("merge", "/".join(module.path)):
+        with paths.naming("merge", "/".join(module.path)):
             merged = over_stack(rule[1].merge, matrices)(flax.core.unfreeze(params), matrices)
         layer.set_matrices(merged)
         module.put_variable("params", ADAPTER, None)  # a layer called twice is merged once
@@ -225,7 +218,7 @@ class LinenAdapter:
         for path, value in params.items():
             i = None
             if ADAPTER not in path:
-                i = find_rule(self.rules, "/".join(path[:-1]), "/".join(path))
+                i = paths.find_rule(self.rules, "/".join(path[:-1]), "/".join(path))
             method = None if i is None else self.rules[i][1]
             if i is not None and (method is None or method.trains_base):
                 record.used.add(i)

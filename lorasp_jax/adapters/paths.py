@@ -50,11 +50,6 @@ def naming(doing: str, where: object) -> Iterator[None]:
         raise ValueError(f"cannot {doing} {where or 'the model'}: {error}") from error
 
 
-def unique(locations: list[Location]) -> list[Location]:
-    """Keep only the first location of each shared child."""
-    return list({id(location.child): location for location in reversed(locations)}.values())[::-1]
-
-
 def set_child(location: Location, child: Any) -> None:
     """Replace the child at a location."""
     setattr(location.parent, location.name, child)

@@ -204,11 +204,8 @@ def _input_gradient(
     q: jax.Array,
 ) -> jax.Array:
     """Compute Σ g Wᵀ + q Pᵀ, [..., I]; `base_input_grads` holds each g Wᵀ if already computed."""
-    p, kernels, d_in = (
-        _concat_downs(layers, x.dtype),
-        [layer.kernel for layer in layers],
-        x.shape[-1],
-    )
+    p, kernels = _concat_downs(layers, x.dtype), [layer.kernel for layer in layers]
+    d_in = x.shape[-1]
     is_narrow = sum(g.shape[-1] for g in gradients) <= d_in
     pairs = list(zip(gradients, kernels, strict=True))
     if is_narrow and all(_should_concat(kernel, g, d_in) for g, kernel in pairs):

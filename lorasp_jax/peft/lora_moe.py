@@ -11,7 +11,7 @@ label for every task; it is omitted here, as in LoRA-SP's code.
 
 import dataclasses
 import functools
-from typing import Literal
+from typing import ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,8 @@ class LoRAMoE(Method):
       ValueError: `experts` or `rank` below 1, an unknown routing or gate gradient, or "switch"
         without "top1".
     """
+
+    down_in_fp32: ClassVar[bool] = True  # the router's logits
 
     experts: int = 4
     """Number of experts, E."""
@@ -54,11 +56,6 @@ class LoRAMoE(Method):
             )
         if self.gate_gradient == "switch" and self.routing != "top1":
             raise ValueError(f"gate_gradient 'switch' needs routing 'top1', got {self.routing!r}")
-
-    @property
-    def down_in_fp32(self) -> bool:
-        """True: the router's logits stay in fp32."""
-        return True
 
     @property
     def scale(self) -> float:

@@ -19,6 +19,7 @@ Unlike in the public code, padding is excluded, everything is in fp32, and the r
 
 import dataclasses
 import functools
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -40,17 +41,14 @@ class LoRASPRelease(BankMethod):
         ValueError: a rank below 1, or η outside (0, 1].
     """
 
+    score_arrays: ClassVar[tuple[str, ...]] = ("w1",)
+
     rank: int = 128
     """R, size of the bank; it may exceed I and O."""
     energy_target: float = 0.9
     """η."""
     alpha: float | None = None
     """α of the scale α/R. None: 2 R."""
-
-    @property
-    def score_arrays(self) -> tuple[str, ...]:
-        """See `BankMethod.score_arrays`."""
-        return ("w1",)
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
         """Initialize V and W1 randomly and U to zero; the delta is zero."""

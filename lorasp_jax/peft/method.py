@@ -74,25 +74,17 @@ class Method(Bottleneck):
     is_low_rank_sum: ClassVar[bool] = True
     """True if the layer computes exactly x W + z U; False for a method that overrides `apply`."""
 
-    @property
-    def splits_kernel(self) -> bool:
-        """True if `init` moves part of the kernel into the parameters and returns the residual."""
-        return False
-
-    @property
-    def down_in_fp32(self) -> bool:
-        """True to keep x P in fp32, whatever the dtype of x."""
-        return False
+    splits_kernel: ClassVar[bool] = False
+    """True if `init` moves part of the kernel into the parameters and returns the residual."""
+    down_in_fp32: ClassVar[bool] = False
+    """True to keep x P in fp32, whatever the dtype of x."""
+    needs_statistics: ClassVar[bool] = False
+    """True if `init` requires statistics of the layer's inputs."""
 
     @property
     def name(self) -> str:
         """Name accepted by `create`."""
         return name_of(type(self))
-
-    @property
-    def needs_statistics(self) -> bool:
-        """True if `init` requires statistics of the layer's inputs."""
-        return False
 
     @property
     def as_saved(self) -> "Method":

@@ -245,16 +245,11 @@ def adapters_by_path(name: str, model: nnx.Module) -> AdaptedLayers:
     """
     if adapter_sets(model):
         raise ValueError(f"{name} is already a combined model: extract one adapter first")
-    layers = single_adapters(model)
-    if extra := sorted(adaptation.methods(model).keys() - layers.keys()):
-        raise ValueError(f"{name} also trains {extra[0]}; only adapters can be combined")
-    return layers
-
-
-def single_adapters(model: nnx.Module) -> AdaptedLayers:
-    """Layers with a single (unnamed) adapter, by path."""
     locations = paths.locate(nnx.List([model]), AdaptedLayer)
-    return {p.path: p.child for p in locations if isinstance(p.child.adapter, AdapterParam)}
+    layers = {p.path: p.child for p in locations if isinstance(p.child.adapter, AdapterParam)}
+    if extra := sorted(adaptation.methods(model).keys() - layers.keys()):
+        raise ValueError(f"{name} also trains {extra[0]}, which is not an adapter")
+    return layers
 
 
 def _check_same_base(first: nnx.Module, name: str, second: nnx.Module, other: str) -> None:

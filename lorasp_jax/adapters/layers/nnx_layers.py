@@ -218,12 +218,11 @@ def make_adaptable(layer: nnx.Module, einsums: Einsums) -> AdaptedLayer:
     known = supported_class(layer, einsums)
     if isinstance(layer, nnx.Linear) and known is nnx.Linear:
         return to_dense(layer)
-    if known not in (nnx.Embed, nnx.Conv):
-        check_settings(layer)
     if known is nnx.Embed:
         return _with_mixin(layer, EmbedLayer, "embedding")
     if known is nnx.Conv:
         return _with_mixin(layer, ConvLayer, "kernel")
+    check_settings(layer)
     name, equation = kernel_and_equation(layer, known, einsums)
     return _with_mixin(layer, EinsumLayer, name, equation)
 
@@ -284,18 +283,12 @@ def check_einsums(einsums: Any) -> None:
 
 
 def describe_einsum(describe: Callable[[Any], Any], layer: Any) -> tuple[str, str | None]:
-    """Call an `Einsums` function; raise ValueError if it fails or returns a wrong type."""
-    try:
-        name, equation = describe(layer)
-    except (TypeError, ValueError, AttributeError) as error:
-        raise ValueError(
-            f"the einsums function of {type(layer).__name__} failed: {error}"
-        ) from error
-    if not isinstance(name, str) or not isinstance(equation, str | None):
-        raise ValueError(
-            f"einsums functions must return (name, equation), got {short((name, equation))}"
-        )
-    return name, equation
+    """Call an `Einsums` function; raise ValueError if it returns a wrong type."""
+    result = describe(layer)
+    is_pair = isinstance(result, tuple) and len(result) == 2
+    if not is_pair or not isinstance(result[0], str) or not isinstance(result[1], str | None):
+        raise ValueError(f"einsums functions must return (name, equation), got {short(result)}")
+    return result
 
 
 def matrices_shape(layer: Any, einsums: Einsums) -> tuple[int, ...]:

@@ -39,12 +39,6 @@ class FusedBottleneck(Bottleneck):
     interpret: bool = False
     """Run the kernels in interpret mode, which is slow but needs no GPU."""
 
-    @property
-    def is_supported(self) -> bool:
-        """Whether Triton supports the sizes."""
-        sizes = self.rank, self.num_scores, self.hidden_width
-        return all(size == supported_size(size) for size in sizes)
-
     def pack(self, params: Any) -> Any:
         """Pack the router into one flat array."""
         return PackedTree.of(params["router"])

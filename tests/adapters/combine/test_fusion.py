@@ -129,24 +129,15 @@ def test_unmerge_with_a_saved_adapter(tmp_path):
     assert_close(back.blocks.kernel.get_value(), NET.blocks.kernel.get_value())
 
 
-def test_unmerge_with_fully_fine_tuned_weights():
-    """Biases keep their trained values and are trainable again."""
-    rules = [("bias|out", FullFineTuning()), ("blocks", LoRA(rank=2))]
-    model = trained(*rules, seed=4)
-    back = lorasp_jax.unmerge(lorasp_jax.merge(model), model)
-    assert adaptation.methods(back) == adaptation.methods(model)
-    assert_close(call(back, X), call(model, X))
-    assert_close(back.blocks.kernel.get_value(), NET.blocks.kernel.get_value())
-    with pytest.raises(ValueError, match="no parameter"):
-        lorasp_jax.unmerge(nnx.Dict(blocks=lorasp_jax.merge(model).blocks), model)
-
-
 def test_unmerge_errors():
     model = trained(("blocks", LoRA(rank=2)), seed=4)
     merged = lorasp_jax.merge(model)
     for method in (DoRA(rank=2), SP, LoRAMoE(experts=2, rank=2)):
         with pytest.raises(ValueError, match="cannot unmerge blocks"):
             lorasp_jax.unmerge(merged, trained(("blocks", method), seed=4))
+    full = trained(("bias", FullFineTuning()), ("blocks", LoRA(rank=2)), seed=4)
+    with pytest.raises(ValueError, match="the adapted model also trains"):
+        lorasp_jax.unmerge(lorasp_jax.merge(full), full)
     with pytest.raises(ValueError, match="blocks has one"):
         lorasp_jax.unmerge(model, model)
     with pytest.raises(ValueError, match="layer blocks"):
