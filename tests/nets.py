@@ -1,7 +1,6 @@
 """Small adapted models with non-initial adapter parameters, shared by several tests."""
 
 import dataclasses
-import itertools
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +12,7 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.dense import Dense
 from lorasp_jax.peft import LoRA, LoRASP
 from tests import GOLDEN
+from tests.adapters.io import peft_folder
 from tests.models.random_models import with_noise, with_random_parameters
 
 SP = LoRASP(rank=8, hidden_width=4)
@@ -87,25 +87,10 @@ def assert_close(actual, expected):
     np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-5)
 
 
-class Tiny(nnx.Module):
-    """Network of the golden file."""
-
-    def __init__(self, golden):
-        sizes = itertools.pairwise((24, 40, 24, 16))
-        self.lin = nnx.List([nnx.Linear(i, o, rngs=nnx.Rngs(0)) for i, o in sizes])
-        for n, layer in enumerate(self.lin):
-            layer.kernel.set_value(jnp.array(golden[f"base/lin.{n}.weight"].T))
-            layer.bias.set_value(jnp.array(golden[f"base/lin.{n}.bias"]))
-
-    def __call__(self, x):
-        x = jnp.tanh(self.lin[1](jnp.tanh(self.lin[0](x))))
-        return self.lin[2](x)
-
-
 def golden_model(golden, name, method):
     layers = [n for n in range(3) if f"param/lin.{n}.lora_A.{name}.weight" in golden]
     pattern = "|".join(f"lin/{n}" for n in layers)
-    model = adaptation.adapt(Tiny(golden), [(pattern, method)], rngs=nnx.Rngs(0))
+    model = adaptation.adapt(peft_folder.Net(golden), [(pattern, method)], rngs=nnx.Rngs(0))
     for n in layers:
         a, b = (golden[f"param/lin.{n}.lora_{side}.{name}.weight"].T for side in "AB")
         model.lin[n].adapter.set_value({"lora_a": jnp.array(a), "lora_b": jnp.array(b)})

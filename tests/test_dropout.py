@@ -16,18 +16,13 @@ from lorasp_jax.peft import AdaLoRA, DoRA, LoRA
 from lorasp_jax.peft.dora import column_factor
 from lorasp_jax.peft.method import dropout
 from tests import nets
+from tests.models.random_models import with_noise
 from tests.test_scanned import EINSUMS, IDS, Llama
 
 RATE = 0.4
 KEY = jax.random.key(7)
 X = jax.random.normal(jax.random.key(0), (6, 5))
 WITH_DROPOUT = LoRA(rank=2, dropout=RATE)
-
-
-def perturbed(params, seed=3):
-    """Add noise to all parameters, so that none keeps its initial value."""
-    noise = lambda p: p + 0.3 * jax.random.normal(jax.random.key(seed), p.shape)  # noqa: E731
-    return jax.tree.map(noise, params)
 
 
 def equal(a, b):
@@ -47,7 +42,7 @@ def test_dropped_fraction_is_zero_and_the_rest_is_rescaled():
 def test_formula_matches_peft(method):
     """PEFT 0.21.2: lora_B(lora_A(dropout(x))); DoRA's magnitude rescales W dropout(x) (dora.py)."""
     kernel = jax.random.normal(jax.random.key(1), (5, 4))
-    params = perturbed(method.init(jax.random.key(2), kernel)[0])
+    params = with_noise(method.init(jax.random.key(2), kernel)[0], 0.3)
     dropped = dropout(X, RATE, KEY)
     a, b = params["lora_a"], params["lora_b"]
     if isinstance(method, AdaLoRA):
@@ -68,7 +63,7 @@ def test_formula_matches_peft(method):
 def trained(base, rules, **options):
     model = lorasp_jax.adapt(base, rules, rngs=nnx.Rngs(1), **options)
     graphdef, adapters, frozen = lorasp_jax.split(model)
-    return nnx.merge(graphdef, perturbed(adapters), frozen, copy=True)
+    return nnx.merge(graphdef, with_noise(adapters, 0.3), frozen, copy=True)
 
 
 @pytest.mark.parametrize("path", ["conv", "split", "experts", "join", "blocks", "out"])
@@ -193,7 +188,7 @@ LINEN_IDS = jnp.array([[1, 2, 3], [4, 5, 6]])
 def test_linen(path):
     adapter = lorasp_jax.LinenAdapter(Linen(), [(path, WITH_DROPOUT)])
     variables = adapter.init(jax.random.key(0), LINEN_IDS)
-    variables |= {"adapters": perturbed(variables["adapters"])}
+    variables |= {"adapters": with_noise(variables["adapters"], 0.3)}
     run = jax.jit(lambda key: adapter.apply(variables, LINEN_IDS, rngs={"dropout": key}))
     assert not np.allclose(run(KEY), run(jax.random.key(8)))
     assert equal(run(KEY), run(KEY))
@@ -214,7 +209,7 @@ def test_linen_scan_without_split_rngs():
 def test_linen_dense():
     layer = LinenDense(4, method=WITH_DROPOUT)
     variables = layer.init(jax.random.key(0), X)
-    variables |= {"adapters": perturbed(variables["adapters"])}
+    variables |= {"adapters": with_noise(variables["adapters"], 0.3)}
     first, second = (layer.apply(variables, X, rngs={"dropout": k}) for k in jax.random.split(KEY))
     assert not np.allclose(first, second)
     expected = LinenDense(4, method=LoRA(rank=2)).apply(variables, X)

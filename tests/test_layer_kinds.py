@@ -187,16 +187,6 @@ def test_weighted_sums_match_merged_kernels(models, combined):
     assert 0 < errors["blocks"] < 1
 
 
-def test_swapping_does_not_recompile(models, combined):
-    other = trained(("conv|join|blocks", LoRA(rank=1, alpha=5)), seed=7, net=NET)
-    run = jax.jit(lambda model, x: model(x))
-    run(lorasp_jax.choose(combined, "b"), IDS[0])
-    swapped = lorasp_jax.swap(lorasp_jax.choose(combined, "b"), "b", other)
-    assert_close(run(swapped, IDS[0]), call(other, IDS[0]))
-    assert run._cache_size() == 1
-    assert_close(call(lorasp_jax.choose(swapped, "a"), IDS[0]), call(models["a"], IDS[0]))
-
-
 @pytest.mark.slow
 def test_named_adapters_of_other_methods(models):
     others = {

@@ -13,8 +13,8 @@ import pytest
 from lorasp_jax.kernels.low_rank_matmul import Bottleneck, LowRankLayer, low_rank_matmul
 
 # (I, O), every code path for 10 tokens: output wider, more than twice as wide, square, input wider;
-# then I above the number of tokens.
-SHAPES = [(9, 10), (6, 20), (10, 10), (10, 7), (12, 30), (12, 12), (12, 7)]
+# then I above the number of tokens, where nothing is concatenated.
+SHAPES = [(9, 10), (6, 20), (10, 10), (10, 7), (12, 30)]
 DOWN, RANK = 4, 3
 
 

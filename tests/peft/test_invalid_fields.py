@@ -7,7 +7,6 @@ import pytest
 from flax import nnx
 
 import lorasp_jax
-from lorasp_jax import peft
 from lorasp_jax.peft import AdaLoRA, LoRA, LoRAMoE, LoRASP, LoRASPRelease
 
 NET = nnx.Dict(inp=nnx.Linear(5, 4, rngs=nnx.Rngs(0)))
@@ -110,8 +109,3 @@ def test_rank_larger_than_a_split_kernel(initialization):
         ValueError, match=r"cannot adapt inp: .* got rank 128 and a kernel \[5, 4\]"
     ):
         lorasp_jax.adapt(NET, [("inp", method)], rngs=nnx.Rngs(0))
-
-
-def test_unknown_field_of_a_method_gets_a_suggestion():
-    with pytest.raises(ValueError, match=r"lora_sp has no field 'energy_targt' \(did you mean"):
-        peft.create("lora_sp", energy_targt=0.9)

@@ -99,7 +99,7 @@ METHODS = [peft.create(n, rank=2) for n in peft.names() if n not in UNMERGEABLE]
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
-@pytest.mark.parametrize("method", [*METHODS, LoRA(rank=3, rank_stabilized=True), *SPLITS], ids=str)
+@pytest.mark.parametrize("method", [*METHODS, *SPLITS], ids=str)
 def test_unmerge(method, dtype):
     """The base kernels are restored up to the documented rounding, with the same adapters."""
     graphdef, state = nnx.split(NET)
