@@ -66,5 +66,7 @@ def replace_adapters(
         for a, b in zip(before(batch), after(batch), strict=True):
             a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
             error, norm = error + np.square(b - a).sum(), norm + np.square(a).sum()
+    if not np.isfinite(error + norm):
+        raise ValueError("the model's outputs are not finite")
     output_error = float(np.sqrt(error / max(norm, np.finfo(np.float32).tiny)))
     return smaller, Compaction(ranks, output_error)

@@ -58,8 +58,7 @@ def assert_close(actual, expected, tolerance):
 @pytest.mark.parametrize(
     ("tokens", "d_in", "d_out", "fields"),
     [
-        (48, 24, 20, {"rank": 32, "hidden_width": 16, "energy_target": 0.5}),
-        (48, 20, 24, {"rank": 32, "hidden_width": 16, "energy_target": 0.99, "alpha": 5.0}),
+        (48, 24, 20, {"rank": 32, "hidden_width": 16, "energy_target": 0.5, "alpha": 5.0}),
         (1, 6, 40, {"rank": 48, "hidden_width": 3}),  # a bank wider than the layer
         (7, 8, 8, {"rank": 1, "hidden_width": 1}),
     ],
