@@ -129,8 +129,6 @@ class Dense(AdaptedLayer):
       kernel: [I, O] (an `AdapterParam` under full fine-tuning). In a model that scans over its
         layers, kernel and adapter have leading layer axes.
       bias: [O] or None.
-      adapter: `AdapterParam` holding the method's parameters, or None.
-      method: the adapter's method, static.
     """
 
     def __init__(

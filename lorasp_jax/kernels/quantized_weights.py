@@ -94,17 +94,8 @@ class QuantizedKernel:
         return kernel[..., : self.d_in, :]
 
     def reshape(self, *shape: Any) -> "QuantizedKernel":
-        """Reshape the leading axes; -1 is inferred, as in `jnp.reshape`.
-
-        Raises:
-          ValueError: the shape does not end in [I, O].
-        """
-        *leading, d_in, d_out = np.empty(self.shape, np.void).reshape(*shape).shape
-        if (d_in, d_out) != self.shape[-2:]:
-            raise ValueError(
-                f"cannot reshape a quantized kernel {self.shape} to {shape}: "
-                "only its leading axes may change"
-            )
+        """Reshape the axes before [I, O]; -1 is inferred, as in `jnp.reshape`."""
+        leading = np.empty(self.shape, np.void).reshape(*shape).shape[:-2]
         arrays = {n: getattr(self, n) for n in ("codes", "scale")}
         return dataclasses.replace(
             self, **{n: a.reshape(*leading, *a.shape[-3:]) for n, a in arrays.items()}

@@ -43,12 +43,6 @@ def test_shared_children_are_replaced_once(net):
     assert net.linear is not net.again  # replaced separately
 
 
-def test_set_child_in_a_list(net):
-    (location,) = (location for location in modules(net) if location.path == "several/0")
-    paths.set_child(location, nnx.Dropout(0.5))
-    assert type(net.several[0]) is nnx.Dropout
-
-
 def test_merging_restores_classes(net):
     structure = nnx.graphdef(net)
     model = lorasp_jax.adapt(net, [("first|several", LoRA(rank=2))], rngs=nnx.Rngs(1))

@@ -34,13 +34,6 @@ def test_equals_hugging_face():
         assert_close(initial["magnitude"], recorded["magnitude"], 1e-6)
 
 
-def test_initially_equals_the_base():
-    params, kernel = METHOD.init(jax.random.key(0), KERNEL)
-    assert kernel is KERNEL
-    np.testing.assert_array_equal(METHOD.apply(params, X, KERNEL)[1].active_rank, RANK)
-    np.testing.assert_allclose(METHOD.merge(params, KERNEL), KERNEL, rtol=1e-5)
-
-
 def test_initial_magnitude_is_the_column_norm():
     kernel = jnp.array([[3.0, 0.0], [4.0, 2.0], [0.0, 0.0]], jnp.bfloat16)
     magnitude = METHOD.init(jax.random.key(0), kernel)[0]["magnitude"]

@@ -161,12 +161,9 @@ def extract(model: Model, name: str | None) -> Model:
 def with_adapters(
     base: Model, adapters: Mapping[str, tuple[AdaptedLayer, Method | None, Params]]
 ) -> Model:
-    """Attach adapters to the base's layers, in place.
+    """Attach adapters to the layers of a base from `strip_adapters`, in place.
 
-    Args:
-        base: from `strip_adapters`.
-        adapters: by path, a template layer that supports the adapter, the method (None for no
-            adapter) and the parameters.
+    `adapters` has, by path, a layer that supports the adapter, its method or None, and parameters.
     """
 
     def make_adapted(location: Location) -> AdaptedLayer | None:

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax.adapters import adaptation, paths
+from lorasp_jax.adapters import paths
 from lorasp_jax.adapters.layers import nnx_layers
-from lorasp_jax.dense import AdapterAux, validate
+from lorasp_jax.dense import AdapterAux, AdapterParam, validate
 from lorasp_jax.kernels.frozen_matmul import frozen_matmul
 from lorasp_jax.peft.method import Aux, Method, Params
 
@@ -69,11 +69,6 @@ class Observed(Method):
     path: str
     inner: Method | None
     report: Report
-
-    def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
-        """Return {}: `Observed` has no parameters of its own."""
-        del key, d_in, d_out
-        return {}
 
     def apply(
         self,
@@ -166,9 +161,8 @@ def _make_observed(model: nnx.Module, reports: dict[str, Report]) -> nnx.Module:
             layer = nnx_layers.make_adaptable(location.child, {})
         paths.set_child(location, layer)
         if layer.adapter is None:
-            adaptation.attach(layer, Observed(path, None, reports[path]), jax.random.key(0))
-        else:
-            layer.method = Observed(path, layer.method, reports[path])
+            layer.method, layer.adapter = None, AdapterParam({})
+        layer.method = Observed(path, layer.method, reports[path])
     return root[0]
 
 

@@ -9,7 +9,7 @@ import json
 import os
 import pathlib
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -135,7 +135,11 @@ def _match_folder(
         rank = values[path]["lora_a"].shape[-1]
         with paths.naming("load", folder):
             rules.append((f"^{re.escape(path)}$", kind(rank, scale * rank, dropout=dropout)))
-    _check_used(folder, modules, unused, candidates)
+    if not modules:
+        raise ValueError(f"{folder} contains no adapters")
+    if unused:
+        name, close = min(unused), paths.near_misses(min(unused), candidates)
+        raise ValueError(f"{folder} adapts {short(name)}, which the model lacks; it has {close}")
     check_biases(folder, config.get("bias", "none"), full, sizes, values)
     full_values = full_parameters(folder, full, shapes, sizes, names)
     # These rules come first, since the bias of an adapted layer may be fully fine-tuned.
@@ -225,17 +229,6 @@ def _check_fits(folder: pathlib.Path, module: str, adapter: Adapter, d_in: int, 
     magnitude = adapter.get("magnitude", np.empty(d_out)).shape
     if (a, b, magnitude) != ((d_in, rank), (rank, d_out), (d_out,)):
         raise ValueError(f"{folder}: {module} has shapes {a} and {b} for a {d_in}x{d_out} kernel")
-
-
-def _check_used(
-    folder: pathlib.Path, modules: Collection[str], unused: Collection[str], candidates: list[str]
-) -> None:
-    """Raise ValueError if the folder has no modules, or some are missing from the model."""
-    if not modules:
-        raise ValueError(f"{folder} contains no adapters")
-    if unused:
-        name, close = min(unused), paths.near_misses(min(unused), candidates)
-        raise ValueError(f"{folder} adapts {short(name)}, which the model lacks; it has {close}")
 
 
 def _stacked(adapters: list[Adapter], leading: list[int]) -> tuple[float, Adapter]:

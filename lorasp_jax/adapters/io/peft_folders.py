@@ -62,7 +62,9 @@ def read_folder(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter
     """
     with as_value_error(folder / CONFIG):
         config = read_json(folder / CONFIG)
-        _check_fields(config)
+        json_values.check({name: v for name, v in config.items() if v is not None}, _FIELDS)
+        if config.get("bias") not in (None, "none", "all", "lora_only"):
+            raise ValueError(f"bias must be 'none', 'all' or 'lora_only', got {config['bias']!r}")
     _, tensors = read_tensors(folder / TENSORS)
     _check_supported(folder, config)
     modules, full_values = collections.defaultdict(dict), {}
@@ -120,13 +122,6 @@ def _from_peft(config: Mapping[str, Any], module: str, tensors: Adapter) -> Adap
     if "lora_magnitude_vector" in tensors:
         adapter["magnitude"] = tensors["lora_magnitude_vector"].reshape(-1)
     return adapter
-
-
-def _check_fields(config: Mapping[str, Any]) -> None:
-    """Raise ValueError for a field of the wrong type, or a `bias` that PEFT does not have."""
-    json_values.check({name: v for name, v in config.items() if v is not None}, _FIELDS)
-    if config.get("bias") not in (None, "none", "all", "lora_only"):
-        raise ValueError(f"bias must be 'none', 'all' or 'lora_only', got {short(config['bias'])}")
 
 
 def _alpha(config: Mapping[str, Any], module: str) -> Any:

@@ -16,9 +16,8 @@ from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE
-from tests.cases import mostly_slow
 from tests.models.random_models import with_random_parameters
-from tests.nets import METHODS, NET, SP, Net, X, assert_close, call, golden_models, trained
+from tests.nets import NET, SP, Net, X, assert_close, call, golden_models, trained
 
 NAMES = ("pour", "press", "open", "pick")
 WEIGHTS = {"pour": 0.5, "press": -0.7}
@@ -99,20 +98,6 @@ def test_swap_does_not_recompile():
     )
     assert_close(run(model, X), call(NET, X))
     assert len(traces) == 1
-
-
-def test_weighted_sum_merges_into_one_model():
-    """Each merged kernel has the weighted sum of the adapters' deltas."""
-    pair = lorasp_jax.combine({name: models()[name] for name in WEIGHTS})
-    model = lorasp_jax.choose(pair, WEIGHTS)
-    merged = lorasp_jax.merge(model)
-    for layer in ("inp", "blocks", "out"):
-        expected = base = getattr(NET, layer).kernel.get_value()
-        for name, weight in WEIGHTS.items():
-            own = getattr(lorasp_jax.merge(models()[name]), layer).kernel.get_value()
-            expected += weight * (own - base)
-        assert_close(getattr(merged, layer).kernel.get_value(), expected)
-    assert_close(call(merged, X), call(model, X))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -201,15 +186,6 @@ def test_hugging_face(case, choice):
     expected = golden[f"y/{case}"]
     atol = 1e-5 * np.abs(expected).max()
     np.testing.assert_allclose(model(golden["x"]), expected, rtol=0, atol=atol)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", mostly_slow([n for n in METHODS if n != "full"], ["lora_sp"]))
-def test_half_weight_is_half_the_delta(name):
-    model = trained(("inp", METHODS[name]), seed=6)
-    pair = lorasp_jax.combine({"lora": models()["pour"], "own": model})
-    half = lorasp_jax.choose(pair, {"own": 0.5}).inp(X)
-    assert_close(half, 0.5 * (NET.inp(X) + model.inp(X)))
 
 
 @pytest.mark.slow

@@ -55,14 +55,7 @@ def test_pruning_inactive_directions_preserves_outputs(method, batches):
 @pytest.mark.slow
 def test_a_stack_gets_the_largest_rank_that_a_layer_needs(batches):
     """Three layers need ranks 7, 9 and 8: all get rank 9 and keep the directions they use."""
-    model = lora_sp_model(dataclasses.replace(VARIANTS[0], energy_target=1.0))
     inactive = [[0, 1, 2, 5, 11], [3, 4, 10], [0, 6, 7, 8]]
-    for layer, directions in enumerate(inactive):
-        model = deactivate(model, "blocks", layer, directions)
-    smaller, report = lorasp_jax.prune(model, batches, 0.0, forward=forward)
-    # With η = 1 every positive score is active, even softplus(-30), so nothing is dropped.
-    np.testing.assert_array_equal(report.ranks["blocks"], 12)
-
     method = dataclasses.replace(VARIANTS[0], energy_target=0.99)
     model = lora_sp_model(method)
     for layer, directions in enumerate(inactive):

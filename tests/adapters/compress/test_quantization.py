@@ -91,18 +91,6 @@ def test_adapters_on_a_quantized_base_are_saved(tmp_path):
     assert_close(call(own, X), call(model, X))
 
 
-def test_merge_dequantizes_only_adapted_kernels():
-    model = trained(("blocks", LoRA(rank=2)), seed=1, net=quantized("nf4"))
-    merged = lorasp_jax.merge(model)
-    assert merged.blocks.kernel.get_value().dtype == jnp.float32
-    assert isinstance(merged.inp.kernel.get_value(), QuantizedKernel)
-    assert_close(call(merged, X), call(model, X))
-    back = lorasp_jax.unmerge(merged, model)
-    assert_close(
-        back.blocks.kernel.get_value(), dequantized(quantized("nf4")).blocks.kernel.get_value()
-    )
-
-
 def test_adapters_that_split_kernels_come_first():
     pissa = LoRA(rank=2, initialization="pissa")
     with pytest.raises(ValueError, match="quantized kernel"):
@@ -147,15 +135,6 @@ def test_rules():
         lorasp_jax.quantize(broken, [("", "nf4")])
     with pytest.raises(ValueError, match="out/kernel is quantized"):
         adaptation.adapt(model, [("out", FullFineTuning())], rngs=nnx.Rngs(0))
-
-
-def test_shared_kernels_stay_shared():
-    tied = nnx.List([nnx.Linear(4, 4, use_bias=False, rngs=nnx.Rngs(i)) for i in range(2)])
-    tied[1].kernel = tied[0].kernel
-    model, errors = lorasp_jax.quantize(tied, [("", "int8")])
-    assert model[0].kernel is model[1].kernel
-    assert errors["0"] == errors["1"] > 0
-    assert size(model) == 4 * 4 + 4 * 4
 
 
 def test_summary_and_aux():
