@@ -77,10 +77,16 @@ def call(model, x):
 
 
 def trained(*rules, seed, net=NET, size=0.5):
-    """Adapt a model and add noise of this size to its adapters."""
-    model = adaptation.adapt(net, rules, rngs=nnx.Rngs(seed))
-    graphdef, adapters, frozen = adaptation.split(model)
-    return nnx.merge(graphdef, with_noise(adapters, size, seed), frozen)
+    """Adapt a model, with random adapters of this size; compiles nothing if it can."""
+    adapt = lambda: adaptation.adapt(net, rules, rngs=nnx.Rngs(seed))  # noqa: E731
+    if any(method is not None and method.splits_kernel for _, method in rules):
+        graphdef, adapters, frozen = adaptation.split(adapt())
+        return nnx.merge(graphdef, with_noise(adapters, size, seed), frozen)
+    graphdef, adapters, shapes = adaptation.split(nnx.eval_shape(adapt))
+    zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), adapters)
+    base = dict(nnx.to_flat_state(nnx.state(net)))
+    frozen = [(path, v.replace(base[path].get_value())) for path, v in nnx.to_flat_state(shapes)]
+    return nnx.merge(graphdef, with_noise(zeros, size, seed), nnx.from_flat_state(frozen))
 
 
 def assert_close(actual, expected):
