@@ -19,10 +19,10 @@ SP = LoRASP(rank=8, hidden_width=4)
 SIZES = {"rank": 8, "hidden_width": 4}
 
 
-def small(name):
+def small(name, sizes=SIZES):
     """Create a method by module name, with small sizes."""
     fields = {field.name for field in dataclasses.fields(peft.find(name))}
-    return peft.create(name, **{key: size for key, size in SIZES.items() if key in fields})
+    return peft.create(name, **{key: size for key, size in sizes.items() if key in fields})
 
 
 METHODS = {name: small(name) for name in peft.names()}

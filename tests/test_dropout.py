@@ -188,21 +188,22 @@ LINEN_IDS = jnp.array([[1, 2, 3], [4, 5, 6]])
 @pytest.mark.parametrize("path", ["blocks", "split", "conv"])
 def test_linen(path):
     adapter = lorasp_jax.LinenAdapter(Linen(), [(path, WITH_DROPOUT)])
-    variables = adapter.init(jax.random.key(0), LINEN_IDS)
+    variables = jax.jit(adapter.init)(jax.random.key(0), LINEN_IDS)
     variables |= {"adapters": with_noise(variables["adapters"], 0.3)}
     run = jax.jit(lambda key: adapter.apply(variables, LINEN_IDS, rngs={"dropout": key}))
     assert not np.allclose(run(KEY), run(jax.random.key(8)))
     assert equal(run(KEY), run(KEY))
     off = dataclasses.replace(adapter, rules=[(path, LoRA(rank=2))])
-    expected = off.apply(variables, LINEN_IDS)
-    assert equal(adapter.apply(variables, LINEN_IDS), expected)
-    assert equal(off.apply(variables, LINEN_IDS, rngs={"dropout": KEY}), expected)
+    expected = jax.jit(off.apply)(variables, LINEN_IDS)
+    assert equal(jax.jit(adapter.apply)(variables, LINEN_IDS), expected)
+    without = jax.jit(lambda v: off.apply(v, LINEN_IDS, rngs={"dropout": KEY}))
+    assert equal(without(variables), expected)
 
 
 def test_linen_scan_without_split_rngs():
     adapter = lorasp_jax.LinenAdapter(Linen(streams=("params",)), [("blocks", WITH_DROPOUT)])
-    variables = adapter.init(jax.random.key(0), LINEN_IDS)
-    adapter.apply(variables, LINEN_IDS)
+    variables = jax.jit(adapter.init)(jax.random.key(0), LINEN_IDS)
+    jax.eval_shape(adapter.apply, variables, LINEN_IDS)
     with pytest.raises(ValueError, match=r"blocks/dense .* split_rngs"):
         adapter.apply(variables, LINEN_IDS, rngs={"dropout": KEY})
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.scipy.special import ndtri
+from scipy.special import ndtri
 
 from lorasp_jax.kernels.low_rank_matmul import Bottleneck, LowRankLayer, low_rank_matmul
 from lorasp_jax.kernels.quantized_weights import KINDS, NF4, quantize_kernel
@@ -25,8 +25,8 @@ def dequantized(kernel, kind):
 def test_nf4_table():
     """QLoRA's construction: normal quantiles, 8 up to 0 and 9 from 0, scaled to [-1, 1]."""
     offset = (1 / 32 + 1 / 30) / 2
-    below = ndtri(jnp.linspace(offset, 0.5, 8))
-    above = -ndtri(jnp.linspace(offset, 0.5, 9))
+    below = ndtri(np.linspace(offset, 0.5, 8))
+    above = -ndtri(np.linspace(offset, 0.5, 9))
     table = np.unique(np.concatenate([below / -below[0], above / above[0]]).round(6))
     np.testing.assert_allclose(table, NF4, atol=2e-4)
     assert len(NF4) == 16

@@ -10,6 +10,7 @@ import pytest
 
 from lorasp_jax import peft
 from tests.models.random_models import with_noise
+from tests.nets import small
 
 D_IN, D_OUT, RANK = 6, 10, 12  # the rank exceeds both widths
 # Cannot be merged, unlike every other method.
@@ -18,14 +19,9 @@ INPUT_DEPENDENT = (peft.LoRASP, peft.LoRASPRelease, peft.LoRAMoE)
 SMALL = {"rank": RANK, "target_rank": 6, "hidden_width": 4, "alpha": 5.0, "experts": 2}
 
 
-def small(name):
-    fields = {field.name for field in dataclasses.fields(peft.find(name))}
-    return peft.create(name, **{key: value for key, value in SMALL.items() if key in fields})
-
-
 @pytest.fixture(params=peft.names())
 def method(request):
-    return small(request.param)
+    return small(request.param, SMALL)
 
 
 @pytest.fixture

@@ -13,10 +13,9 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.combine import named
 from lorasp_jax.adapters.io.native import load_adapters, save_adapters
 from lorasp_jax.dense import AdapterParam
-from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE
-from tests.models.random_models import with_random_parameters
+from tests.models.random_models import observation, with_random_parameters
 from tests.nets import NET, SP, Net, X, assert_close, call, golden_models, trained
 
 NAMES = ("pour", "press", "open", "pick")
@@ -192,16 +191,7 @@ def test_hugging_face(case, choice):
 def test_mixed_batch_through_pi0():
     """Test scanned towers, cameras folded into the batch, and a cache that both experts share."""
     config = Pi0Config.dummy()
-    net, size = config.create(nnx.Rngs(0)), (2, config.image_size, config.image_size, 3)
-    obs = Observation(
-        images={
-            n: jax.random.uniform(jax.random.key(i), size) for i, n in enumerate(config.cameras)
-        },
-        image_masks={n: jnp.ones(2, bool) for n in config.cameras},
-        tokens=jnp.ones((2, config.max_tokens), jnp.int32),
-        token_mask=jnp.ones((2, config.max_tokens), bool),
-        state=jax.random.normal(jax.random.key(3), (2, config.action_dim)),
-    )
+    net, obs = config.create(nnx.Rngs(0)), observation(config, 2)
     x_t = jax.random.normal(jax.random.key(4), (2, config.chunk, config.action_dim))
     models = {"a": trained(("vision/.*fc1|v_proj", LoRA(rank=2)), seed=1, net=net)}
     models["b"] = trained(("vision/.*fc|state_proj", LoRA(rank=3)), seed=2, net=net)

@@ -5,7 +5,6 @@ import json
 import shutil
 
 import huggingface_hub
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from lorasp_jax.adapters.io import hugging_face
 from lorasp_jax.peft import FullFineTuning, LoRA
 from tests import GOLDEN
 from tests.adapters.io.peft_folder import FOLDER, Net, edit_config, edit_tensors
+from tests.models.random_models import with_noise
 
 
 @pytest.mark.parametrize(
@@ -91,10 +91,7 @@ def numbered(path, index):
 def perturbed(model):
     """Add noise to all trainable parameters."""
     graphdef, adapters, frozen = adaptation.split(model)
-    adapters = jax.tree.map(
-        lambda x: x + 0.1 * jnp.cos(jnp.arange(x.size)).reshape(x.shape), adapters
-    )
-    return nnx.merge(graphdef, adapters, frozen)
+    return nnx.merge(graphdef, with_noise(adapters, 0.1), frozen)
 
 
 IDS = jnp.array([[1, 2, 3], [4, 5, 6]])

@@ -39,6 +39,7 @@ def scores_of(router, x, kind="gelu"):
     return router_scores(router, x @ router["w1"], kind)
 
 
+@jax.jit
 def losses_of(scores, kept_energy=1.0, valid=None):
     """The three losses for scores that are also the logits; every positive score is active."""
     valid = jnp.ones((len(scores), 1), bool) if valid is None else valid

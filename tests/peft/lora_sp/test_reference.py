@@ -94,8 +94,8 @@ def test_dense_equals_the_reference():
         normal(4, 6, 5),
         normal(5, 5),
     )
-    y, aux = dense(x, kernel, bias, params, method)
-    expected, losses = paper(method)(params, x.reshape(18, 6), kernel)
+    y, aux = jax.jit(lambda x: dense(x, kernel, bias, params, method))(x)
+    expected, losses = jax.jit(paper(method))(params, x.reshape(18, 6), kernel)
     assert_close(y, (expected + bias).reshape(2, 9, 5), 1e-5)
     assert_close(dict(aux.losses), losses, 1e-5)
 
