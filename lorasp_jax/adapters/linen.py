@@ -35,6 +35,7 @@ ADAPTER = "lorasp_adapter"  # parameter name of an adapter in its layer
 # Face's tied heads do.
 MODEL_FLAG = "lorasp_jax"
 DROPOUT_FLAG = "lorasp_jax_dropout"  # marks scopes of a call with rngs for "dropout"
+Function = Callable[..., Any]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,15 +151,12 @@ class LinenAdapter:
         return {**rest, "params": unflatten_dict(flat)}
 
     def _visit_layers(
-        self, visit: Callable[..., Any], variables: Mapping[str, Any], *args: Any, **kwargs: Any
+        self, visit: Function, variables: Mapping[str, Any], *args: Any, **kwargs: Any
     ) -> Any:
         """Call the model and `visit` each of its modules; return the new parameters."""
 
         def interceptor(
-            next_fun: Callable[..., Any],
-            args: Any,
-            kwargs: Any,
-            context: nn.module.InterceptorContext,
+            next_fun: Function, args: Any, kwargs: Any, context: nn.module.InterceptorContext
         ):
             y = next_fun(*args, **kwargs)
             if context.method_name == "__call__" and _is_model_module(context.module):
@@ -233,7 +231,7 @@ class LinenAdapter:
             (trained if full or ADAPTER in path else base)[path] = value
         return base, trained
 
-    def _call(self, next_fun: Callable[..., Any], args: Any, kwargs: Any, context: Any) -> Any:
+    def _call(self, next_fun: Function, args: Any, kwargs: Any, context: Any) -> Any:
         """Method interceptor that computes adapted layers."""
         module = context.module
         if context.method_name not in ("__call__", "attend") or not self._supported_class(module):

@@ -31,14 +31,12 @@ def locate(root: nnx.List[Any], kind: type | tuple[type, ...]) -> list[Location]
 
     `root` is `nnx.List([model])`; paths are relative to the model.
     """
-
-    def walk() -> Iterator[Location]:
-        for path, module in nnx.iter_modules(root):
-            for name, child in vars(module).items():
-                if isinstance(child, kind):
-                    yield Location("/".join(map(str, (*path, name)[1:])), module, name, child)
-
-    return list(walk())
+    return [
+        Location("/".join(map(str, (*path, name)[1:])), module, name, child)
+        for path, module in nnx.iter_modules(root)
+        for name, child in vars(module).items()
+        if isinstance(child, kind)
+    ]
 
 
 @contextlib.contextmanager

@@ -38,6 +38,8 @@ from lorasp_jax.peft.fields import short
 from lorasp_jax.peft.method import Params
 
 Selection: TypeAlias = str | Mapping[str, float] | None
+AdaptedLayers: TypeAlias = dict[str, AdaptedLayer]
+"""Adapted layers, by path or by adapter name."""
 
 
 def combine(models: Mapping[str, Model], *, rank: int | None = None) -> Model:
@@ -232,7 +234,7 @@ def strip_adapters(model: Model) -> Model:
     return root[0]
 
 
-def adapters_by_path(name: str, model: nnx.Module) -> dict[str, AdaptedLayer]:
+def adapters_by_path(name: str, model: nnx.Module) -> AdaptedLayers:
     """Adapted layers of the model called `name`, by path.
 
     Raises:
@@ -267,10 +269,7 @@ def _equal(a: jax.Array, b: jax.Array) -> bool:
 
 
 def _combined_layer(
-    layer: nnx.Module,
-    adapter_names: tuple[str, ...],
-    adapted: dict[str, AdaptedLayer],
-    rank: int | None,
+    layer: nnx.Module, adapter_names: tuple[str, ...], adapted: AdaptedLayers, rank: int | None
 ) -> AdaptedLayer:
     """Combine the layer's adapters into an `AdapterSet` with all weights 0."""
     layer = nnx_layers.make_adaptable_like(layer, next(iter(adapted.values())))
