@@ -93,8 +93,7 @@ def rowwise_kernel(
     """
     launches = (FEW, FEW) if len(rows) <= FEW_ROWS else (FORWARD, BACKWARD)
     static = function, widths, start, launches, interpret
-    results: Any = _rowwise(static, shared, rows, valid.astype(jnp.int8))
-    return results
+    return _rowwise(static, shared, rows, valid.astype(jnp.int8))
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))

@@ -118,8 +118,7 @@ def _match_folder(
     by path.
     """
     config, modules, full = read_folder(folder)
-    kind = DoRA if config.get("use_dora") else LoRA
-    dropout = config.get("lora_dropout") or 0.0
+    kind, dropout = DoRA if config.get("use_dora") else LoRA, config.get("lora_dropout") or 0.0
     unused, candidates, rules, values = dict(modules), [], [], {}
     for path, (*leading, d_in, d_out) in shapes.items():
         module_names = [names(path, index) for index in np.ndindex(*leading)]
