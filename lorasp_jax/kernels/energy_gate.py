@@ -53,7 +53,7 @@ def exact_ratio(energy_target: float) -> Ratio:
     """Convert η to an exact ratio, interpreting it as a decimal.
 
     Raises:
-      ValueError: η is not a number in (0, 1].
+        ValueError: η is not a number in (0, 1].
     """
     try:
         ratio = fractions.Fraction(decimal.Decimal(str(energy_target)))
@@ -79,16 +79,16 @@ def energy_gate(
     zeros keeps nothing and has `kept_energy` 1. η = 1 keeps every positive score.
 
     Args:
-      scores: [..., R], non-negative, cast to fp32. For negative scores the magnitude is used.
-      energy_target: η in (0, 1], a Python number, interpreted as an exact decimal.
-      implementation: see the module docstring; None for `default_implementation()`.
-      interpret: run "pallas" without a GPU, slowly.
+        scores: [..., R], non-negative, cast to fp32. For negative scores the magnitude is used.
+        energy_target: η in (0, 1], a Python number, interpreted as an exact decimal.
+        implementation: see the module docstring; None for `default_implementation()`.
+        interpret: run "pallas" without a GPU, slowly.
 
     Returns:
-      mask bool [..., R], active_rank f32 [...] = k, kept_energy f32 [...] = E_k.
+        mask bool [..., R], active_rank f32 [...] = k, kept_energy f32 [...] = E_k.
 
     Raises:
-      ValueError: η outside (0, 1] or an unknown implementation.
+        ValueError: η outside (0, 1] or an unknown implementation.
     """
     ratio = exact_ratio(energy_target)
     name = implementation or default_implementation()

@@ -115,11 +115,11 @@ def low_rank_matmul(
     """Return (x W + z U, aux) of each layer, where z, aux = f(params, x P, token_mask).
 
     Args:
-      f: computes z of all layers.
-      rows_dtype: dtype of x P, which is accumulated in fp32.
-      layers: the arrays of each layer.
-      x: [..., I]; the outputs have its dtype.
-      token_mask: bool [...tokens] or None, passed to f.
+        f: computes z of all layers.
+        rows_dtype: dtype of x P, which is accumulated in fp32.
+        layers: the arrays of each layer.
+        x: [..., I]; the outputs have its dtype.
+        token_mask: bool [...tokens] or None, passed to f.
     """
     projected = jnp.matmul(x, _concat_downs(layers, x.dtype), preferred_element_type=rows_dtype)
     params = [layer.params for layer in layers]

@@ -39,7 +39,7 @@ class AdaLoRA(Method):
     zeroes its entry of lora_e. Until the last allocation, a pruned triplet can return.
 
     Raises:
-      ValueError: an invalid rank, interval, fraction or decay.
+        ValueError: an invalid rank, interval, fraction or decay.
     """
 
     rank: int = 128
@@ -136,12 +136,12 @@ class AdaLoRA(Method):
         computed from the updated parameters.
 
         Args:
-          optimizer: for any parameter tree that includes AdaLoRA parameters.
-          total_steps: number of training steps.
+            optimizer: for any parameter tree that includes AdaLoRA parameters.
+            total_steps: number of training steps.
 
         Raises:
-          ValueError: no steps remain between warm-up and final phase. The wrapped optimizer's
-            `init` also raises it, for a tree without AdaLoRA parameters.
+            ValueError: no steps remain between warm-up and final phase. The wrapped optimizer's
+                `init` also raises it, for a tree without AdaLoRA parameters.
         """
         positive_int("total_steps", total_steps)
         begin, end = round(self.warmup * total_steps), total_steps - round(self.final * total_steps)

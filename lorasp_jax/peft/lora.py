@@ -22,7 +22,7 @@ class LoRA(Method):
     Parameters: lora_a [I, R], lora_b [R, O]: (I + O) R in total.
 
     Raises:
-      ValueError: a rank below 1, an unknown initialization, or a dropout outside [0, 1).
+        ValueError: a rank below 1, an unknown initialization, or a dropout outside [0, 1).
     """
 
     rank: int = 128
@@ -74,9 +74,9 @@ class LoRA(Method):
         See `Method.init` for the arguments and results.
 
         Raises:
-          ValueError: `Method.init` rejects an argument. For "pissa" and "olora": the kernel has no
-            values, or R > min(I, O). For "eva": statistics are missing or have the wrong shape, or
-            R > I.
+            ValueError: `Method.init` rejects an argument. For "pissa" and "olora": the kernel has
+                no values, or R > min(I, O). For "eva": statistics are missing or have the wrong
+                shape, or R > I.
         """
         if self.needs_statistics:
             check_kernel(kernel)
@@ -174,12 +174,12 @@ def principal_inputs(moment: jax.Array | None, d_in: int, rank: int) -> jax.Arra
     vectors are computed as eigenvectors of Σ x xᵀ, which can be summed over batches.
 
     Args:
-      moment: Σ x xᵀ, [I, I], not centered.
-      d_in: I.
-      rank: R, at most I.
+        moment: Σ x xᵀ, [I, I], not centered.
+        d_in: I.
+        rank: R, at most I.
 
     Raises:
-      ValueError: the moment is missing or has the wrong shape, or R exceeds I.
+        ValueError: the moment is missing or has the wrong shape, or R exceeds I.
     """
     if moment is None:
         raise ValueError(

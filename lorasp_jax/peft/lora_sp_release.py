@@ -90,9 +90,9 @@ def release_losses(scores: jax.Array, mask: jax.Array, valid: jax.Array) -> dict
     """Spectral, balance and z-loss of the public code, f32 scalars over the valid tokens.
 
     Args:
-      scores: f32 [...tokens, R].
-      mask: bool [...tokens, R], from `release_gate`.
-      valid: bool [...tokens], False for padding.
+        scores: f32 [...tokens, R].
+        mask: bool [...tokens, R], from `release_gate`.
+        valid: bool [...tokens], False for padding.
     """
     mean = functools.partial(masked_mean, mask=valid)
     mean_per_direction = jax.vmap(mean, in_axes=-1)

@@ -97,15 +97,15 @@ class Method(Bottleneck):
         """Initialize parameters for one kernel. The adapted layer initially equals x @ kernel.
 
         Args:
-          key: typed random key.
-          kernel: [I, O] array or ShapeDtypeStruct; this implementation uses only its shape.
-          statistics: activation statistics, for data-driven initialization.
+            key: typed random key.
+            kernel: [I, O] array or ShapeDtypeStruct; this implementation uses only its shape.
+            statistics: activation statistics, for data-driven initialization.
 
         Returns:
-          The parameters, and the kernel: unchanged, or the residual if the method splits it.
+            The parameters, and the kernel: unchanged, or the residual if the method splits it.
 
         Raises:
-          ValueError: the kernel is not a matrix, or `key` is not a random key.
+            ValueError: the kernel is not a matrix, or `key` is not a random key.
         """
         del statistics
         fields.check_kernel(kernel)
@@ -129,12 +129,12 @@ class Method(Bottleneck):
         """Map each token's row of x P to z.
 
         Args:
-          params: from `bottleneck_params`.
-          rows: x P, [...tokens, Q] in the dtype of x, or in fp32 if `down_in_fp32`.
-          token_mask: see `delta`.
+            params: from `bottleneck_params`.
+            rows: x P, [...tokens, Q] in the dtype of x, or in fp32 if `down_in_fp32`.
+            token_mask: see `delta`.
 
         Returns:
-          z [...tokens, R], to be multiplied by U, and aux with token_mask unset.
+            z [...tokens, R], to be multiplied by U, and aux with token_mask unset.
         """
         raise NotImplementedError
 
@@ -153,13 +153,13 @@ class Method(Bottleneck):
         """Compute what the adapter adds to x @ kernel, [...tokens, O], and aux.
 
         Args:
-          params: from `init`.
-          x: [...tokens, I].
-          token_mask: bool [...tokens]; False marks padding, excluded from losses and statistics.
+            params: from `init`.
+            x: [...tokens, I].
+            token_mask: bool [...tokens]; False marks padding, excluded from losses and statistics.
 
         Raises:
-          ValueError: the method is not additive, x is not floating point, or the parameters belong
-            to another method.
+            ValueError: the method is not additive, x is not floating point, or the parameters
+                belong to another method.
         """
         if not self.additive:
             raise ValueError(f"{type(self).__name__} is not additive and has no delta; use apply")
@@ -233,8 +233,8 @@ class Method(Bottleneck):
         """The shapes that parameters must have.
 
         Args:
-          initial: shapes from `init_params`, by path.
-          actual: shapes of the parameters, which may have been pruned.
+            initial: shapes from `init_params`, by path.
+            actual: shapes of the parameters, which may have been pruned.
         """
         del actual
         return initial
@@ -255,7 +255,7 @@ class Method(Bottleneck):
         """The kernel [I, O] merged with the adapter, in the kernel's dtype.
 
         Raises:
-          ValueError: the delta depends on the input, so it cannot be merged.
+            ValueError: the delta depends on the input, so it cannot be merged.
         """
         raise NotImplementedError
 

@@ -47,7 +47,7 @@ class EinsumLayer(AdaptedLayer):
     """Mixin for a layer that computes an einsum of its input and its kernel.
 
     Attributes:
-      kernel_equation: see `lorasp_jax.adapters.layers.einsum`.
+        kernel_equation: see `lorasp_jax.adapters.layers.einsum`.
     """
 
     kernel_equation: str
@@ -56,7 +56,7 @@ class EinsumLayer(AdaptedLayer):
         """Compute y, see `einsum.einsum`.
 
         Raises:
-          ValueError: out_sharding is not None.
+            ValueError: out_sharding is not None.
         """
         if out_sharding is not None:
             reject_out_sharding()
@@ -167,9 +167,9 @@ def convolve(layer: Any, a: jax.Array, inputs: jax.Array) -> jax.Array:
     """Convolve inputs with A, using the layer's strides, padding and other settings.
 
     Args:
-      layer: an NNX or Linen convolution; both have the same attribute names.
-      a: LoRA's A, [sizes · I, R].
-      inputs: [..., *spatial, I].
+        layer: an NNX or Linen convolution; both have the same attribute names.
+        a: LoRA's A, [sizes · I, R].
+        inputs: [..., *spatial, I].
     """
     sizes = (layer.kernel_size,) if isinstance(layer.kernel_size, int) else layer.kernel_size
     same = ("strides", "padding", "input_dilation", "kernel_dilation", "dtype", "precision")
@@ -189,8 +189,8 @@ def lora_init(layer: Any, method: Method) -> Callable[[jax.Array, jax.Array], An
     """Function (key, kernel) that initializes LoRA for an embedding or a convolution.
 
     Raises:
-      ValueError: the method is not plain LoRA, its initialization needs the kernel or statistics,
-        or the convolution is grouped or masked.
+        ValueError: the method is not plain LoRA, its initialization needs the kernel or statistics,
+            or the convolution is grouped or masked.
     """
     if type(method) is not LoRA or method.splits_kernel or method.needs_statistics:
         raise ValueError(
@@ -210,8 +210,8 @@ def make_adaptable(layer: nnx.Module, einsums: Einsums) -> AdaptedLayer:
     The layer is not modified; an `AdaptedLayer` is returned as is.
 
     Raises:
-      ValueError: the layer has a custom matmul or precision, its equation cannot be adapted, or an
-        attribute that adapted layers need already exists.
+        ValueError: the layer has a custom matmul or precision, its equation cannot be adapted, or
+            an attribute that adapted layers need already exists.
     """
     if isinstance(layer, AdaptedLayer):
         return layer
@@ -233,7 +233,7 @@ def make_adaptable_like(layer: Any, other: AdaptedLayer) -> AdaptedLayer:
     The layer is not modified; it is returned as is if it can already carry the adapter.
 
     Raises:
-      ValueError: the layer is not of the other layer's original class.
+        ValueError: the layer is not of the other layer's original class.
     """
     if isinstance(layer, type(other)):
         return layer
@@ -258,7 +258,7 @@ def kernel_and_equation(layer: Any, known: type | None, einsums: Einsums) -> tup
     """Kernel name and equation of an einsum layer.
 
     Raises:
-      ValueError: the equation cannot be adapted, or the layer has no such kernel.
+        ValueError: the equation cannot be adapted, or the layer has no such kernel.
     """
     assert known is not None
     name, equation = describe_einsum({**EINSUMS, **einsums}[known], layer)
@@ -295,7 +295,7 @@ def matrices_shape(layer: Any, einsums: Einsums) -> tuple[int, ...]:
     """Shape [..., *batch, I, O] of the kernel matrices of a dense layer or einsum, adapted or not.
 
     Raises:
-      ValueError: the equation cannot be adapted.
+        ValueError: the equation cannot be adapted.
     """
     if isinstance(layer, AdaptedLayer):
         return tuple(layer.kernel_matrices().shape)
@@ -325,7 +325,7 @@ def to_dense(linear: Dense | nnx.Linear) -> Dense:
     """Convert `nnx.Linear` to a `Dense` that shares its variables; a `Dense` is returned as is.
 
     Raises:
-      ValueError: the layer has a custom matmul or precision.
+        ValueError: the layer has a custom matmul or precision.
     """
     if isinstance(linear, Dense):
         return linear

@@ -39,7 +39,7 @@ class LoRASP(BankMethod):
     "softmax", b1 [H], b2 [R]. In total R (I + O) + H (I + R), plus H + R for the biases.
 
     Raises:
-      ValueError: a rank or width below 1, or η outside (0, 1].
+        ValueError: a rank or width below 1, or η outside (0, 1].
     """
 
     score_arrays: ClassVar[tuple[str, ...]] = ("w2", "b2")
