@@ -16,18 +16,14 @@ from lorasp_jax.peft import AdaLoRA, DoRA, LoRA
 from lorasp_jax.peft.dora import column_factor
 from lorasp_jax.peft.method import dropout
 from tests import nets
+from tests.models.random_models import with_noise, with_random_parameters
 from tests.test_scanned import EINSUMS, IDS, Llama
 
 RATE = 0.4
 KEY = jax.random.key(7)
 X = jax.random.normal(jax.random.key(0), (6, 5))
 WITH_DROPOUT = LoRA(rank=2, dropout=RATE)
-
-
-def perturbed(params, seed=3):
-    """Add noise to all parameters, so that none keeps its initial value."""
-    noise = lambda p: p + 0.3 * jax.random.normal(jax.random.key(seed), p.shape)  # noqa: E731
-    return jax.tree.map(noise, params)
+KINDS = with_random_parameters(nets.Kinds)
 
 
 def equal(a, b):
@@ -47,7 +43,7 @@ def test_dropped_fraction_is_zero_and_the_rest_is_rescaled():
 def test_formula_matches_peft(method):
     """PEFT 0.21.2: lora_B(lora_A(dropout(x))); DoRA's magnitude rescales W dropout(x) (dora.py)."""
     kernel = jax.random.normal(jax.random.key(1), (5, 4))
-    params = perturbed(method.init(jax.random.key(2), kernel)[0])
+    params = with_noise(method.init(jax.random.key(2), kernel)[0], 0.3)
     dropped = dropout(X, RATE, KEY)
     a, b = params["lora_a"], params["lora_b"]
     if isinstance(method, AdaLoRA):
@@ -68,13 +64,13 @@ def test_formula_matches_peft(method):
 def trained(base, rules, **options):
     model = lorasp_jax.adapt(base, rules, rngs=nnx.Rngs(1), **options)
     graphdef, adapters, frozen = lorasp_jax.split(model)
-    return nnx.merge(graphdef, perturbed(adapters), frozen, copy=True)
+    return nnx.merge(graphdef, with_noise(adapters, 0.3), frozen, copy=True)
 
 
 @pytest.mark.parametrize("path", ["conv", "split", "experts", "join", "blocks", "out"])
 def test_every_layer_type(path):
     """Outputs depend on the key in training and are deterministic in evaluation."""
-    model = trained(nets.Kinds(), [(path, WITH_DROPOUT)])
+    model = trained(KINDS, [(path, WITH_DROPOUT)])
     ids = jnp.array([[1, 2, 3], [4, 5, 6]])
 
     @jax.jit
@@ -84,22 +80,22 @@ def test_every_layer_type(path):
     first, second = run(KEY), run(jax.random.key(8))
     assert not np.allclose(first, second)
     assert equal(first, run(KEY))
-    without = lorasp_jax.adapt(nets.Kinds(), [(path, LoRA(rank=2))], rngs=nnx.Rngs(1))
-    graphdef, _, frozen = lorasp_jax.split(without)
-    assert equal(model(ids), nnx.merge(graphdef, lorasp_jax.split(model)[1], frozen)(ids))
+    without = nnx.clone(model)
+    getattr(without, path).method = LoRA(rank=2)
+    assert equal(nets.call(model, ids), nets.call(without, ids))
 
 
 def test_embedding_ids_are_never_dropped():
-    model = trained(nets.Kinds(), [("embed", WITH_DROPOUT)])
+    model = trained(KINDS, [("embed", WITH_DROPOUT)])
     ids = jnp.array([[1, 2, 3]])
-    assert equal(lorasp_jax.with_dropout(model, KEY)(ids), model(ids))
+    assert equal(nets.call(lorasp_jax.with_dropout(model, KEY), ids), nets.call(model, ids))
 
 
 def test_layers_experts_and_stacks_use_independent_masks():
-    model = lorasp_jax.with_dropout(trained(nets.Kinds(), [("out|join|blocks", WITH_DROPOUT)]), KEY)
+    model = lorasp_jax.with_dropout(trained(KINDS, [("out|join|blocks", WITH_DROPOUT)]), KEY)
     keys = [model.out.dropout_key, model.join.dropout_key, *model.blocks.dropout_key]
     assert len({tuple(jax.random.key_data(key).tolist()) for key in keys}) == 5
-    layer = trained(nets.Kinds(), [("experts", WITH_DROPOUT)]).experts
+    layer = trained(KINDS, [("experts", WITH_DROPOUT)]).experts
     x = jnp.ones((50, 2, 3))
     equal_experts = jax.tree.map(lambda p: p.at[1].set(p[0]), layer.adapter.get_value())
     layer.adapter.set_value(equal_experts)
@@ -192,21 +188,22 @@ LINEN_IDS = jnp.array([[1, 2, 3], [4, 5, 6]])
 @pytest.mark.parametrize("path", ["blocks", "split", "conv"])
 def test_linen(path):
     adapter = lorasp_jax.LinenAdapter(Linen(), [(path, WITH_DROPOUT)])
-    variables = adapter.init(jax.random.key(0), LINEN_IDS)
-    variables |= {"adapters": perturbed(variables["adapters"])}
+    variables = jax.jit(adapter.init)(jax.random.key(0), LINEN_IDS)
+    variables |= {"adapters": with_noise(variables["adapters"], 0.3)}
     run = jax.jit(lambda key: adapter.apply(variables, LINEN_IDS, rngs={"dropout": key}))
     assert not np.allclose(run(KEY), run(jax.random.key(8)))
     assert equal(run(KEY), run(KEY))
     off = dataclasses.replace(adapter, rules=[(path, LoRA(rank=2))])
-    expected = off.apply(variables, LINEN_IDS)
-    assert equal(adapter.apply(variables, LINEN_IDS), expected)
-    assert equal(off.apply(variables, LINEN_IDS, rngs={"dropout": KEY}), expected)
+    expected = jax.jit(off.apply)(variables, LINEN_IDS)
+    assert equal(jax.jit(adapter.apply)(variables, LINEN_IDS), expected)
+    without = jax.jit(lambda v: off.apply(v, LINEN_IDS, rngs={"dropout": KEY}))
+    assert equal(without(variables), expected)
 
 
 def test_linen_scan_without_split_rngs():
     adapter = lorasp_jax.LinenAdapter(Linen(streams=("params",)), [("blocks", WITH_DROPOUT)])
-    variables = adapter.init(jax.random.key(0), LINEN_IDS)
-    adapter.apply(variables, LINEN_IDS)
+    variables = jax.jit(adapter.init)(jax.random.key(0), LINEN_IDS)
+    jax.eval_shape(adapter.apply, variables, LINEN_IDS)
     with pytest.raises(ValueError, match=r"blocks/dense .* split_rngs"):
         adapter.apply(variables, LINEN_IDS, rngs={"dropout": KEY})
 
@@ -214,7 +211,7 @@ def test_linen_scan_without_split_rngs():
 def test_linen_dense():
     layer = LinenDense(4, method=WITH_DROPOUT)
     variables = layer.init(jax.random.key(0), X)
-    variables |= {"adapters": perturbed(variables["adapters"])}
+    variables |= {"adapters": with_noise(variables["adapters"], 0.3)}
     first, second = (layer.apply(variables, X, rngs={"dropout": k}) for k in jax.random.split(KEY))
     assert not np.allclose(first, second)
     expected = LinenDense(4, method=LoRA(rank=2)).apply(variables, X)

@@ -1,8 +1,5 @@
 """Test how the benchmark of kernels sorts them, and its arithmetic."""
 
-import json
-import types
-
 import jax
 import jax.numpy as jnp
 import pytest
@@ -124,17 +121,3 @@ def test_profile():
 
 def test_xla_knows_the_options():
     jax.jit(jnp.sin).lower(1.0).compile(kernels.WITHOUT_GRAPHS)
-
-
-def test_command(monkeypatch, tmp_path, capsys):
-    rows = [{"kind": "matmuls", "kernels": 2, "ms": 3.0, "%": 75.0}]
-    step = types.SimpleNamespace(load=lambda *_: step)
-    monkeypatch.setattr(kernels, "Step", lambda *_, options: step)
-    monkeypatch.setattr(kernels, "arrays", lambda *_: (None, None, None))
-    monkeypatch.setattr(kernels, "profile", lambda *_: (rows, []))
-    file = tmp_path / "kernels.json"
-    options = ["--size", "nano", "--backbones", "pi0", "--json", str(file)]
-    monkeypatch.setattr("sys.argv", ["kernels", *options])
-    kernels.main()
-    assert json.loads(file.read_text())["pi0"] == {"kinds": rows, "slowest": []}
-    assert "matmuls" in capsys.readouterr().out

@@ -112,8 +112,6 @@ def test_experts_shrink_like_equivalent_dense_layers(tool):
     if tool is lorasp_jax.prune:  # a stack has a single rank, the largest
         assert smaller.method.rank == max(report.ranks[""]) < SP.rank
     else:
-        own = [each.layer_errors[str(i)] for i in range(2)]
-        np.testing.assert_allclose(report.layer_errors[""], own, rtol=1e-3)
         assert_close(call(smaller, x), apply_dense_layers(expected, x))
     error = np.linalg.norm(smaller(x) - layer(x)) / np.linalg.norm(layer(x))
     np.testing.assert_allclose(report.output_error, error, rtol=1e-4)
@@ -123,7 +121,7 @@ def test_experts_shrink_like_equivalent_dense_layers(tool):
 def test_distilled_layers_merge_save_and_load(tmp_path):
     model = trained(("split|experts|join|blocks", SP), seed=4, net=NET, size=0.2)
     smaller, report = lorasp_jax.distill(model, IDS)
-    assert sorted(report.layer_errors) == EINSUMS
+    assert sorted(report.ranks) == EINSUMS
     assert {path: ranks.shape for path, ranks in report.ranks.items()} == {
         "blocks": (3,), "experts": (2,), "join": (), "split": ()
     }  # fmt: skip
@@ -187,16 +185,6 @@ def test_weighted_sums_match_merged_kernels(models, combined):
     smaller, errors = lorasp_jax.fuse(combined, WEIGHTS, rank=3)
     assert smaller.experts.adapter.get_value()["lora_a"].shape == (2, 3, 3)
     assert 0 < errors["blocks"] < 1
-
-
-def test_swapping_does_not_recompile(models, combined):
-    other = trained(("conv|join|blocks", LoRA(rank=1, alpha=5)), seed=7, net=NET)
-    run = jax.jit(lambda model, x: model(x))
-    run(lorasp_jax.choose(combined, "b"), IDS[0])
-    swapped = lorasp_jax.swap(lorasp_jax.choose(combined, "b"), "b", other)
-    assert_close(run(swapped, IDS[0]), call(other, IDS[0]))
-    assert run._cache_size() == 1
-    assert_close(call(lorasp_jax.choose(swapped, "a"), IDS[0]), call(models["a"], IDS[0]))
 
 
 @pytest.mark.slow

@@ -11,12 +11,8 @@ import pytest
 from flax import nnx
 
 from benchmarks.peers import cases, openpi, ours, workloads
-from benchmarks.peers.worker import Job
 from lorasp_jax.adapters import adaptation
-
-
-def job(table, variant="none", **options):
-    return Job(table, variant, options.pop("size", "tiny"), 1, options.pop("steps", 2), False)
+from tests.test_peers import job
 
 
 def test_all_programs_get_the_same_numbers():

@@ -11,6 +11,7 @@ from flax import nnx
 import lorasp_jax
 from lorasp_jax.adapters.io.native import load_adapters, save_adapters
 from lorasp_jax.peft import LoRASP
+from tests.nets import call
 
 WIDTH, HEADS, DEPTH, VOCABULARY = 4, 2, 3, 7
 SP = LoRASP(rank=4, hidden_width=2)
@@ -120,7 +121,7 @@ def test_documented_training_loop(remat, scanned, tmp_path):
     trained = nnx.merge(graphdef, adapters, frozen, copy=True)
     save_adapters(tmp_path, trained)
     loaded = load_adapters(tmp_path, base, einsums=EINSUMS)
-    np.testing.assert_array_equal(loaded(IDS), trained(IDS))
+    np.testing.assert_array_equal(call(loaded, IDS), call(trained, IDS))
     with pytest.raises(ValueError, match=r"unsupported classes: .*layers(/0)?/[qo] \(Einsum\)"):
         load_adapters(tmp_path, base)
 

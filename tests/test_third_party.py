@@ -14,6 +14,7 @@ from lorasp_jax.adapters.io.native import load_adapters, save_adapters
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.peft import LoRA, LoRASP
 from tests import gemmas
+from tests.models.random_models import with_noise
 
 pytestmark = pytest.mark.slow
 
@@ -30,14 +31,7 @@ def gemma(request):
         pytest.importorskip("transformer", reason="flax/examples/gemma is not on the path")
     model = (gemmas.Gemma if request.param == "own" else gemmas.flax_gemma)(nnx.Rngs(0))
     graphdef, params, rest = nnx.split(model, nnx.Param, ...)
-    return nnx.merge(graphdef, perturbed(params, 0.2), rest)
-
-
-def perturbed(tree, size):
-    leaves, structure = jax.tree.flatten(tree)
-    keys = jax.random.split(jax.random.key(5), len(leaves))
-    noisy = [v + size * jax.random.normal(k, v.shape) for k, v in zip(keys, leaves, strict=True)]
-    return jax.tree.unflatten(structure, noisy)
+    return nnx.merge(graphdef, with_noise(params, 0.2), rest)
 
 
 def called(model):
@@ -94,7 +88,7 @@ def test_nnx_gemma_merges_into_its_own_parameters(gemma):
     sizes = [(16, 32), (16, 32), (32, 16), (16, 24), (16, 24), (24, 16)]
     assert adaptation.count(model).trainable == 2 * sum(2 * (i + o) for i, o in sizes)
     graphdef, adapters, frozen = adaptation.split(model)
-    model = nnx.merge(graphdef, perturbed(adapters, 0.3), frozen)
+    model = nnx.merge(graphdef, with_noise(adapters, 0.3), frozen)
     merged = lorasp_jax.merge(model)
     assert not jax.tree.leaves(nnx.state(merged, AdapterParam))
     loaded = nnx.merge(nnx.graphdef(gemma), nnx.state(merged))
@@ -106,7 +100,7 @@ def test_nnx_gemma_with_named_adapters_and_quantization(gemma):
     """The model reads sizes from its kernels, so quantized kernels must keep their shapes."""
     pour, press = (adapted(gemma, (".*", LoRA(rank=rank))) for rank in (2, 3))
     graphdef, adapters, frozen = adaptation.split(pour)
-    pour = nnx.merge(graphdef, perturbed(adapters, 0.3), frozen)
+    pour = nnx.merge(graphdef, with_noise(adapters, 0.3), frozen)
     both = lorasp_jax.combine({"pour": pour, "press": press})
     np.testing.assert_allclose(logits(both), logits(pour), rtol=1e-3, atol=1e-4)
     unmerged = lorasp_jax.unmerge(lorasp_jax.merge(pour), pour)
@@ -177,7 +171,7 @@ def test_linen_gemma_merges(linen):
     # The head shares the embedding table, so merging into it would change the head too.
     adapter = LinenAdapter(module, [("embed_tokens", None), (".*", LoRA(rank=2))])
     variables = jax.jit(adapter.attach)(jax.random.key(1), published, *arguments)
-    variables = perturbed(variables, 0.1)
+    variables = with_noise(variables, 0.1)
     merged = jax.jit(adapter.merge)(variables, *arguments)
     assert jax.tree.map(jnp.shape, merged) == jax.tree.map(jnp.shape, published)
     expected = jax.jit(adapter.apply)(variables, *arguments).logits

@@ -4,13 +4,6 @@ A rule is (pattern, method). Patterns are searched (`re.search`) in "/"-joined p
 match wins, even if its method cannot apply to that path. For example, [("vision", LoRA()),
 (".*", FullFineTuning())] leaves the vision tower's norms frozen. The method `None` skips the path.
 
-Hugging Face PEFT's options map to rules, most specific first:
-
-    rank_pattern, alpha_pattern    ("attn/q", LoRA(rank=4, alpha=32)), (".*", LoRA(rank=8))
-    modules_to_save                ("head", FullFineTuning()), (".*", LoRA())
-    bias="all"                     ("bias$", FullFineTuning()), (".*", LoRA())
-    exclude_modules                ("head", None), (".*", LoRA())
-
 The rule ("bias$", FullFineTuning()) also unfreezes the biases of adapted layers. It does not match
 the paths of the layers themselves, so another rule can adapt them.
 """
@@ -19,7 +12,7 @@ import math
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -78,10 +71,13 @@ def adapt(
     paths.check_method_rules(rules)
     nnx_layers.check_einsums(einsums)
     root, key = _wrapped_copy(model), validate.rngs(rngs).params()
-    used = _attach_all(root, rules, key, einsums, statistics) | unfreeze(root, rules)
+    used = _attach_all(root, rules, key, einsums, statistics) | _unfreeze(root, rules)
     for i, (pattern, _) in enumerate(rules):
         if i not in used:
-            raise ValueError(_no_match_message(pattern, root, einsums))
+            known = [location.path for location in paths.locate_layers(root, einsums)]
+            others = paths.locate_other_matrices(root, einsums)
+            classes = {p.path.rpartition("/")[0]: type(p.parent).__name__ for p in others}
+            raise ValueError(paths.no_match_message(pattern, known, classes))
     return root[0]
 
 
@@ -113,7 +109,7 @@ def with_dropout(model: Model, key: jax.Array) -> Model:
         key: typed PRNG key.
     """
     root, key = _wrapped_copy(model), checked_key(key)
-    for location in paths.unique(paths.locate(root, AdaptedLayer)):
+    for location in paths.locate(root, AdaptedLayer):
         layer = location.child
         if isinstance(layer.adapter, AdapterParam) and dropout_rate(layer.method):
             layer_key = jax.random.fold_in(key, zlib.crc32(location.path.encode()))
@@ -224,29 +220,25 @@ def _attach_all(
     statistics: Mapping[str, jax.Array],
 ) -> set[int]:
     """Attach adapters in place; return the indices of the rules used."""
-    used: dict[str, int] = {}
-    layers = paths.locate_layers(root, einsums)
-    for location in layers:
-        i = paths.find_rule(rules, location.path)
-        method = None if i is None else rules[i][1]
-        if i is not None and method is not None and not method.trains_base:
-            used[location.path] = i
+    used: set[int] = set()
 
     def attach_to(location: paths.Location) -> AdaptedLayer | None:
-        if location.path not in used:
+        i = paths.find_rule(rules, location.path)
+        method = None if i is None else rules[i][1]
+        if i is None or method is None or method.trains_base:
             return None
-        method = cast(Method, rules[used[location.path]][1])
+        used.add(i)
         layer_key = jax.random.fold_in(key, zlib.crc32(location.path.encode()))
         with paths.naming("adapt", location.path):
             layer = nnx_layers.make_adaptable(location.child, einsums)
             attach(layer, method, layer_key, statistics.get(location.path))
         return layer
 
-    paths.replace(layers, attach_to)
-    return set(used.values())
+    paths.replace(paths.locate_layers(root, einsums), attach_to)
+    return used
 
 
-def unfreeze(root: nnx.List[Any], rules: paths.Rules) -> set[int]:
+def _unfreeze(root: nnx.List[Any], rules: paths.Rules) -> set[int]:
     """Unfreeze base parameters in place; return the indices of the rules used."""
     used, unfrozen = set(), []
     for location in paths.locate(root, nnx.Param):
@@ -308,13 +300,6 @@ def over_stack(function: Callable[..., Any], kernel: jax.Array) -> Callable[...,
     for _ in kernel.shape[:-2]:
         function = jax.vmap(function)
     return function
-
-
-def _no_match_message(pattern: str, root: nnx.List[Any], einsums: nnx_layers.Einsums) -> str:
-    known = [location.path for location in paths.locate_layers(root, einsums)]
-    others = paths.locate_other_matrices(root, einsums)
-    classes = {p.path.rpartition("/")[0]: type(p.parent).__name__ for p in others}
-    return paths.no_match_message(pattern, known, classes)
 
 
 def _size(tree: Any) -> int:

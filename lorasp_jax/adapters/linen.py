@@ -11,7 +11,6 @@ remat, vmap) also apply to it.
 
 import dataclasses
 import functools
-import operator
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
@@ -21,19 +20,11 @@ import jax
 import jax.numpy as jnp
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from lorasp_jax.adapters import _compat
+from lorasp_jax.adapters import _compat, paths
 from lorasp_jax.adapters.adaptation import init_stack, over_stack
 from lorasp_jax.adapters.layers import nnx_layers
-from lorasp_jax.adapters.layers.einsum import to_matrices
 from lorasp_jax.adapters.layers.linen_layers import layer_call, supported_class, with_lora
 from lorasp_jax.adapters.layers.nnx_layers import Einsums
-from lorasp_jax.adapters.paths import (
-    Rules,
-    check_method_rules,
-    find_rule,
-    naming,
-    no_match_message,
-)
 from lorasp_jax.dense import AUX_NAME, validate
 from lorasp_jax.peft import Method
 from lorasp_jax.peft.fields import checked_key
@@ -66,11 +57,11 @@ class LinenAdapter:
     """
 
     model: nn.Module
-    rules: Rules
+    rules: paths.Rules
     einsums: Einsums = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        check_method_rules(self.rules)
+        paths.check_method_rules(self.rules)
         nnx_layers.check_einsums(self.einsums)
 
     def init(self, key: Any, *args: Any, **kwargs: Any) -> dict[str, Any]:
@@ -110,7 +101,7 @@ class LinenAdapter:
         base, trained = self._partition(flatten_dict(params), record)
         for i, (pattern, _) in enumerate(self.rules):
             if i not in record.used:
-                raise ValueError(no_match_message(pattern, record.layers, record.others))
+                raise ValueError(paths.no_match_message(pattern, record.layers, record.others))
         trained = flatten_dict(variables.get("adapters", {})) | trained
         return {**variables, "params": unflatten_dict(base), "adapters": unflatten_dict(trained)}
 
@@ -176,37 +167,13 @@ class LinenAdapter:
             _, changed = _apply(self.model, variables, *args, mutable=True, **kwargs)
         return flax.core.unfreeze(changed["params"])
 
-    def kernel_shapes(
-        self, variables: Mapping[str, Any], *args: Any, **kwargs: Any
-    ) -> dict[str, tuple[int, ...]]:
-        """Kernel shapes `[..., *batch, I, O]` of dense layers and einsums, by path.
-
-        The arguments are those of the bare model, which is called once to find its layers.
-        """
-        shapes: dict[str, tuple[int, ...]] = {}
-
-        def visit(module: nn.Module, args: Any, kwargs: Any) -> None:
-            if not self._supported_class(module):
-                return
-            layer = layer_call(module, self.einsums, args, kwargs)
-            if layer.equation is None:
-                return
-            params = functools.reduce(operator.getitem, module.path, variables["params"])
-            kernel = nn.meta.unbox(params[layer.name])  # with the axes of a scanned stack
-            shaped = jax.ShapeDtypeStruct(kernel.shape, kernel.dtype)
-            matrices = functools.partial(to_matrices, layer.equation)
-            shapes["/".join(module.path)] = jax.eval_shape(matrices, shaped).shape
-
-        self._visit_layers(visit, validate.variables(variables), *args, **kwargs)
-        return shapes
-
     def _supported_class(self, module: nn.Module) -> type[nn.Module] | None:
         """`supported_class`, or None if the module does not belong to the model."""
         return supported_class(module, self.einsums) if _is_model_module(module) else None
 
     def _rule(self, module: nn.Module) -> tuple[int, Method] | None:
         """Index and method of the rule that adapts the layer, or None."""
-        i = find_rule(self.rules, "/".join(module.path))
+        i = paths.find_rule(self.rules, "/".join(module.path))
         method = None if i is None else self.rules[i][1]
         return None if i is None or method is None or method.trains_base else (i, method)
 
@@ -223,7 +190,7 @@ class LinenAdapter:
         if rule is None or module.has_variable("params", ADAPTER):
             return
         i, method = rule
-        with naming("adapt", path):
+        with paths.naming("adapt", path):
             layer = layer_call(module, self.einsums, args, kwargs)
             init, key = layer.adapter_init(method), module.make_rng("params")
             params, rest = init_stack(key, init, layer.matrices())
@@ -240,7 +207,7 @@ class LinenAdapter:
             return
         layer = layer_call(module, self.einsums, args, kwargs)
         matrices = layer.matrices()
-        with naming("merge", "/".join(module.path)):
+        with paths.naming("merge", "/".join(module.path)):
             merged = over_stack(rule[1].merge, matrices)(flax.core.unfreeze(params), matrices)
         layer.set_matrices(merged)
         module.put_variable("params", ADAPTER, None)  # a layer called twice is merged once
@@ -251,7 +218,7 @@ class LinenAdapter:
         for path, value in params.items():
             i = None
             if ADAPTER not in path:
-                i = find_rule(self.rules, "/".join(path[:-1]), "/".join(path))
+                i = paths.find_rule(self.rules, "/".join(path[:-1]), "/".join(path))
             method = None if i is None else self.rules[i][1]
             if i is not None and (method is None or method.trains_base):
                 record.used.add(i)

@@ -31,14 +31,12 @@ def locate(root: nnx.List[Any], kind: type | tuple[type, ...]) -> list[Location]
 
     `root` is `nnx.List([model])`; paths are relative to the model.
     """
-
-    def walk() -> Iterator[Location]:
-        for path, module in nnx.iter_modules(root):
-            for name, child in vars(module).items():
-                if isinstance(child, kind):
-                    yield Location("/".join(map(str, (*path, name)[1:])), module, name, child)
-
-    return list(walk())
+    return [
+        Location("/".join(map(str, (*path, name)[1:])), module, name, child)
+        for path, module in nnx.iter_modules(root)
+        for name, child in vars(module).items()
+        if isinstance(child, kind)
+    ]
 
 
 @contextlib.contextmanager
@@ -48,11 +46,6 @@ def naming(doing: str, where: object) -> Iterator[None]:
         yield
     except (ValueError, TypeError, OverflowError) as error:
         raise ValueError(f"cannot {doing} {where or 'the model'}: {error}") from error
-
-
-def unique(locations: list[Location]) -> list[Location]:
-    """Keep only the first location of each shared child."""
-    return list({id(location.child): location for location in reversed(locations)}.values())[::-1]
 
 
 def set_child(location: Location, child: Any) -> None:

@@ -144,14 +144,14 @@ def auxiliary_loss(model: nnx.Module | Mapping[str, Any]) -> jax.Array:
     `AuxiliaryConfig`; the losses of the parameters alone (`penalties`) are included for NNX.
 
     Args:
-      model: as for `collect_aux`, in the same traced function; an NNX model's stored aux is
-        removed.
+        model: as for `collect_aux`, in the same traced function; an NNX model's stored aux is
+            removed.
 
     Returns:
-      f32 scalar; 0 if no method has auxiliary losses, as with LoRA.
+        f32 scalar; 0 if no method has auxiliary losses, as with LoRA.
 
     Raises:
-      ValueError: no adapted layer stored any aux; full fine-tuning alone stores none.
+        ValueError: no adapted layer stored any aux; full fine-tuning alone stores none.
     """
     losses = auxiliary_losses(collect_aux(model))
     if isinstance(model, nnx.Module):

@@ -42,21 +42,21 @@ def dense(
     """x @ kernel + bias, with an optional adapter.
 
     Args:
-      x: [...tokens, I].
-      kernel: [I, *O]. Several output axes are flattened into one for the adapter.
-      bias: broadcastable to [*O], or None.
-      params: the adapter's parameters for the kernel as a matrix [I, O], or None.
-      method: the adapter's method, given together with `params`. A method that trains the base
-        weights takes no `params`.
-      dropout_key: key for the adapter's dropout; None disables dropout.
-      token_mask: bool [...tokens]; False marks padding, excluded from losses and statistics.
+        x: [...tokens, I].
+        kernel: [I, *O]. Several output axes are flattened into one for the adapter.
+        bias: broadcastable to [*O], or None.
+        params: the adapter's parameters for the kernel as a matrix [I, O], or None.
+        method: the adapter's method, given together with `params`. A method that trains the base
+            weights takes no `params`.
+        dropout_key: key for the adapter's dropout; None disables dropout.
+        token_mask: bool [...tokens]; False marks padding, excluded from losses and statistics.
 
     Returns:
-      y [...tokens, *O] in the dtype of x, and the adapter's aux.
+        y [...tokens, *O] in the dtype of x, and the adapter's aux.
 
     Raises:
-      ValueError: x is not floating point, the shapes do not match, or `params` and `method` do not
-        go together.
+        ValueError: x is not floating point, the shapes do not match, or `params` and `method` do
+            not go together.
     """
     layer = DenseLayer(kernel, bias, params, method, dropout_key)
     validate.layer(layer)

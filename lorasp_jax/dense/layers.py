@@ -49,12 +49,12 @@ class AdaptedLayer(nnx.Module):
     """A layer that can have an adapter: the interface used by adaptation, summaries and file I/O.
 
     Attributes:
-      kernel_name: attribute name of the layer's kernel.
-      adapter: `AdapterParam` holding the method's parameters, or None.
-      method: the adapter's method, static.
-      stored_aux: aux of the last call. The attribute is absent before the first call, so that it is
-        not part of the layer's graph structure.
-      stored_dropout_key: the key set by `with_dropout`; absent otherwise.
+        kernel_name: attribute name of the layer's kernel.
+        adapter: `AdapterParam` holding the method's parameters, or None.
+        method: the adapter's method, static.
+        stored_aux: aux of the last call. The attribute is absent before the first call, so that it
+            is not part of the layer's graph structure.
+        stored_dropout_key: the key set by `with_dropout`; absent otherwise.
     """
 
     kernel_name: str = "kernel"
@@ -91,7 +91,7 @@ class AdaptedLayer(nnx.Module):
         """Return the initializer (key, kernel [I, O]) -> (params, kernel or residual).
 
         Raises:
-          ValueError: this kind of layer does not support the method.
+            ValueError: this kind of layer does not support the method.
         """
         return method.init
 
@@ -126,11 +126,9 @@ class Dense(AdaptedLayer):
     """A dense layer with an optional adapter, a drop-in for `nnx.Linear`.
 
     Attributes:
-      kernel: [I, O] (an `AdapterParam` under full fine-tuning). In a model that scans over its
-        layers, kernel and adapter have leading layer axes.
-      bias: [O] or None.
-      adapter: `AdapterParam` holding the method's parameters, or None.
-      method: the adapter's method, static.
+        kernel: [I, O] (an `AdapterParam` under full fine-tuning). In a model that scans over its
+            layers, kernel and adapter have leading layer axes.
+        bias: [O] or None.
     """
 
     def __init__(
@@ -148,17 +146,17 @@ class Dense(AdaptedLayer):
         """Initialize the weights.
 
         Args:
-          d_in: I.
-          d_out: O.
-          use_bias: whether to add a bias, initially zero.
-          method: adapter method, or None.
-          dtype: compute dtype; None promotes the dtypes of input and kernel.
-          param_dtype: dtype of kernel and bias; adapters are always fp32.
-          kernel_init: initializer of the kernel.
-          rngs: source of the random keys.
+            d_in: I.
+            d_out: O.
+            use_bias: whether to add a bias, initially zero.
+            method: adapter method, or None.
+            dtype: compute dtype; None promotes the dtypes of input and kernel.
+            param_dtype: dtype of kernel and bias; adapters are always fp32.
+            kernel_init: initializer of the kernel.
+            rngs: source of the random keys.
 
         Raises:
-          ValueError: an invalid width, method, dtype or rngs.
+            ValueError: an invalid width, method, dtype or rngs.
         """
         d_in, d_out = validate.size("d_in", d_in), validate.size("d_out", d_out)
         validate.method(method)
@@ -201,7 +199,7 @@ class Dense(AdaptedLayer):
         """The layer's arguments for `dense` and `dense_shared_input`.
 
         Raises:
-          ValueError: the adapter's parameters, which a caller may replace, do not fit its method.
+            ValueError: the adapter's parameters, which a caller may replace, do not fit its method.
         """
         kernel, bias = self.kernel.get_value(), None if self.bias is None else self.bias.get_value()
         params = None if self.adapter is None else self.adapter.get_value()

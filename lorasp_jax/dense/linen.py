@@ -22,12 +22,12 @@ class LinenDense(nn.Module):
     there for `collect_aux`. Passing an rng for "dropout" enables the method's dropout.
 
     Attributes:
-      features: O.
-      use_bias: whether to add a bias.
-      method: adapter method, or None.
-      dtype: compute dtype; None promotes the dtypes of input and kernel.
-      param_dtype: dtype of kernel and bias; adapters are always fp32.
-      kernel_init: initializer of the kernel.
+        features: O.
+        use_bias: whether to add a bias.
+        method: adapter method, or None.
+        dtype: compute dtype; None promotes the dtypes of input and kernel.
+        param_dtype: dtype of kernel and bias; adapters are always fp32.
+        kernel_init: initializer of the kernel.
     """
 
     features: int

@@ -24,8 +24,6 @@ class Launch(NamedTuple):
     of keys in cached attention."""
     keys: int = 0
     """Keys per matmul in attention, a power of two, at least 16."""
-    stages: int = 1
-    """Stages of the software pipeline over blocks."""
 
 
 def load(ref: Any, at: tuple[Any, ...], exist: jax.Array | None) -> jax.Array:

@@ -122,7 +122,7 @@ def _call(
         functools.partial(_kernel, launch, size),
         grid=(pl.cdiv(rows, launch.rows), size.kv_heads * size.splits, batch),
         out_shape=[jax.ShapeDtypeStruct(s, jnp.float32) for s in ((*shape, dim), shape, shape)],
-        compiler_params=triton.CompilerParams(num_warps=launch.warps, num_stages=launch.stages),
+        compiler_params=triton.CompilerParams(num_warps=launch.warps, num_stages=1),
         interpret=interpret,
         name="cached_attention",
     )(*arrays)

@@ -6,11 +6,10 @@ For scores s >= 0, let E_k be the fraction of the energy Σ s² in the k largest
 - "sort": sort the scores, accumulate energy, threshold. The reference; in rare cases, rounding of
   its cumulative sum changes whether η is reached.
 - "bisection": binary search for the threshold, one bit per step, without a sort.
-- "block": bisection that stops early, for the few rows in a block of a kernel.
-- "pallas": "block" as a Triton kernel, one row per warp, scores in registers.
+- "pallas": bisection that stops early, as a Triton kernel, one row per warp, scores in registers.
 
-"sort", "block" and "pallas" find each row's `Boundary`, the last kept (score, index). Comparing the
-scores with it gives the mask.
+"sort" and "pallas" find each row's `Boundary`, the last kept (score, index). Comparing the scores
+with it gives the mask. `kept_flags` is "pallas" for a block of rows inside another kernel.
 
 η is the decimal as written, so 0.9 means 9/10. E_k >= 9/10 is tested as 10 Σ_k >= 9 Σ, where Σ_k is
 the kept and Σ the total energy. Rows that reach η exactly thus do not depend on its rounding.
@@ -25,7 +24,7 @@ All implementations agree at the limits of fp32:
 import decimal
 import fractions
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
 import jax
@@ -43,7 +42,7 @@ from lorasp_jax.kernels.threshold_search import (
     float_bits,
 )
 
-Implementation = Literal["sort", "bisection", "block", "pallas"]
+Implementation = Literal["sort", "bisection", "pallas"]
 
 MIN_TARGET = 2.0**-64
 """A smaller η could underflow in fp32 and is raised to this value. Both keep one direction, because
@@ -54,7 +53,7 @@ def exact_ratio(energy_target: float) -> Ratio:
     """Convert η to an exact ratio, interpreting it as a decimal.
 
     Raises:
-      ValueError: η is not a number in (0, 1].
+        ValueError: η is not a number in (0, 1].
     """
     try:
         ratio = fractions.Fraction(decimal.Decimal(str(energy_target)))
@@ -80,24 +79,35 @@ def energy_gate(
     zeros keeps nothing and has `kept_energy` 1. η = 1 keeps every positive score.
 
     Args:
-      scores: [..., R], non-negative, cast to fp32. For negative scores the magnitude is used.
-      energy_target: η in (0, 1], a Python number, interpreted as an exact decimal.
-      implementation: see the module docstring; None for `default_implementation()`.
-      interpret: run "pallas" without a GPU, slowly.
+        scores: [..., R], non-negative, cast to fp32. For negative scores the magnitude is used.
+        energy_target: η in (0, 1], a Python number, interpreted as an exact decimal.
+        implementation: see the module docstring; None for `default_implementation()`.
+        interpret: run "pallas" without a GPU, slowly.
 
     Returns:
-      mask bool [..., R], active_rank f32 [...] = k, kept_energy f32 [...] = E_k.
+        mask bool [..., R], active_rank f32 [...] = k, kept_energy f32 [...] = E_k.
 
     Raises:
-      ValueError: η outside (0, 1] or an unknown implementation.
+        ValueError: η outside (0, 1] or an unknown implementation.
     """
     ratio = exact_ratio(energy_target)
     name = implementation or default_implementation()
-    compute_mask = _mask_function(name, interpret)
+    if name not in get_args(Implementation):
+        valid = ", ".join(get_args(Implementation))
+        raise ValueError(f"implementation must be one of {valid}, got {name!r}")
     scores = scores.astype(jnp.float32)
     constant = jnp.abs(jax.lax.stop_gradient(scores))  # also clears the sign bit of -0
-    keep_all = ratio.numerator == ratio.denominator
-    mask = positive(constant) if keep_all else compute_mask(constant, ratio)
+    if ratio.numerator == ratio.denominator:
+        mask = positive(constant)
+    elif name == "bisection":
+        mask = bisected_mask(constant, ratio)
+    else:
+        # Without the barrier, XLA may compute the scores twice, for the boundary and for the
+        # comparison with it, and round them differently. A kernel computes them once.
+        constant = jax.lax.optimization_barrier(constant)
+        pallas = functools.partial(_pallas_boundary, interpret=interpret)
+        boundary = _sorted_boundary if name == "sort" else pallas
+        mask = kept_mask(constant, boundary(constant, ratio))
     return mask, mask.sum(-1).astype(jnp.float32), kept_energy(scores, mask)
 
 
@@ -114,10 +124,10 @@ def kept_flags(scores: jax.Array, energy_target: float) -> jax.Array:
     """
     ratio, constant = exact_ratio(energy_target), jax.lax.stop_gradient(scores)
     keep_all = ratio.numerator == ratio.denominator
-    return _positive_flags(constant) if keep_all else _block_flags(constant, ratio)
+    return _positive_flags(constant) if keep_all else _boundary_flags(constant, ratio)
 
 
-def _block_flags(scores: jax.Array, ratio: Ratio) -> jax.Array:
+def _boundary_flags(scores: jax.Array, ratio: Ratio) -> jax.Array:
     """Compare with the boundary of `block_boundary`: the sign bit of a difference is the flag."""
     last = block_boundary(scores, ratio)
     position = jax.lax.broadcasted_iota(jnp.int32, scores.shape, scores.ndim - 1)
@@ -131,32 +141,6 @@ def _positive_flags(scores: jax.Array) -> jax.Array:
     """`positive` as int32."""
     keeps_any = (scores.sum(-1, keepdims=True) > 0).astype(jnp.int32)
     return jax.lax.shift_right_logical(-float_bits(scores), 31) & keeps_any
-
-
-def _mask_function(implementation: str, interpret: bool) -> Callable[[jax.Array, Ratio], jax.Array]:
-    """Return the function that maps scores [..., R] and η to the mask."""
-    masks = {
-        "bisection": bisected_mask,
-        "block": lambda scores, ratio: _block_flags(scores, ratio) != 0,
-    }
-    boundaries = {
-        "sort": _sorted_boundary,
-        "pallas": functools.partial(_pallas_boundary, interpret=interpret),
-    }
-    if implementation in masks:
-        return masks[implementation]
-    if implementation not in boundaries:
-        valid = ", ".join(get_args(Implementation))
-        raise ValueError(f"implementation must be one of {valid}, got {implementation!r}")
-    boundary = boundaries[implementation]
-
-    def compute_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
-        # Without the barrier, XLA may compute the scores twice, for the boundary and for the
-        # comparison with it, and round them differently. A kernel computes them once.
-        scores = jax.lax.optimization_barrier(scores)
-        return kept_mask(scores, boundary(scores, ratio))
-
-    return compute_mask
 
 
 def positive(scores: jax.Array) -> jax.Array:

@@ -115,11 +115,11 @@ def low_rank_matmul(
     """Return (x W + z U, aux) of each layer, where z, aux = f(params, x P, token_mask).
 
     Args:
-      f: computes z of all layers.
-      rows_dtype: dtype of x P, which is accumulated in fp32.
-      layers: the arrays of each layer.
-      x: [..., I]; the outputs have its dtype.
-      token_mask: bool [...tokens] or None, passed to f.
+        f: computes z of all layers.
+        rows_dtype: dtype of x P, which is accumulated in fp32.
+        layers: the arrays of each layer.
+        x: [..., I]; the outputs have its dtype.
+        token_mask: bool [...tokens] or None, passed to f.
     """
     projected = jnp.matmul(x, _concat_downs(layers, x.dtype), preferred_element_type=rows_dtype)
     params = [layer.params for layer in layers]
@@ -204,11 +204,8 @@ def _input_gradient(
     q: jax.Array,
 ) -> jax.Array:
     """Compute Σ g Wᵀ + q Pᵀ, [..., I]; `base_input_grads` holds each g Wᵀ if already computed."""
-    p, kernels, d_in = (
-        _concat_downs(layers, x.dtype),
-        [layer.kernel for layer in layers],
-        x.shape[-1],
-    )
+    p, kernels = _concat_downs(layers, x.dtype), [layer.kernel for layer in layers]
+    d_in = x.shape[-1]
     is_narrow = sum(g.shape[-1] for g in gradients) <= d_in
     pairs = list(zip(gradients, kernels, strict=True))
     if is_narrow and all(_should_concat(kernel, g, d_in) for g, kernel in pairs):

@@ -25,9 +25,7 @@ class PackedTree:
 
     @classmethod
     def of(cls, tree: Any, axes: int = 0) -> "PackedTree":
-        """Pack a tree whose leaves share `axes` leading axes; a packed tree is returned as is."""
-        if isinstance(tree, cls):
-            return tree
+        """Pack a tree whose leaves share `axes` leading axes."""
         leaves, structure = jax.tree.flatten(tree)
         flat = [leaf.reshape(*leaf.shape[:axes], -1) for leaf in leaves]
         shapes = tuple(leaf.shape[axes:] for leaf in leaves)

@@ -25,13 +25,13 @@ def by_rows(kernel: Kernel, shared: Arrays, arrays: Arrays) -> tuple[Arrays, Arr
     Under `jax.vmap`, every device processes all rows. No gradient is defined.
 
     Args:
-      kernel: (shared, arrays) -> (outputs, sums). Row i of the outputs depends only on row i of the
-        arrays. The sums of all devices are added up.
-      shared: replicated arrays of any shape.
-      arrays: each [T, ...], sharded over T.
+        kernel: (shared, arrays) -> (outputs, sums). Row i of the outputs depends only on row i of
+            the arrays. The sums of all devices are added up.
+        shared: replicated arrays of any shape.
+        arrays: each [T, ...], sharded over T.
 
     Returns:
-      outputs, each [T, ...] and sharded like the arrays; and sums of any shape.
+        outputs, each [T, ...] and sharded like the arrays; and sums of any shape.
     """
     num_shared = len(shared)
 

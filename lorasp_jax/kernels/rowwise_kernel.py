@@ -60,7 +60,7 @@ Body = Callable[..., tuple[list[Columns], Any]]
 
 def rowwise_kernel(
     function: Function,
-    shared: Any,
+    shared: PackedTree,
     rows: jax.Array,
     widths: Widths,
     valid: jax.Array,
@@ -68,40 +68,32 @@ def rowwise_kernel(
     start: int = 0,
     interpret: bool = False,
 ) -> tuple[jax.Array, Any, Columns]:
-    """Apply `function` to all rows in one kernel; its gradient is another kernel.
-
-    If `shared` stacks n trees, the kernel applies n functions, each to its own columns of `rows`.
+    """Apply n functions to all rows, each to its own columns, in one kernel; gradients in another.
 
     Args:
-      function: (shared, columns, valid, mask) -> (output, sums, mask, statistics), on a block of b
-        rows. Triton requires dimensions to be powers of two, and at least 16 in a matmul.
-        columns: list of [b, width].
-        valid: bool [b, 1].
-        mask: int32 [b, K] of 0 and 1, K >= 8. The forward pass passes None, and the function
-          computes the mask. The backward pass passes this mask as a constant.
-        output: [b, O].
-        sums: pytree of fp32 arrays, summed over blocks.
-        statistics: list of [b, 1], without gradient.
-      shared: small fp32 arrays used by every row: a pytree, a `PackedTree`, or a `PackedTree` that
-        stacks n trees.
-      rows: [T, at least start + n * sum(widths)].
-      widths: widths of the column groups of one function.
-      valid: bool [T, 1], passed to `function`.
-      start: first column of `rows` to use.
-      interpret: run without a GPU, slowly.
+        function: (shared, columns, valid, mask) -> (output, sums, mask, statistics), on a block of
+            b rows. Triton requires dimensions to be powers of two, and at least 16 in a matmul.
+            columns: list of [b, width].
+            valid: bool [b, 1].
+            mask: int32 [b, K] of 0 and 1, K >= 8. The forward pass passes None, and the function
+                computes the mask. The backward pass passes this mask as a constant.
+            output: [b, O].
+            sums: pytree of fp32 arrays, summed over blocks.
+            statistics: list of [b, 1], without gradient.
+        shared: small fp32 arrays used by every row, a tree for each function, stacked.
+        rows: [T, at least start + n * sum(widths)].
+        widths: widths of the column groups of one function.
+        valid: bool [T, 1], passed to `function`.
+        start: first column of `rows` to use.
+        interpret: run without a GPU, slowly.
 
     Returns:
-      output [T, O], sums, and the list of statistics, [T, 1] each. For n stacked trees: output
-      [T, n O], sums with a leading axis n, statistics [T, n]. Output and sums are differentiable in
-      `shared` and `rows`.
+        Output [T, n O], sums with a leading axis n, and the list of statistics, [T, n] each. Output
+        and sums are differentiable in `shared` and `rows`.
     """
     launches = (FEW, FEW) if len(rows) <= FEW_ROWS else (FORWARD, BACKWARD)
-    packed, valid = PackedTree.of(shared), valid.astype(jnp.int8)
-    single = packed.values.ndim == 1  # one function: treat it as a stack of one
-    packed = dataclasses.replace(packed, values=jnp.atleast_2d(packed.values))
-    results: Any = _rowwise((function, widths, start, launches, interpret), packed, rows, valid)
-    output, sums, statistics = results
-    return output, jax.tree.map(lambda leaf: leaf[0], sums) if single else sums, statistics
+    static = function, widths, start, launches, interpret
+    return _rowwise(static, shared, rows, valid.astype(jnp.int8))
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))

@@ -144,7 +144,7 @@ def _call(
             functools.partial(kernel, launch),
             grid=(*grid, batch),
             out_shape=[jax.ShapeDtypeStruct((batch, *shape[1:]), dtype) for shape, dtype in like],
-            compiler_params=triton.CompilerParams(num_warps=launch.warps, num_stages=launch.stages),
+            compiler_params=triton.CompilerParams(num_warps=launch.warps, num_stages=1),
             interpret=static.interpret,
             name=f"short_attention{kernel.__name__.removesuffix('_kernel')}",
         )(*arrays)

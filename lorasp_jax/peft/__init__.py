@@ -61,7 +61,7 @@ def find(name: str) -> type[Method]:
     """Return the method class defined in the module `name`.
 
     Raises:
-      ValueError: unknown method; the message lists the valid names.
+        ValueError: unknown method; the message lists the valid names.
     """
     classes = _classes()
     if name not in classes:
@@ -76,7 +76,7 @@ def create(name: str, **fields: Any) -> Method:
     """Create a method by name, such as "lora", "lora_sp" or "full".
 
     Raises:
-      ValueError: unknown method, unknown field or invalid value.
+        ValueError: unknown method, unknown field or invalid value.
     """
     return find(name)(**fields)
 
@@ -85,7 +85,7 @@ def from_settings(settings: Any) -> Method:
     """Create a method from settings written by `to_settings`.
 
     Raises:
-      ValueError: `settings` does not name a method, or `create` rejects it.
+        ValueError: `settings` does not name a method, or `create` rejects it.
     """
     if not isinstance(settings, dict) or not isinstance(settings.get("method"), str):
         raise ValueError(f"adapter settings must name a method, got {short(settings)}")

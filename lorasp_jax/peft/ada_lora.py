@@ -39,7 +39,7 @@ class AdaLoRA(Method):
     zeroes its entry of lora_e. Until the last allocation, a pruned triplet can return.
 
     Raises:
-      ValueError: an invalid rank, interval, fraction or decay.
+        ValueError: an invalid rank, interval, fraction or decay.
     """
 
     rank: int = 128
@@ -123,7 +123,7 @@ class AdaLoRA(Method):
     def penalty(self, params: Params) -> dict[str, jax.Array]:
         """Eq. (4) as in PEFT: the mean of ‖AᵀA − I‖ and ‖BBᵀ − I‖, Frobenius norms, not squared."""
         a, b = params["lora_a"], params["lora_b"]
-        norms = [_norm(gram - jnp.eye(len(gram))) for gram in (a.T @ a, b @ b.T)]
+        norms = [optax.safe_norm(gram - jnp.eye(len(gram)), 0) for gram in (a.T @ a, b @ b.T)]
         return {"orthogonality": (norms[0] + norms[1]) / 2}
 
     def transform(
@@ -136,12 +136,12 @@ class AdaLoRA(Method):
         computed from the updated parameters.
 
         Args:
-          optimizer: for any parameter tree that includes AdaLoRA parameters.
-          total_steps: number of training steps.
+            optimizer: for any parameter tree that includes AdaLoRA parameters.
+            total_steps: number of training steps.
 
         Raises:
-          ValueError: no steps remain between warm-up and final phase. The wrapped optimizer's
-            `init` also raises it, for a tree without AdaLoRA parameters.
+            ValueError: no steps remain between warm-up and final phase. The wrapped optimizer's
+                `init` also raises it, for a tree without AdaLoRA parameters.
         """
         positive_int("total_steps", total_steps)
         begin, end = round(self.warmup * total_steps), total_steps - round(self.final * total_steps)
@@ -217,12 +217,6 @@ def _allocate(
     pairs = zip(_keep(scores, num_pruned), state.kept, strict=True)
     kept = [jnp.where(allocate, new, old) for new, old in pairs]
     return kept, [(allocate | (step > end)) & ~keep for keep in kept]
-
-
-def _norm(matrix: jax.Array) -> jax.Array:
-    """Frobenius norm, with gradient 0 for a zero matrix."""
-    total = jnp.square(matrix).sum()
-    return jnp.where(total > 0, jnp.sqrt(jnp.where(total > 0, total, 1.0)), 0.0)
 
 
 def _is_triplets(node: Any) -> bool:

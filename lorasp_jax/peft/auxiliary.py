@@ -25,14 +25,14 @@ class Aux:
     """Auxiliary outputs of an adapted layer.
 
     Attributes:
-      active_rank: f32 [...tokens], number of active directions; None if the method has no rank.
-      kept_energy: f32 [...tokens], the active directions' fraction of the score energy: E_k of
-        eq. (12) of the LoRA-SP paper. None for methods without an energy gate.
-      losses: f32 [] by name, or [L] for stacked layers, averaged over the valid tokens.
-      token_mask: bool [...tokens], True for valid tokens; None if all are valid.
-      usage: f32 [R], number of valid tokens that use each direction; None without an energy gate.
-      statistics: sums over valid tokens, by layer path; empty except during calibration
-        (`lorasp_jax.adapters.compress.calibration`).
+        active_rank: f32 [...tokens], number of active directions; None if the method has no rank.
+        kept_energy: f32 [...tokens], the active directions' fraction of the score energy: E_k of
+            eq. (12) of the LoRA-SP paper. None for methods without an energy gate.
+        losses: f32 [] by name, or [L] for stacked layers, averaged over the valid tokens.
+        token_mask: bool [...tokens], True for valid tokens; None if all are valid.
+        usage: f32 [R], number of valid tokens that use each direction; None without an energy gate.
+        statistics: sums over valid tokens, by layer path; empty except during calibration
+            (`lorasp_jax.adapters.compress.calibration`).
     """
 
     active_rank: jax.Array | None = None
@@ -62,11 +62,11 @@ def auxiliary_losses(aux: Any) -> dict[str, jax.Array]:
     The means are f32 [], by name, over the layers that have the loss.
 
     Args:
-      aux: any tree of `Aux`, such as the result of `collect_aux`. An `Aux` stacked by a scan counts
-        once per layer.
+        aux: any tree of `Aux`, such as the result of `collect_aux`. An `Aux` stacked by a scan
+            counts once per layer.
 
     Raises:
-      ValueError: a leaf of the tree is not an `Aux`.
+        ValueError: a leaf of the tree is not an `Aux`.
     """
     layers = jax.tree.leaves(aux, is_leaf=lambda node: isinstance(node, Aux))
     if invalid := [layer for layer in layers if not isinstance(layer, Aux)]:

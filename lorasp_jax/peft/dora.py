@@ -27,7 +27,7 @@ class DoRA(LoRA):
     Parameters: lora_a [I, R], lora_b [R, O], magnitude [O]: (I + O) R + O in total.
 
     Raises:
-      ValueError: a rank below 1, an unknown initialization, or a dropout outside [0, 1).
+        ValueError: a rank below 1, an unknown initialization, or a dropout outside [0, 1).
     """
 
     additive: ClassVar[bool] = False
@@ -41,7 +41,7 @@ class DoRA(LoRA):
         See `Method.init` for the arguments and results.
 
         Raises:
-          ValueError: the kernel has no values, or `LoRA.init` rejects an argument.
+            ValueError: the kernel has no values, or `LoRA.init` rejects an argument.
         """
         if isinstance(kernel, jax.ShapeDtypeStruct):
             raise ValueError(

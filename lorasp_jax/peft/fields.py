@@ -17,30 +17,31 @@ MAX_INT = 2**31 - 1
 """Default upper bound for integers: the int32 maximum."""
 
 
-def check_fields(owner: Any, prefix: str = "") -> None:
+def check_fields(owner: Any, prefix: str = "", maximum: int = MAX_INT) -> None:
     """Check field values against their annotations.
 
     An int is a valid float; a bool is neither.
 
     Args:
-      owner: a dataclass instance. Only annotations that are classes, unions, `Literal` or
-        homogeneous tuples are checked.
-      prefix: prefix of field names in messages, such as "optim.".
+        owner: a dataclass instance. Only annotations that are classes, unions, `Literal` or
+            homogeneous tuples are checked.
+        prefix: prefix of field names in messages, such as "optim.".
+        maximum: bound on the magnitude of integers whose field's metadata has no "max".
 
     Raises:
-      ValueError: a value has the wrong type, a number is not finite in fp32, or an integer's
-        magnitude exceeds the "max" in its field's metadata (default `MAX_INT`).
+        ValueError: a value has the wrong type, a number is not finite in fp32, or an integer is
+            too large.
     """
     fields = dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ()
-    maximum = {field.name: field.metadata.get("max", MAX_INT) for field in fields}
+    bounds = {field.name: field.metadata.get("max", maximum) for field in fields}
     for name, kind in typing.get_type_hints(type(owner)).items():
         if typing.get_origin(kind) is typing.ClassVar:
             continue
         value = getattr(owner, name)
         if not _fits(value, kind):
             raise ValueError(f"{prefix}{name} must be {_describe(kind)}, got {short(value)}")
-        if type(value) is int and abs(value) > maximum[name]:
-            bound = f"at most {maximum[name]}" if value > 0 else f"at least -{maximum[name]}"
+        if type(value) is int and abs(value) > bounds[name]:
+            bound = f"at most {bounds[name]}" if value > 0 else f"at least -{bounds[name]}"
             raise ValueError(f"{prefix}{name} must be {bound}, got {value}")
 
 

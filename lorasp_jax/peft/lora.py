@@ -14,8 +14,6 @@ from lorasp_jax.peft.auxiliary import Aux
 from lorasp_jax.peft.fields import check_kernel
 from lorasp_jax.peft.method import Kernel, Method, Params, kaiming_uniform
 
-_SPLIT_INITIALIZATIONS = ("pissa", "olora")
-
 
 @dataclasses.dataclass(frozen=True)
 class LoRA(Method):
@@ -24,7 +22,7 @@ class LoRA(Method):
     Parameters: lora_a [I, R], lora_b [R, O]: (I + O) R in total.
 
     Raises:
-      ValueError: a rank below 1, an unknown initialization, or a dropout outside [0, 1).
+        ValueError: a rank below 1, an unknown initialization, or a dropout outside [0, 1).
     """
 
     rank: int = 128
@@ -55,7 +53,7 @@ class LoRA(Method):
     @property
     def splits_kernel(self) -> bool:
         """True if the initial A B is split off the kernel."""
-        return self.initialization in _SPLIT_INITIALIZATIONS
+        return self.initialization in ("pissa", "olora")
 
     @property
     def needs_statistics(self) -> bool:
@@ -76,9 +74,9 @@ class LoRA(Method):
         See `Method.init` for the arguments and results.
 
         Raises:
-          ValueError: `Method.init` rejects an argument. For "pissa" and "olora": the kernel has no
-            values, or R > min(I, O). For "eva": statistics are missing or have the wrong shape, or
-            R > I.
+            ValueError: `Method.init` rejects an argument. For "pissa" and "olora": the kernel has
+                no values, or R > min(I, O). For "eva": statistics are missing or have the wrong
+                shape, or R > I.
         """
         if self.needs_statistics:
             check_kernel(kernel)
@@ -93,10 +91,13 @@ class LoRA(Method):
                 f"initialization {self.initialization!r} needs the kernel's values and a rank of "
                 f"at most min(I, O), got rank {self.rank} and {given} {list(kernel.shape)}"
             )
-        split = principal_part if self.initialization == "pissa" else orthogonal_part
-        a, b = split(kernel.astype(jnp.float32), self.rank, self.scale)
-        params = {"lora_a": a, "lora_b": b}
-        return params, (kernel.astype(jnp.float32) - self.scale * (a @ b)).astype(kernel.dtype)
+        exact = kernel.astype(jnp.float32)
+        if self.initialization == "pissa":
+            a, b = principal_part(exact, self.rank, self.scale)
+        else:
+            a, b = orthogonal_part(exact, self.rank)
+        residual = (exact - self.scale * (a @ b)).astype(kernel.dtype)
+        return {"lora_a": a, "lora_b": b}, residual
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
         """Initialize A randomly and B to zero; the delta is exactly zero."""
@@ -157,12 +158,11 @@ def principal_part(kernel: jax.Array, rank: int, scale: float) -> tuple[jax.Arra
     return left[:, :rank] * root, root[:, None] * right[:rank]
 
 
-def orthogonal_part(kernel: jax.Array, rank: int, scale: float) -> tuple[jax.Array, jax.Array]:
+def orthogonal_part(kernel: jax.Array, rank: int) -> tuple[jax.Array, jax.Array]:
     """A [I, R] and B [R, O] from a rank-R QR of the kernel's transpose; B's rows are orthonormal.
 
     As in OLoRA (Büyükakyüz, arXiv 2406.01775, algorithm 1), A B does not depend on the scale.
     """
-    del scale
     orthonormal, triangular = jnp.linalg.qr(kernel.T)
     return triangular[:rank].T, orthonormal[:, :rank].T
 
@@ -174,12 +174,12 @@ def principal_inputs(moment: jax.Array | None, d_in: int, rank: int) -> jax.Arra
     vectors are computed as eigenvectors of Σ x xᵀ, which can be summed over batches.
 
     Args:
-      moment: Σ x xᵀ, [I, I], not centered.
-      d_in: I.
-      rank: R, at most I.
+        moment: Σ x xᵀ, [I, I], not centered.
+        d_in: I.
+        rank: R, at most I.
 
     Raises:
-      ValueError: the moment is missing or has the wrong shape, or R exceeds I.
+        ValueError: the moment is missing or has the wrong shape, or R exceeds I.
     """
     if moment is None:
         raise ValueError(

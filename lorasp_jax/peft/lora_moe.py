@@ -11,7 +11,7 @@ label for every task; it is omitted here, as in LoRA-SP's code.
 
 import dataclasses
 import functools
-from typing import Literal
+from typing import ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -29,9 +29,11 @@ class LoRAMoE(Method):
     Expert i has columns i R to (i + 1) R of lora_a and the same rows of lora_b.
 
     Raises:
-      ValueError: `experts` or `rank` below 1, an unknown routing or gate gradient, or "switch"
-        without "top1".
+        ValueError: `experts` or `rank` below 1, an unknown routing or gate gradient, or "switch"
+            without "top1".
     """
+
+    down_in_fp32: ClassVar[bool] = True  # the router's logits
 
     experts: int = 4
     """Number of experts, E."""
@@ -54,11 +56,6 @@ class LoRAMoE(Method):
             )
         if self.gate_gradient == "switch" and self.routing != "top1":
             raise ValueError(f"gate_gradient 'switch' needs routing 'top1', got {self.routing!r}")
-
-    @property
-    def down_in_fp32(self) -> bool:
-        """True: the router's logits stay in fp32."""
-        return True
 
     @property
     def scale(self) -> float:
@@ -139,11 +136,11 @@ def balance_loss(probabilities: jax.Array, valid: jax.Array | None) -> jax.Array
     all sequences, unlike in Hugging Face's Switch.
 
     Args:
-      probabilities: the router's softmax, f32 [...tokens, E].
-      valid: bool [...tokens], False for padding; None if all are valid.
+        probabilities: the router's softmax, f32 [...tokens, E].
+        valid: bool [...tokens], False for padding; None if all are valid.
 
     Returns:
-      f32 scalar, 0 if no token is valid.
+        f32 scalar, 0 if no token is valid.
     """
     mean = jax.vmap(masked_mean, in_axes=(-1, None))
     fractions = mean(_one_hot_argmax(probabilities), valid)
@@ -157,10 +154,10 @@ def z_loss(logits: jax.Array, valid: jax.Array | None) -> jax.Array:
     As in Zoph et al. (arXiv 2202.08906, eq. 5), with no offset: zero logits give (ln E)².
 
     Args:
-      logits: f32 [...tokens, E].
-      valid: bool [...tokens], False for padding; None if all are valid.
+        logits: f32 [...tokens, E].
+        valid: bool [...tokens], False for padding; None if all are valid.
 
     Returns:
-      f32 scalar, 0 if no token is valid.
+        f32 scalar, 0 if no token is valid.
     """
     return masked_mean(jnp.square(jax.nn.logsumexp(logits, axis=-1)), valid)

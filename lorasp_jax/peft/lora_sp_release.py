@@ -13,12 +13,13 @@ Differences from the paper (`lora_sp`):
 - The z-loss is ln(1 + lse), where lse is logsumexp(scores) clipped to [-1, 10]. It is -inf at
   lse = -1.
 
-Unlike in the public code, padding is excluded, everything is in fp32, and the router's input has no
-dropout (5 % there).
+Unlike in the public code, padding is excluded, everything is in fp32, and the router has no dropout
+(5 % there) and no hidden layer (`router_projection` there).
 """
 
 import dataclasses
 import functools
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +27,7 @@ import jax.numpy as jnp
 from lorasp_jax.kernels.energy_gate import kept_energy
 from lorasp_jax.peft.auxiliary import Aux, masked_mean
 from lorasp_jax.peft.lora_sp.bank import BankMethod, apply_masked_scores, init_bank
-from lorasp_jax.peft.lora_sp.router import cast_and_clip, init_output_layer
+from lorasp_jax.peft.lora_sp.router import cast_and_clip
 from lorasp_jax.peft.method import Params, kaiming_uniform
 
 
@@ -34,11 +35,13 @@ from lorasp_jax.peft.method import Params, kaiming_uniform
 class LoRASPRelease(BankMethod):
     """Adapter with an input-dependent active rank, for comparison with the public code only.
 
-    Parameters: bank.u [R, O], bank.v [I, R]; router.w1 [I, R], or w1 [I, H] and w2 [H, R].
+    Parameters: bank.u [R, O], bank.v [I, R], router.w1 [I, R].
 
     Raises:
-      ValueError: a rank or width below 1, or η outside (0, 1].
+        ValueError: a rank below 1, or η outside (0, 1].
     """
+
+    score_arrays: ClassVar[tuple[str, ...]] = ("w1",)
 
     rank: int = 128
     """R, size of the bank; it may exceed I and O."""
@@ -46,37 +49,20 @@ class LoRASPRelease(BankMethod):
     """η."""
     alpha: float | None = None
     """α of the scale α/R. None: 2 R."""
-    hidden_width: int | None = None
-    """None: the scores are x W1, the default of the public code. H: they are softmax(x W1) W2 with
-    width H and W2 initially 0/1, as with that code's option `router_projection` (H = 4)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.hidden_width is not None and self.hidden_width < 1:
-            raise ValueError(f"hidden_width must be at least 1, got {self.hidden_width}")
-
-    @property
-    def score_arrays(self) -> tuple[str, ...]:
-        """See `BankMethod.score_arrays`."""
-        return ("w1",) if self.hidden_width is None else ("w2",)
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
         """Initialize V and W1 randomly and U to zero; the delta is zero."""
-        input_key, score_key = jax.random.split(key)
-        inputs = kaiming_uniform(input_key, (d_in, self.rank + (self.hidden_width or self.rank)))
-        v, w1 = jnp.split(inputs, [self.rank], axis=1)
-        output_layer = {}
-        if self.hidden_width is not None:
-            output_layer = init_output_layer(score_key, "softmax", self.hidden_width, self.rank)
-        return {"bank": init_bank(v, d_out), "router": {"w1": w1, **output_layer}}
+        v, w1 = jnp.split(kaiming_uniform(key, (d_in, 2 * self.rank)), 2, axis=1)
+        return {"bank": init_bank(v, d_out), "router": {"w1": w1}}
 
     def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
         """Compute z = scale Σ(x) V x and aux from the rows x [V, W1]."""
+        del params
         valid = jnp.ones(rows.shape[:-1], bool) if token_mask is None else token_mask
         v_x, hidden = jnp.split(rows, [self.rank], axis=-1)
-        scores = release_scores(params["router"], hidden)
+        scores = cast_and_clip(hidden)  # x W1, signed
         mask = release_gate(scores, self.energy_target)
         # Scores after the first R belong to directions that `lorasp_jax.prune` removed.
         mask &= jnp.arange(mask.shape[-1]) < self.rank
@@ -85,12 +71,6 @@ class LoRASPRelease(BankMethod):
         z = apply_masked_scores(v_x, self.scale * scores, mask, e_k[..., None])
         active_rank = mask.astype(jnp.float32).sum(-1)
         return z, Aux(active_rank, e_k, release_losses(scores, mask, valid), usage=usage)
-
-
-def release_scores(router: dict[str, jax.Array], hidden: jax.Array) -> jax.Array:
-    """Signed scores f32 [..., R]: x W1, or softmax(x W1) W2 if the router has a w2 [H, R]."""
-    hidden = cast_and_clip(hidden)
-    return jax.nn.softmax(hidden) @ router["w2"] if "w2" in router else hidden
 
 
 def release_gate(scores: jax.Array, energy_target: float) -> jax.Array:
@@ -110,9 +90,9 @@ def release_losses(scores: jax.Array, mask: jax.Array, valid: jax.Array) -> dict
     """Spectral, balance and z-loss of the public code, f32 scalars over the valid tokens.
 
     Args:
-      scores: f32 [...tokens, R].
-      mask: bool [...tokens, R], from `release_gate`.
-      valid: bool [...tokens], False for padding.
+        scores: f32 [...tokens, R].
+        mask: bool [...tokens, R], from `release_gate`.
+        valid: bool [...tokens], False for padding.
     """
     mean = functools.partial(masked_mean, mask=valid)
     mean_per_direction = jax.vmap(mean, in_axes=-1)

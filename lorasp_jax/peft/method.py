@@ -58,11 +58,7 @@ class Method(Bottleneck):
 
     def __post_init__(self) -> None:
         """Raise ValueError for a field of the wrong type or out of range."""
-        for field in dataclasses.fields(self):  # pyright: ignore[reportArgumentType]
-            value = getattr(self, field.name)
-            if type(value) is int and value > MAX_SIZE:
-                raise ValueError(f"{field.name} must be at most {MAX_SIZE}, got {value}")
-        fields.check_fields(self)
+        fields.check_fields(self, maximum=MAX_SIZE)
         alpha = getattr(self, "alpha", None)
         if alpha is not None and not 1 / MAX_ALPHA <= abs(alpha) <= MAX_ALPHA:
             raise ValueError(
@@ -78,25 +74,17 @@ class Method(Bottleneck):
     is_low_rank_sum: ClassVar[bool] = True
     """True if the layer computes exactly x W + z U; False for a method that overrides `apply`."""
 
-    @property
-    def splits_kernel(self) -> bool:
-        """True if `init` moves part of the kernel into the parameters and returns the residual."""
-        return False
-
-    @property
-    def down_in_fp32(self) -> bool:
-        """True to keep x P in fp32, whatever the dtype of x."""
-        return False
+    splits_kernel: ClassVar[bool] = False
+    """True if `init` moves part of the kernel into the parameters and returns the residual."""
+    down_in_fp32: ClassVar[bool] = False
+    """True to keep x P in fp32, whatever the dtype of x."""
+    needs_statistics: ClassVar[bool] = False
+    """True if `init` requires statistics of the layer's inputs."""
 
     @property
     def name(self) -> str:
         """Name accepted by `create`."""
         return name_of(type(self))
-
-    @property
-    def needs_statistics(self) -> bool:
-        """True if `init` requires statistics of the layer's inputs."""
-        return False
 
     @property
     def as_saved(self) -> "Method":
@@ -109,15 +97,15 @@ class Method(Bottleneck):
         """Initialize parameters for one kernel. The adapted layer initially equals x @ kernel.
 
         Args:
-          key: typed random key.
-          kernel: [I, O] array or ShapeDtypeStruct; this implementation uses only its shape.
-          statistics: activation statistics, for data-driven initialization.
+            key: typed random key.
+            kernel: [I, O] array or ShapeDtypeStruct; this implementation uses only its shape.
+            statistics: activation statistics, for data-driven initialization.
 
         Returns:
-          The parameters, and the kernel: unchanged, or the residual if the method splits it.
+            The parameters, and the kernel: unchanged, or the residual if the method splits it.
 
         Raises:
-          ValueError: the kernel is not a matrix, or `key` is not a random key.
+            ValueError: the kernel is not a matrix, or `key` is not a random key.
         """
         del statistics
         fields.check_kernel(kernel)
@@ -141,12 +129,12 @@ class Method(Bottleneck):
         """Map each token's row of x P to z.
 
         Args:
-          params: from `bottleneck_params`.
-          rows: x P, [...tokens, Q] in the dtype of x, or in fp32 if `down_in_fp32`.
-          token_mask: see `delta`.
+            params: from `bottleneck_params`.
+            rows: x P, [...tokens, Q] in the dtype of x, or in fp32 if `down_in_fp32`.
+            token_mask: see `delta`.
 
         Returns:
-          z [...tokens, R], to be multiplied by U, and aux with token_mask unset.
+            z [...tokens, R], to be multiplied by U, and aux with token_mask unset.
         """
         raise NotImplementedError
 
@@ -165,13 +153,13 @@ class Method(Bottleneck):
         """Compute what the adapter adds to x @ kernel, [...tokens, O], and aux.
 
         Args:
-          params: from `init`.
-          x: [...tokens, I].
-          token_mask: bool [...tokens]; False marks padding, excluded from losses and statistics.
+            params: from `init`.
+            x: [...tokens, I].
+            token_mask: bool [...tokens]; False marks padding, excluded from losses and statistics.
 
         Raises:
-          ValueError: the method is not additive, x is not floating point, or the parameters belong
-            to another method.
+            ValueError: the method is not additive, x is not floating point, or the parameters
+                belong to another method.
         """
         if not self.additive:
             raise ValueError(f"{type(self).__name__} is not additive and has no delta; use apply")
@@ -245,8 +233,8 @@ class Method(Bottleneck):
         """The shapes that parameters must have.
 
         Args:
-          initial: shapes from `init_params`, by path.
-          actual: shapes of the parameters, which may have been pruned.
+            initial: shapes from `init_params`, by path.
+            actual: shapes of the parameters, which may have been pruned.
         """
         del actual
         return initial
@@ -267,7 +255,7 @@ class Method(Bottleneck):
         """The kernel [I, O] merged with the adapter, in the kernel's dtype.
 
         Raises:
-          ValueError: the delta depends on the input, so it cannot be merged.
+            ValueError: the delta depends on the input, so it cannot be merged.
         """
         raise NotImplementedError
 

@@ -12,6 +12,7 @@ from lorasp_jax import peft
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.dense import AdapterParam, Dense
 from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP
+from tests.cases import mostly_slow
 
 LAYERS, WIDTH = 3, 4
 SP = LoRASP(rank=8, hidden_width=4)
@@ -82,7 +83,7 @@ def leaves(model, kind):
     return jax.tree.leaves(nnx.state(model, kind))
 
 
-@pytest.mark.parametrize("name", peft.names())
+@pytest.mark.parametrize("name", mostly_slow(peft.names(), ["lora_sp", "full"]))
 def test_only_adapters_train(net, x, name):
     """The initial output equals the base's, and training does not change the base."""
     method = SP if name == "lora_sp" else peft.create(name)

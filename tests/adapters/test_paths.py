@@ -1,14 +1,11 @@
 """Locate and replace modules, without changing anything else in the model."""
 
-import re
-
 import pytest
 from flax import nnx
 
 import lorasp_jax
 from lorasp_jax.adapters import paths
 from lorasp_jax.peft import LoRA
-from tests import ROOT
 
 
 class Net(nnx.Module):
@@ -46,12 +43,6 @@ def test_shared_children_are_replaced_once(net):
     assert net.linear is not net.again  # replaced separately
 
 
-def test_set_child_in_a_list(net):
-    (location,) = (location for location in modules(net) if location.path == "several/0")
-    paths.set_child(location, nnx.Dropout(0.5))
-    assert type(net.several[0]) is nnx.Dropout
-
-
 def test_merging_restores_classes(net):
     structure = nnx.graphdef(net)
     model = lorasp_jax.adapt(net, [("first|several", LoRA(rank=2))], rngs=nnx.Rngs(1))
@@ -61,12 +52,3 @@ def test_merging_restores_classes(net):
     assert model.first is model.second
     assert model.first.kernel is not net.first.kernel
     assert nnx.graphdef(lorasp_jax.merge(model)) == structure
-
-
-def test_only_three_modules_use_setattr():
-    """They are paths.py, for `set_child`, layers.py, where an attribute names the kernel, and
-    prepared.py, which replaces fused layers."""
-    by_name = re.compile(r"\b(setattr|delattr)\(|\.__class__ =")
-    sources = (ROOT / "lorasp_jax").rglob("*.py")
-    users = {path.name for path in sources if by_name.search(path.read_text())}
-    assert users == {"paths.py", "layers.py", "prepared.py"}

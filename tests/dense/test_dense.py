@@ -12,6 +12,7 @@ from flax import nnx
 import lorasp_jax
 from lorasp_jax.dense import AdapterParam, Dense, LinenDense, dense, dense_shared_input
 from lorasp_jax.peft import DoRA, FullFineTuning, LoRA, LoRASP
+from tests.models.random_models import with_noise
 
 METHOD = LoRASP(rank=8, hidden_width=4)
 
@@ -55,14 +56,14 @@ def test_layers_with_a_shared_input(x):
     for i, layer in enumerate(layers):
         layer.bias.set_value(jnp.full(6 + i, 0.5))
         if layer.adapter is not None:
-            params = layer.adapter.get_value()
-            draw = jax.random.normal(jax.random.key(i), (1000,))
-            layer.adapter.set_value(
-                jax.tree.map(lambda p, d=draw: p + d[: p.size].reshape(p.shape), params)
-            )
-    results = dense_shared_input(x, [layer.arrays() for layer in layers], token_mask=mask)
-    for layer, (y, aux) in zip(layers, results, strict=True):
-        alone, expected = layer(x, token_mask=mask, return_aux=True)
+            layer.adapter.set_value(with_noise(layer.adapter.get_value(), 1.0, i))
+
+    @jax.jit
+    def run(x):
+        shared = dense_shared_input(x, [layer.arrays() for layer in layers], token_mask=mask)
+        return shared, [layer(x, token_mask=mask, return_aux=True) for layer in layers]
+
+    for (y, aux), (alone, expected) in zip(*run(x), strict=True):
         np.testing.assert_allclose(y, alone, rtol=1e-5, atol=1e-5)
         assert jax.tree.structure(aux) == jax.tree.structure(expected)
         for a, b in zip(jax.tree.leaves(aux), jax.tree.leaves(expected), strict=True):

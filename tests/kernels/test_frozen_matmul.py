@@ -72,13 +72,16 @@ def test_codes_are_the_only_difference(on_hopper, method):
     kernel, x = quantize_kernel(normal(0, 24, 16), "float8"), normal(1, 8, 24)
     params, _ = method.init(jax.random.key(2), jnp.zeros((24, 16))) if method else (None, None)
     x8 = rounded(x, jnp.float8_e4m3fn)
-    y, _ = dense(x, kernel, None, params, method)
-    expected, _ = dense(x, jnp.zeros((24, 16)), None, params, method)
-    np.testing.assert_allclose(y, x8 @ kernel.astype(jnp.float32) + expected, atol=1e-5)
-    gradient = jax.grad(lambda x: dense(x, kernel, None, params, method)[0].sum())(x)
-    of_adapter = jax.grad(lambda x: dense(x, jnp.zeros((24, 16)), None, params, method)[0].sum())
-    of_base = jnp.ones((8, 16)) @ kernel.astype(jnp.float32).T
-    np.testing.assert_allclose(gradient, of_base + of_adapter(x), atol=1e-5)
+
+    @jax.jit
+    def run(x, kernel):
+        y, vjp = jax.vjp(lambda x: dense(x, kernel, None, params, method)[0], x)
+        return y, *vjp(jnp.ones_like(y))
+
+    (y, gradient), (expected, of_adapter) = run(x, kernel), run(x, jnp.zeros((24, 16)))
+    w = np.asarray(kernel.astype(jnp.float32))
+    np.testing.assert_allclose(y, x8 @ w + expected, atol=1e-5)
+    np.testing.assert_allclose(gradient, np.ones((8, 16)) @ w.T + of_adapter, atol=1e-5)
 
 
 def lowered(tokens, d_in, d_out, kind="float8", platform="cuda"):

@@ -14,7 +14,7 @@ from lorasp_jax.kernels.cached_attention import cached_attention
 from lorasp_jax.kernels.row_sharding import by_rows
 from lorasp_jax.kernels.short_attention import short_attention
 from lorasp_jax.training.distributed import mesh as meshes
-from tests.kernels.test_rowwise_kernel import WIDTHS, close, gated
+from tests.kernels.test_rowwise_kernel import close, kernel
 
 
 def doubled(shared, arrays):
@@ -78,9 +78,7 @@ def test_rowwise_kernel(monkeypatch):
         def loss(shared, x):
             rows = jnp.sin(x).reshape(-1, 48)
             valid = rows[:, :1] > 0
-            output, sums, _ = kernels.rowwise_kernel(
-                gated, shared, rows, WIDTHS, valid, interpret=True
-            )
+            output, sums, _ = kernel(shared, rows, valid)
             return jnp.sin(output).sum() + sums["squares"].sum()
 
         return jax.value_and_grad(loss, argnums=(0, 1))(shared, x)

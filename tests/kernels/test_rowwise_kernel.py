@@ -29,15 +29,22 @@ def shared():
     return {"w": jax.random.normal(keys[0], (16, 32)), "b": jax.random.normal(keys[1], (32,))}
 
 
+def kernel(shared, rows, valid, function=gated):
+    """Run the kernel for a single function."""
+    interpret = jax.default_backend() != "gpu"
+    packed = jax.tree.map(lambda leaf: leaf[None], kernels.PackedTree.of(shared))
+    output, sums, statistics = kernels.rowwise_kernel(
+        function, packed, rows, WIDTHS, valid, interpret=interpret
+    )
+    return output, jax.tree.map(lambda leaf: leaf[0], sums), statistics
+
+
 def run(as_kernel, shared, rows, valid):
     """Return the loss, all outputs and the gradients, with or without the kernel."""
 
     def loss(shared, rows):
         if as_kernel:
-            interpret = jax.default_backend() != "gpu"
-            results = kernels.rowwise_kernel(
-                gated, shared, rows, WIDTHS, valid, interpret=interpret
-            )
+            results = kernel(shared, rows, valid)
         else:
             output, sums, _, statistics = gated(shared, jnp.split(rows, [32], 1), valid, None)
             results = output, sums, statistics
@@ -87,10 +94,9 @@ def test_dtypes_are_those_of_the_function(shared):
 def test_residuals_are_the_rows_and_the_packed_mask(shared):
     rows, valid = jnp.ones((32, 48)), jnp.ones((32, 1), bool)
 
-    def call(rows):
-        return kernels.rowwise_kernel(gated, shared, rows, WIDTHS, valid, interpret=True)[0]
-
-    _, vjp = jax.eval_shape(lambda rows: jax.vjp(call, rows), rows)
+    _, vjp = jax.eval_shape(
+        lambda rows: jax.vjp(lambda rows: kernel(shared, rows, valid)[0], rows), rows
+    )
     stored = {leaf.shape for leaf in jax.tree.leaves(vjp) if leaf.shape}
     assert stored <= {(32, 48), (32, 32 // 8), (32, 1), (1, 16 * 32 + 32)}
 
@@ -107,26 +113,13 @@ def test_layers_share_traced_kernels(shared):
             return gated(*arguments)
 
         def loss(rows):
-            results = [
-                kernels.rowwise_kernel(counted, shared, rows, WIDTHS, valid, interpret=True)
-                for _ in range(layers)
-            ]
+            results = [kernel(shared, rows, valid, counted) for _ in range(layers)]
             return sum(output.sum() for output, *_ in results)
 
         jax.make_jaxpr(jax.grad(loss))(rows)
         return len(calls)
 
     assert traces(3) == traces(1) > 0
-
-
-def test_shared_arrays_may_be_packed(shared):
-    rows, valid = jnp.sin(jnp.arange(16.0 * 48)).reshape(16, 48), jnp.ones((16, 1), bool)
-    packed = kernels.PackedTree.of(shared)
-    assert packed.values.shape == (16 * 32 + 32,)
-    jax.tree.map(np.testing.assert_array_equal, packed.tree(), shared)
-    expected, (d_shared, d_rows) = run(True, shared, rows, valid)
-    actual, (d_packed, others) = run(True, packed, rows, valid)
-    jax.tree.map(close, (actual, d_packed.tree(), others), (expected, d_shared, d_rows))
 
 
 @pytest.mark.parametrize("few", [0, pytest.param(kernels.FEW_ROWS, marks=pytest.mark.slow)])

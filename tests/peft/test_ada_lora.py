@@ -106,16 +106,20 @@ def test_budgets(trace, configured):
 def test_forward_and_orthogonality():
     arrays = dict(np.load(GOLDEN / "adalora_forward.npz"))
     method, x, penalties = AdaLoRA(rank=6, target_rank=3, alpha=16), jnp.array(arrays["x"]), []
+
+    @jax.jit
+    def run(params, x, kernel):
+        delta, penalty = method.merge(params, jnp.zeros(kernel.shape)), method.penalty(params)
+        return *method.apply(params, x, kernel), delta, penalty["orthogonality"]
+
     for i in range(3):
         name = f"param/lin.{i}"
-        params = layer(arrays, name, ".default")
         kernel, bias = arrays[f"{name}.weight"].T, arrays[f"{name}.bias"]
-        delta = method.merge(params, jnp.zeros(kernel.shape))
+        y, aux, delta, penalty = run(layer(arrays, name, ".default"), x, kernel)
         np.testing.assert_allclose(delta.T, arrays[f"delta/{i}"], rtol=1e-5, atol=1e-6)
-        x, aux = method.apply(params, x, jnp.array(kernel))
-        x = x + bias if i == 2 else jnp.tanh(x + bias)
+        x = y + bias if i == 2 else np.tanh(y + bias)
         assert np.all(aux.active_rank == 6)
-        penalties.append(method.penalty(params)["orthogonality"])
+        penalties.append(penalty)
     np.testing.assert_allclose(x, arrays["y"], rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(np.mean(penalties), arrays["orth_reg_mean"], rtol=1e-5)
 
@@ -202,7 +206,7 @@ def test_match_budget():
 
 def test_orthogonal_parameters_have_zero_gradient():
     params = {"lora_a": jnp.eye(4, 2), "lora_b": jnp.eye(2, 3), "lora_e": jnp.ones(2)}
-    gradient = jax.grad(lambda p: small(rank=2).penalty(p)["orthogonality"])(params)
+    gradient = jax.jit(jax.grad(lambda p: small(rank=2).penalty(p)["orthogonality"]))(params)
     assert not any(np.any(leaf) for leaf in jax.tree.leaves(gradient))
 
 
@@ -214,12 +218,3 @@ def test_optimizer_without_adalora_parameters():
 def test_too_few_steps():
     with pytest.raises(ValueError, match="cannot prune in 1 steps"):
         small(warmup=0.2, final=0.6).transform(optax.sgd(1.0), 1)
-
-
-def test_initial_gradients():
-    method = small()
-    params, kernel = method.init(jax.random.key(0), jnp.ones((4, 5)))
-    x = jax.random.normal(jax.random.key(1), (3, 4))
-    grads = jax.grad(lambda p: method.apply(p, x, kernel)[0].sum())(params)
-    assert np.all(grads["lora_a"] == 0)  # e is zero
-    assert np.any(grads["lora_e"] != 0)

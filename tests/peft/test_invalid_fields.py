@@ -7,7 +7,6 @@ import pytest
 from flax import nnx
 
 import lorasp_jax
-from lorasp_jax import peft
 from lorasp_jax.peft import AdaLoRA, LoRA, LoRAMoE, LoRASP, LoRASPRelease
 
 NET = nnx.Dict(inp=nnx.Linear(5, 4, rngs=nnx.Rngs(0)))
@@ -23,7 +22,7 @@ NET = nnx.Dict(inp=nnx.Linear(5, 4, rngs=nnx.Rngs(0)))
         ({"rank": 0}, "rank must be at least 1, got 0"),
         ({"rank": 1.5}, "rank must be int, got 1.5"),
         ({"rank": 10**12}, "rank must be at most 1048576"),
-        ({"rank": -(10**12)}, "rank must be at least -2147483647"),
+        ({"rank": -(10**12)}, "rank must be at least -1048576"),
         ({"alpha": float("nan")}, "alpha must be a finite number or None, got nan"),
         ({"alpha": 1e308}, "alpha must be a finite number or None, got 1e+308"),
         ({"alpha": 1e35}, "|alpha| must be between 1e-30 and 1e+30, got 1e+35"),
@@ -58,7 +57,6 @@ def test_too_many_values():
         (LoRASP, {"rank": 0}, "rank must be at least 1, got 0"),
         (LoRASP, {"hidden_width": 0}, "hidden_width must be at least 1, got 0"),
         (LoRASP, {"router": "relu"}, "router must be one of 'gelu', .*, 'softmax', got 'relu'"),
-        (LoRASPRelease, {"hidden_width": 0}, "hidden_width must be at least 1, got 0"),
         (LoRASPRelease, {"router": "gelu"}, "lora_sp_release has no field 'router'"),
         (LoRAMoE, {"experts": 0}, "experts and rank must be at least 1, got 0, 32"),
         (LoRAMoE, {"rank": 0}, "experts and rank must be at least 1, got 4, 0"),
@@ -111,8 +109,3 @@ def test_rank_larger_than_a_split_kernel(initialization):
         ValueError, match=r"cannot adapt inp: .* got rank 128 and a kernel \[5, 4\]"
     ):
         lorasp_jax.adapt(NET, [("inp", method)], rngs=nnx.Rngs(0))
-
-
-def test_unknown_field_of_a_method_gets_a_suggestion():
-    with pytest.raises(ValueError, match=r"lora_sp has no field 'energy_targt' \(did you mean"):
-        peft.create("lora_sp", energy_targt=0.9)

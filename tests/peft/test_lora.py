@@ -57,15 +57,20 @@ def assert_equals_hugging_face(golden, methods, kernels, params, gradients):
         y = forward(golden["x"], golden, lambda i, x: methods[i].apply(params[i], x, kernels[i])[0])
         return 0.5 * jnp.mean(y**2), y
 
-    (value, y), actual = jax.jit(jax.value_and_grad(loss, has_aux=True))(params)
+    @jax.jit
+    def results(params):
+        merged = [methods[i].merge(params[i], kernels[i]) for i in range(3)]
+        y_merged = forward(golden["x"], golden, lambda i, x: x @ merged[i])
+        return jax.value_and_grad(loss, has_aux=True)(params), merged, y_merged
+
+    ((value, y), actual), merged, y_merged = results(params)
     assert_close(value, golden["loss"], 1e-5)
     assert_close(y, golden["y"], 1e-5)
     jax.tree.map(lambda a, b: assert_close(a, b, 1e-4), actual, gradients)
-    merged = [methods[i].merge(params[i], kernels[i]) for i in range(3)]
     for i in range(3):
         assert methods[i].scale == pytest.approx(float(golden[f"scaling/{i}"]))
         assert_close(merged[i], golden[f"merged/{i}"].T, 1e-5)
-    assert_close(forward(golden["x"], golden, lambda i, x: x @ merged[i]), golden["y_merged"], 1e-5)
+    assert_close(y_merged, golden["y_merged"], 1e-5)
 
 
 @pytest.mark.parametrize(("case", "methods"), CASES)

@@ -9,30 +9,19 @@ import numpy as np
 import pytest
 
 from lorasp_jax import peft
+from tests.models.random_models import with_noise
+from tests.nets import small
 
 D_IN, D_OUT, RANK = 6, 10, 12  # the rank exceeds both widths
-INPUT_DEPENDENT = (
-    peft.LoRASP,
-    peft.LoRASPRelease,
-    peft.LoRAMoE,
-)  # cannot be merged, unlike every other method
-SMALL = {
-    "rank": RANK,
-    "target_rank": 6,
-    "hidden_width": 4,
-    "alpha": 5.0,
-    "experts": 2,
-}  # alpha differs from the rank
-
-
-def small(name):
-    fields = {field.name for field in dataclasses.fields(peft.find(name))}
-    return peft.create(name, **{key: value for key, value in SMALL.items() if key in fields})
+# Cannot be merged, unlike every other method.
+INPUT_DEPENDENT = (peft.LoRASP, peft.LoRASPRelease, peft.LoRAMoE)
+# alpha differs from the rank
+SMALL = {"rank": RANK, "target_rank": 6, "hidden_width": 4, "alpha": 5.0, "experts": 2}
 
 
 @pytest.fixture(params=peft.names())
 def method(request):
-    return small(request.param)
+    return small(request.param, SMALL)
 
 
 @pytest.fixture
@@ -60,14 +49,9 @@ def initial(method, key, kernel):
     return method.init(key, kernel)[0]
 
 
-@functools.partial(jax.jit, static_argnums=0)
 def trained(method, kernel):
     """Parameters away from their initial values, so that all are nonzero."""
-    params, _ = method.init(jax.random.key(3), kernel)
-    leaves, structure = jax.tree.flatten(params)
-    keys = jax.random.split(jax.random.key(4), len(leaves))
-    noise = [0.3 * jax.random.normal(k, leaf.shape) for k, leaf in zip(keys, leaves, strict=True)]
-    return jax.tree.map(jnp.add, params, jax.tree.unflatten(structure, noise))
+    return with_noise(initial(method, jax.random.key(3), kernel), 0.3)
 
 
 def test_initially_equals_the_base(method, kernel, x):

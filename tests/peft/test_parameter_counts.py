@@ -39,7 +39,6 @@ TABLE = [
     ),
     (LoRASP.paper(), 128 * (I + O) + 4 * (I + 128)),
     (LoRASPRelease(), 128 * (I + O) + 128 * I),
-    (LoRASPRelease(hidden_width=4), 128 * (I + O) + 4 * (I + 128)),
     (FullFineTuning(), I * O),
 ]
 

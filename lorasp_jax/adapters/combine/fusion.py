@@ -1,6 +1,5 @@
 """Fuse named LoRAs into one, and unmerge adapters from merged kernels."""
 
-import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -13,7 +12,7 @@ from lorasp_jax.adapters.adaptation import Model
 from lorasp_jax.adapters.combine import named
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdaptedLayer, AdapterParam, validate
-from lorasp_jax.peft import FullFineTuning, LoRA
+from lorasp_jax.peft import LoRA
 from lorasp_jax.peft.method import Params
 
 
@@ -69,7 +68,6 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
 
     The delta is subtracted in fp32 and the result rounded to the kernel's dtype. Each entry of W is
     restored to within eps/2 (|W + ΔW| + |W|), where eps is 1.2e-7 in fp32 and 7.8e-3 in bf16.
-    Fully fine-tuned weights, such as biases, are taken from the adapted model and are trainable.
 
     Args:
         merged: from `merge`; not modified.
@@ -78,15 +76,11 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
 
     Raises:
         ValueError: the merged model has adapters, lacks a layer or has one of a different class,
-            the adapted model is from `combine`, or a method cannot be merged or is not additive
-            (DoRA).
+            the adapted model is from `combine` or also trains base weights, or a method cannot be
+            merged or is not additive (DoRA).
     """
     validate.with_values(merged)
-    if named.adapter_sets(validate.with_values(adapted)):
-        raise ValueError("the adapted model is a combined model: extract one adapter first")
-    adapters = named.single_adapters(adapted)
-    values = {p.path: p.child.get_value() for p in paths.locate(nnx.List([adapted]), AdapterParam)}
-    full_paths = [path for path in adaptation.methods(adapted) if path not in adapters]
+    adapters = named.adapters_by_path("the adapted model", validate.with_values(adapted))
     if has := adaptation.methods(merged):
         raise ValueError(f"the merged model must have no adapters, but {min(has)} has one")
     root = nnx.List([nnx.merge(*adaptation.split(merged))])
@@ -101,12 +95,6 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
     paths.replace(modules, unmerge_layer)
     if missing := adapters.keys() - {location.path for location in modules}:
         raise ValueError(f"the merged model has no layer {min(missing)}")
-    rules = [(f"^{re.escape(path)}$", FullFineTuning()) for path in full_paths]
-    for i in set(range(len(rules))) - adaptation.unfreeze(root, rules):
-        raise ValueError(f"the merged model has no parameter {full_paths[i]}")
-    for location in paths.locate(root, AdapterParam):
-        if location.path in full_paths:
-            location.child.set_value(values[location.path])
     return root[0]
 
 

@@ -161,12 +161,9 @@ def extract(model: Model, name: str | None) -> Model:
 def with_adapters(
     base: Model, adapters: Mapping[str, tuple[AdaptedLayer, Method | None, Params]]
 ) -> Model:
-    """Attach adapters to the base's layers, in place.
+    """Attach adapters to the layers of a base from `strip_adapters`, in place.
 
-    Args:
-        base: from `strip_adapters`.
-        adapters: by path, a template layer that supports the adapter, the method (None for no
-            adapter) and the parameters.
+    `adapters` has, by path, a layer that supports the adapter, its method or None, and parameters.
     """
 
     def make_adapted(location: Location) -> AdaptedLayer | None:
@@ -245,16 +242,11 @@ def adapters_by_path(name: str, model: nnx.Module) -> AdaptedLayers:
     """
     if adapter_sets(model):
         raise ValueError(f"{name} is already a combined model: extract one adapter first")
-    layers = single_adapters(model)
-    if extra := sorted(adaptation.methods(model).keys() - layers.keys()):
-        raise ValueError(f"{name} also trains {extra[0]}; only adapters can be combined")
-    return layers
-
-
-def single_adapters(model: nnx.Module) -> AdaptedLayers:
-    """Layers with a single (unnamed) adapter, by path."""
     locations = paths.locate(nnx.List([model]), AdaptedLayer)
-    return {p.path: p.child for p in locations if isinstance(p.child.adapter, AdapterParam)}
+    layers = {p.path: p.child for p in locations if isinstance(p.child.adapter, AdapterParam)}
+    if extra := sorted(adaptation.methods(model).keys() - layers.keys()):
+        raise ValueError(f"{name} also trains {extra[0]}, which is not an adapter")
+    return layers
 
 
 def _check_same_base(first: nnx.Module, name: str, second: nnx.Module, other: str) -> None:

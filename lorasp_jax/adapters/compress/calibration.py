@@ -10,8 +10,7 @@ store aux.
 import dataclasses
 import functools
 import re
-from collections.abc import Callable, Iterable, Mapping
-from types import MappingProxyType
+from collections.abc import Callable, Iterable
 from typing import Any, ClassVar
 
 import jax
@@ -19,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax.adapters import adaptation, paths
+from lorasp_jax.adapters import paths
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdapterAux, AdapterParam, validate
 from lorasp_jax.kernels.frozen_matmul import frozen_matmul
@@ -45,9 +44,6 @@ class Layer:
         method: the layer's method, or None.
         params: the adapter's parameters, or {}.
         x: `[...tokens, I]`.
-        kernel: `[I, O]`.
-        y: `[...tokens, O]`, without bias.
-        reference_y: `[...tokens, O]`, output with the reference adapter, or None.
         aux: the method's aux.
         valid: bool `[...tokens]`.
     """
@@ -55,9 +51,6 @@ class Layer:
     method: Method | None
     params: Params
     x: jax.Array
-    kernel: jax.Array
-    y: jax.Array
-    reference_y: jax.Array | None
     aux: Aux
     valid: jax.Array
 
@@ -69,22 +62,13 @@ class Layer:
 
 @dataclasses.dataclass(frozen=True)
 class Observed(Method):
-    """Wrap a layer's method to report sums.
-
-    Parameters: those of `inner`, or the pair of these and those of `reference`.
-    """
+    """Wrap a layer's method to report sums; the parameters are those of `inner`."""
 
     is_low_rank_sum: ClassVar[bool] = False
 
     path: str
     inner: Method | None
     report: Report
-    reference: Method | None = None
-
-    def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
-        """Return {}: `Observed` has no parameters of its own."""
-        del key, d_in, d_out
-        return {}
 
     def apply(
         self,
@@ -95,18 +79,12 @@ class Observed(Method):
         token_mask: jax.Array | None = None,
     ) -> tuple[jax.Array, Aux]:
         """Return the wrapped layer's output, with the report in aux."""
-        reference_y = None
-        if self.reference is not None:
-            params, reference_params = params
-            reference_y, _ = self.reference.apply(
-                reference_params, x, kernel, token_mask=token_mask
-            )
         if self.inner is None:
             y, aux = frozen_matmul(x, kernel), Aux()
         else:
             y, aux = self.inner.apply(params, x, kernel, token_mask=token_mask)
         valid = jnp.ones(x.shape[:-1], bool) if token_mask is None else token_mask
-        sums = self.report(Layer(self.inner, params, x, kernel, y, reference_y, aux, valid))
+        sums = self.report(Layer(self.inner, params, x, aux, valid))
         sums["tokens"] = valid.sum().astype(jnp.float32)
         return y, dataclasses.replace(aux, statistics={self.path: sums})
 
@@ -116,7 +94,6 @@ def observe(
     batches: Iterable[Any],
     reports: dict[str, Report],
     forward: Forward = call,
-    references: Mapping[str, tuple[Method, Params]] = MappingProxyType({}),
 ) -> dict[str, Sums]:
     """Sum the reports of the given layers over batches.
 
@@ -125,7 +102,6 @@ def observe(
         batches: inputs of `forward`; use one shape to avoid recompilation.
         reports: report functions by layer path; see `paths.locate_matmul_layers`.
         forward: how to call the model.
-        references: reference adapters by layer path, for `Layer.reference_y`.
 
     Returns:
         Sums by path, including "tokens", the number of valid tokens. All sums have the leading axes
@@ -135,7 +111,7 @@ def observe(
         ValueError: there are no batches or no valid tokens, values are not finite, a layer was not
             called, its aux was not returned by `forward`, or it has a custom matmul or precision.
     """
-    step = _make_step(_make_observed(model, reports, references), forward)
+    step = _make_step(_make_observed(model, reports), forward)
     total: dict[str, Sums] = {}
     for batch in batches:
         _add(total, step(batch))
@@ -173,9 +149,7 @@ def _make_step(model: nnx.Module, forward: Forward) -> Callable[[Any], dict[str,
     return functools.partial(step, state)
 
 
-def _make_observed(
-    model: nnx.Module, reports: dict[str, Report], references: Mapping[str, tuple[Method, Params]]
-) -> nnx.Module:
+def _make_observed(model: nnx.Module, reports: dict[str, Report]) -> nnx.Module:
     """Copy the model, with the methods of some layers wrapped in `Observed`."""
     root = nnx.List([nnx.clone(model)])
     nnx.pop(root, AdapterAux)
@@ -187,16 +161,8 @@ def _make_observed(
             layer = nnx_layers.make_adaptable(location.child, {})
         paths.set_child(location, layer)
         if layer.adapter is None:
-            adaptation.attach(layer, Observed(path, None, reports[path]), jax.random.key(0))
-        else:
-            inner, params = layer.method_and_params()
-            method = Observed(path, inner, reports[path])
-            if path in references:
-                reference, reference_params = references[path]
-                method = dataclasses.replace(method, reference=reference)
-                params = (params, reference_params)
-            layer.method = method
-            layer.adapter = AdapterParam(params)
+            layer.method, layer.adapter = None, AdapterParam({})
+        layer.method = Observed(path, layer.method, reports[path])
     return root[0]
 
 

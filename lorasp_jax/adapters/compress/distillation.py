@@ -9,14 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lorasp_jax.adapters import adaptation
-from lorasp_jax.adapters.compress import calibration
+from lorasp_jax.adapters.compress import calibration, compaction
 from lorasp_jax.adapters.compress.calibration import Forward, Layer, Sums
-from lorasp_jax.adapters.compress.compaction import (
-    Compaction,
-    Replacements,
-    lora_sp_layers,
-    replace_adapters,
-)
 from lorasp_jax.peft import LoRA
 from lorasp_jax.peft.method import Params
 
@@ -27,7 +21,7 @@ def distill(
     rank: int | None = None,
     *,
     forward: Forward = calibration.call,
-) -> tuple[adaptation.Model, Compaction]:
+) -> tuple[adaptation.Model, compaction.Compaction]:
     """Replace LoRA-SP adapters by LoRA adapters, which can be merged into the kernels.
 
     Each layer gets the rank-r update with the smallest squared output error on the calibration set
@@ -45,9 +39,9 @@ def distill(
     Raises:
         ValueError: rank is below 1, or the model has no LoRA-SP layers.
     """
-    layers = lora_sp_layers(model)
+    layers = compaction.lora_sp_layers(model)
     sums = calibration.observe(model, batches, dict.fromkeys(layers, _regression_sums), forward)
-    replacements: Replacements = {}
+    replacements: compaction.Replacements = {}
     ranks = {}
     for path, layer in layers.items():
         kernel = layer.kernel_matrices()
@@ -58,7 +52,7 @@ def distill(
         params = fit(sums[path]["xx"], sums[path]["xz"], u)
         replacements[path] = LoRA(rank=r, alpha=float(r)), params
         ranks[path] = np.full(kernel.shape[:-2], r)
-    return replace_adapters(model, batches, replacements, ranks, forward)
+    return compaction.replace_adapters(model, batches, replacements, ranks, forward)
 
 
 def _regression_sums(layer: Layer) -> Sums:

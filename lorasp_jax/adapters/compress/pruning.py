@@ -10,14 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lorasp_jax.adapters import adaptation
-from lorasp_jax.adapters.compress import calibration
+from lorasp_jax.adapters.compress import calibration, compaction
 from lorasp_jax.adapters.compress.calibration import Forward, Layer, Sums
-from lorasp_jax.adapters.compress.compaction import (
-    Compaction,
-    Replacements,
-    lora_sp_layers,
-    replace_adapters,
-)
 from lorasp_jax.peft import Method
 from lorasp_jax.peft.lora_sp.bank import BankMethod
 from lorasp_jax.peft.lora_sp.gpu_kernel import supported_size
@@ -32,7 +26,7 @@ def prune(
     rank: int | None = None,
     for_kernel: bool = False,
     forward: Forward = calibration.call,
-) -> tuple[adaptation.Model, Compaction]:
+) -> tuple[adaptation.Model, compaction.Compaction]:
     """Prune LoRA-SP directions that are rarely active.
 
     Drops each direction that is active for at most a fraction `tolerance` of the valid calibration
@@ -57,9 +51,9 @@ def prune(
     """
     if not 0 <= tolerance < 1 or (rank is not None and (rank < 1 or tolerance)):
         raise ValueError(f"set a tolerance in [0, 1) or a rank > 0, got {tolerance} and {rank}")
-    layers = lora_sp_layers(model)
+    layers = compaction.lora_sp_layers(model)
     sums = calibration.observe(model, batches, dict.fromkeys(layers, _usage), forward)
-    replacements: Replacements = {}
+    replacements: compaction.Replacements = {}
     ranks = {}
     for path, layer in layers.items():
         usage = np.asarray(sums[path]["usage"] / jnp.maximum(sums[path]["tokens"][..., None], 1))
@@ -70,7 +64,7 @@ def prune(
         kept = min(kept, layer.method.rank)
         ranks[path] = in_use if rank is None else np.full(in_use.shape, kept)
         replacements[path] = _pruned(layer, usage, kept)
-    return replace_adapters(model, batches, replacements, ranks, forward)
+    return compaction.replace_adapters(model, batches, replacements, ranks, forward)
 
 
 def _usage(layer: Layer) -> Sums:

@@ -9,7 +9,7 @@ import json
 import os
 import pathlib
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -88,13 +88,14 @@ def load_peft(
     """
     nnx_layers.check_einsums(einsums)
     root = nnx.List([validate.module(model)])
+    folder, names = _local_folder(folder), checked_names(names)
     shapes = {
         location.path: nnx_layers.matrices_shape(location.child, einsums)
         for location in paths.locate_matmul_layers(root, einsums)
     }
     parameters = [p for p in paths.locate(root, nnx.Param) if p.name != "adapter"]
     sizes = {location.path: location.child.get_value().shape for location in parameters}
-    rules, values, full_values = match_folder(folder, shapes, sizes, names)
+    rules, values, full_values = _match_folder(folder, shapes, sizes, names)
     adapted = adaptation.adapt(model, rules, rngs=nnx.Rngs(0), einsums=einsums)
     for location in paths.locate(nnx.List([adapted]), AdapterParam):
         if location.path in full_values:
@@ -105,31 +106,19 @@ def load_peft(
     return adapted
 
 
-def match_folder(
-    folder: str | os.PathLike[str],
+def _match_folder(
+    folder: pathlib.Path,
     shapes: Mapping[str, Sequence[int]],
     sizes: Mapping[str, Sequence[int]],
     names: Names,
 ) -> tuple[paths.Rules, dict[str, Adapter], Adapter]:
-    """Match a PEFT folder against a model's layers and parameters.
+    """Match a folder against the kernel matrices `[..., I, O]` and the parameters of a model.
 
-    Args:
-        folder: as for `load_peft`.
-        shapes: shape `[..., I, O]` of the kernel matrices of each layer, by path.
-        sizes: shape of each parameter, by path.
-        names: as for `load_peft`.
-
-    Returns:
-        Rules for `adapt`, the adapters' parameters by path, and the fully trained parameters by
-        path.
-
-    Raises:
-        ValueError: as for `load_peft`.
+    Returns rules for `adapt`, the adapters' parameters by path, and the fully trained parameters
+    by path.
     """
-    folder, names = _local_folder(folder), checked_names(names)
     config, modules, full = read_folder(folder)
-    kind = DoRA if config.get("use_dora") else LoRA
-    dropout = config.get("lora_dropout") or 0.0
+    kind, dropout = DoRA if config.get("use_dora") else LoRA, config.get("lora_dropout") or 0.0
     unused, candidates, rules, values = dict(modules), [], [], {}
     for path, (*leading, d_in, d_out) in shapes.items():
         module_names = [names(path, index) for index in np.ndindex(*leading)]
@@ -143,8 +132,13 @@ def match_folder(
             _check_fits(folder, name, adapter, d_in, d_out)
         scale, values[path] = _stacked(adapters, leading)
         rank = values[path]["lora_a"].shape[-1]
-        rules.append((f"^{re.escape(path)}$", kind(rank, scale * rank, dropout=dropout)))
-    _check_used(folder, modules, unused, candidates)
+        with paths.naming("load", folder):
+            rules.append((f"^{re.escape(path)}$", kind(rank, scale * rank, dropout=dropout)))
+    if not modules:
+        raise ValueError(f"{folder} contains no adapters")
+    if unused:
+        name, close = min(unused), paths.near_misses(min(unused), candidates)
+        raise ValueError(f"{folder} adapts {short(name)}, which the model lacks; it has {close}")
     check_biases(folder, config.get("bias", "none"), full, sizes, values)
     full_values = full_parameters(folder, full, shapes, sizes, names)
     # These rules come first, since the bias of an adapted layer may be fully fine-tuned.
@@ -186,7 +180,10 @@ def save_peft(
     folder, names = validate.folder(folder), checked_names(names)
     validate.with_values(model)
     layers = _supported_layers(model)
-    use_dora, lora_dropout = _common_settings([layer.method for layer in layers.values()])
+    settings = {(isinstance(x.method, DoRA), dropout_rate(x.method)) for x in layers.values()}
+    if len(settings) != 1:
+        raise ValueError(f"PEFT needs one use_dora and lora_dropout, got {sorted(settings)}")
+    ((use_dora, lora_dropout),) = settings
     modules = {
         names(path, index): _to_peft(layer, index)
         for path, layer in layers.items()
@@ -208,23 +205,20 @@ def save_peft(
 
 def _supported_layers(model: nnx.Module) -> dict[str, AdaptedLayer]:
     """Adapted layers by path; raise ValueError for one that PEFT does not support."""
-    methods = adaptation.methods(model).items()
-    adapted = {p for p, method in methods if not method.trains_base and _is_supported(p, method)}
     layers = {}
-    for location in paths.locate(nnx.List([model]), AdaptedLayer):
-        if location.path in adapted:
-            if isinstance(location.child, nnx_layers.LoRALayer):
-                raise ValueError(f"PEFT cannot store {location.path}: not dense and no einsum")
-            layers[location.path] = location.child
+    for path, _, _, layer in paths.locate(nnx.List([model]), AdaptedLayer):
+        if not isinstance(layer.adapter, AdapterParam):
+            continue
+        if not isinstance(layer.method, LoRA | AdaLoRA):
+            raise ValueError(
+                f"{path} uses {layer.method.name}, which Hugging Face PEFT does not support"
+            )
+        if layer.method.splits_kernel:
+            raise ValueError(f"the adapter of {path} split the kernel: merge it instead")
+        if isinstance(layer, nnx_layers.LoRALayer):
+            raise ValueError(f"PEFT cannot store {path}: not dense and no einsum")
+        layers[path] = layer
     return layers
-
-
-def _common_settings(methods: Collection[Any]) -> tuple[bool, float]:
-    """`use_dora` and `lora_dropout`; raise ValueError unless all methods agree on both."""
-    settings = {(isinstance(method, DoRA), dropout_rate(method)) for method in methods}
-    if len(settings) != 1:
-        raise ValueError(f"PEFT needs one use_dora and lora_dropout, got {sorted(settings)}")
-    return settings.pop()
 
 
 def _check_fits(folder: pathlib.Path, module: str, adapter: Adapter, d_in: int, d_out: int) -> None:
@@ -234,17 +228,6 @@ def _check_fits(folder: pathlib.Path, module: str, adapter: Adapter, d_in: int, 
     magnitude = adapter.get("magnitude", np.empty(d_out)).shape
     if (a, b, magnitude) != ((d_in, rank), (rank, d_out), (d_out,)):
         raise ValueError(f"{folder}: {module} has shapes {a} and {b} for a {d_in}x{d_out} kernel")
-
-
-def _check_used(
-    folder: pathlib.Path, modules: Collection[str], unused: Collection[str], candidates: list[str]
-) -> None:
-    """Raise ValueError if the folder has no modules, or some are missing from the model."""
-    if not modules:
-        raise ValueError(f"{folder} contains no adapters")
-    if unused:
-        name, close = min(unused), paths.near_misses(min(unused), candidates)
-        raise ValueError(f"{folder} adapts {short(name)}, which the model lacks; it has {close}")
 
 
 def _stacked(adapters: list[Adapter], leading: list[int]) -> tuple[float, Adapter]:
@@ -262,15 +245,6 @@ def _stacked(adapters: list[Adapter], leading: list[int]) -> tuple[float, Adapte
     padded_adapters = [padded(adapter) for adapter in adapters]
     stacked = {name: np.stack([a[name] for a in padded_adapters]) for name in padded_adapters[0]}
     return scale, {name: x.reshape(*leading, *x.shape[1:]) for name, x in stacked.items()}
-
-
-def _is_supported(path: str, method: Any) -> bool:
-    """Return True, or raise ValueError if PEFT does not support the method."""
-    if not isinstance(method, LoRA | AdaLoRA):
-        raise ValueError(f"{path} uses {method.name}, which Hugging Face PEFT does not support")
-    if method.splits_kernel:
-        raise ValueError(f"the adapter of {path} split the kernel: merge it instead")
-    return True
 
 
 def _to_peft(layer: AdaptedLayer, index: tuple[int, ...]) -> tuple[float, Adapter]:

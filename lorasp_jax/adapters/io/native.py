@@ -117,7 +117,10 @@ def load_adapters(
             adapters do not fit the model.
     """
     folder = validate.folder(folder)
-    description, tensors = _read(folder)
+    description = read_description(folder)
+    data, tensors = read_tensors(folder / TENSORS)
+    if description["sha256"] != hashlib.sha256(data).hexdigest():
+        raise ValueError(f"{folder / TENSORS} is damaged, or does not belong to {DESCRIPTION}")
     if base is not None and description["base"] != base:
         raise ValueError(f"{folder} was trained on base {description['base']!r}, not {base!r}")
     with paths.naming("load the methods in", folder):
@@ -230,15 +233,6 @@ def read_tensors(path: pathlib.Path) -> tuple[bytes, dict[str, np.ndarray]]:
             if not is_float or not np.isfinite(tensor.astype(np.float32)).all():
                 raise ValueError(f"tensor {name!r} must be floating-point and finite")
     return data, tensors
-
-
-def _read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Read and verify the description and the tensors."""
-    description = read_description(folder)
-    data, tensors = read_tensors(folder / TENSORS)
-    if description["sha256"] != hashlib.sha256(data).hexdigest():
-        raise ValueError(f"{folder / TENSORS} is damaged, or does not belong to {DESCRIPTION}")
-    return description, tensors
 
 
 def read_description(folder: pathlib.Path) -> dict[str, Any]:

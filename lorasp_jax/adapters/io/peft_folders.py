@@ -10,16 +10,15 @@ import math
 import pathlib
 import re
 import reprlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from lorasp_jax.adapters.io.name_patterns import values_of
 from lorasp_jax.adapters.io.native import read_tensors
+from lorasp_jax.base import json_values
 from lorasp_jax.base.files import as_value_error, read_json
 from lorasp_jax.peft.fields import short
-from lorasp_jax.peft.method import MAX_ALPHA, MAX_SIZE
 
 CONFIG, TENSORS = "adapter_config.json", "adapter_model.safetensors"
 PREFIX = "base_model.model."
@@ -37,6 +36,18 @@ _UNSUPPORTED = (
     "lora_bias", "fan_in_fan_out", "layer_replication", "use_qalora", "target_parameters",
     "trainable_token_indices", "use_bdlora", "alora_invocation_tokens",
 )  # fmt: skip
+# Schema of the fields that this module interprets, see `json_values.check`.
+_FIELDS: dict[str, Any] = {
+    "peft_type": str,
+    "use_dora?": bool,
+    "use_rslora?": bool,
+    "lora_alpha?": float,
+    "alpha_pattern?": {str: float},
+    "init_r?": int,
+    "lora_dropout?": float,
+    "bias?": str,
+    "modules_to_save?": [str],
+}
 
 Adapter = dict[str, np.ndarray]
 FullTensors = dict[tuple[str, str], np.ndarray]
@@ -51,10 +62,11 @@ def read_folder(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter
     """
     with as_value_error(folder / CONFIG):
         config = read_json(folder / CONFIG)
-        kind = config["peft_type"]
-        _check_fields(config)
+        json_values.check({name: v for name, v in config.items() if v is not None}, _FIELDS)
+        if config.get("bias") not in (None, "none", "all", "lora_only"):
+            raise ValueError(f"bias must be 'none', 'all' or 'lora_only', got {config['bias']!r}")
     _, tensors = read_tensors(folder / TENSORS)
-    _check_supported(folder, kind, config)
+    _check_supported(folder, config)
     modules, full_values = collections.defaultdict(dict), {}
     for name, tensor in tensors.items():
         if match := _TENSOR.fullmatch(name):
@@ -65,18 +77,14 @@ def read_folder(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter
             full_values[match[1], match[3]] = tensor.astype(np.float32)
         else:
             raise ValueError(f"{folder} has the unexpected tensor {short(name)}")
-    with as_value_error(folder):
-        alphas = values_of(config.get("alpha_pattern") or {}, modules, config.get("lora_alpha"))
-        imported = {
-            name: _from_peft(config, name, tensors, alphas[name])
-            for name, tensors in modules.items()
-        }
+    with as_value_error(folder, re.error):
+        imported = {name: _from_peft(config, name, tensors) for name, tensors in modules.items()}
     return config, imported, full_values
 
 
-def _check_supported(folder: pathlib.Path, kind: object, config: Mapping[str, Any]) -> None:
+def _check_supported(folder: pathlib.Path, config: Mapping[str, Any]) -> None:
     """Raise ValueError if a PEFT config needs a feature that this project lacks."""
-    if kind not in ("LORA", "ADALORA"):
+    if (kind := config["peft_type"]) not in ("LORA", "ADALORA"):
         raise ValueError(f"{folder} has peft_type {kind}; only LORA and ADALORA are supported")
     enabled = [name for name in _UNSUPPORTED if config.get(name) not in _DISABLED]
     if config.get("init_lora_weights") not in _BASE_PRESERVING:
@@ -94,15 +102,15 @@ def _is_fully_trained(config: Mapping[str, Any], module: str, kind: str) -> bool
     return saved or (kind == "bias" and config.get("bias") in ("all", "lora_only"))
 
 
-def _from_peft(config: Mapping[str, Any], module: str, tensors: Adapter, alpha: Any) -> Adapter:
+def _from_peft(config: Mapping[str, Any], module: str, tensors: Adapter) -> Adapter:
     """Convert a module's tensors to lora_a, lora_b, scale and, for DoRA, magnitude."""
     ada = config["peft_type"] == "ADALORA"
     expected = {"lora_A", "lora_B"} | ({"lora_E"} if ada else set())
     expected |= {"lora_magnitude_vector"} if config.get("use_dora") else set()
     if expected != tensors.keys():
         raise ValueError(f"{module} must have {sorted(expected)}, got {sorted(tensors)}")
-    a, b = tensors["lora_A"].T, tensors["lora_B"].T
-    if not alpha or (ada and not config.get("init_r")):
+    a, b, alpha = tensors["lora_A"].T, tensors["lora_B"].T, _alpha(config, module)
+    if not alpha or (ada and (config.get("init_r") or 0) < 1):
         raise ValueError(f"{module} lacks lora_alpha or init_r for its scale")
     if ada:
         scale = alpha / (config["init_r"] + _ADA_CONSTANT)
@@ -116,37 +124,17 @@ def _from_peft(config: Mapping[str, Any], module: str, tensors: Adapter, alpha: 
     return adapter
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and type(value) is not bool and abs(value) < math.inf
+def _alpha(config: Mapping[str, Any], module: str) -> Any:
+    """α of a module: that of the first pattern that matches its name or a suffix after a dot.
 
-
-def _is_alpha(value: Any) -> bool:
-    return _is_number(value) and 1 / MAX_ALPHA <= abs(value) <= MAX_ALPHA
-
-
-_FIELDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "peft_type": ("a string", lambda value: isinstance(value, str)),
-    "use_dora": ("true or false", lambda value: type(value) is bool),
-    "use_rslora": ("true or false", lambda value: type(value) is bool),
-    "lora_alpha": ("a number other than 0", _is_alpha),
-    "alpha_pattern": (
-        "an object of numbers other than 0",
-        lambda value: isinstance(value, dict) and all(map(_is_alpha, value.values())),
-    ),
-    "init_r": ("a positive integer", lambda value: type(value) is int and 0 < value <= MAX_SIZE),
-    "lora_dropout": ("in [0, 1)", lambda value: _is_number(value) and 0 <= value < 1),
-    "bias": ("'none', 'all' or 'lora_only'", lambda value: value in ("none", "all", "lora_only")),
-    "modules_to_save": (
-        "a list of strings",
-        lambda value: isinstance(value, list) and all(isinstance(item, str) for item in value),
-    ),
-}
-"""The fields that this module interprets, and what their values must be."""
-
-
-def _check_fields(config: Mapping[str, Any]) -> None:
-    """Raise ValueError for a field of the wrong type or out of range."""
-    for name, (description, is_valid) in _FIELDS.items():
-        value = config.get(name)
-        if value is not None and not is_valid(value):
-            raise ValueError(f"{name} must be {description}, got {reprlib.repr(value)}")
+    As in PEFT (get_pattern_key of 0.21.2), but only for names with anchors, dots and escapes: a
+    pattern with repetitions, such as (a+)+b, may take forever to match.
+    """
+    for pattern, alpha in (config.get("alpha_pattern") or {}).items():
+        if not re.fullmatch(r"[\w.\\^$-]*", pattern):
+            raise ValueError(
+                f"alpha_pattern has {short(pattern)}; only names with ^, $, . and \\ are supported"
+            )
+        if re.match(rf"(.*\.)?({pattern})$", module):
+            return alpha
+    return config.get("lora_alpha")

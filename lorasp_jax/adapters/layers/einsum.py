@@ -59,7 +59,7 @@ class Axes(NamedTuple):
         """Replace "..." by letters, for an x with `ndim` axes.
 
         Raises:
-          ValueError: the equation does not allow `ndim` axes.
+            ValueError: the equation does not allow `ndim` axes.
         """
         letters = (c for c in string.ascii_letters if c not in self.x + self.kernel + self.y)
         count = ndim - len(self.x.replace("...", ""))
@@ -76,7 +76,7 @@ def parse(equation: str) -> Axes:
     """Parse an equation.
 
     Raises:
-      ValueError: the equation is not a linear map from x to y for each index of the batch axes.
+        ValueError: the equation is not a linear map from x to y for each index of the batch axes.
     """
     match = _EQUATION.fullmatch(equation.replace(" ", ""))
     axes = Axes(*match.groups()) if match else Axes("", "", "")
@@ -96,9 +96,9 @@ def general_equation(axis: Sequence[int], batch: Sequence[int], outputs: int) ->
     """Equation of a general dense layer with a kernel [*batch, *inputs, *outputs].
 
     Args:
-      axis: axes of x to sum over; negative ones count from the end.
-      batch: leading axes 0, 1, ... of x that the kernel also has.
-      outputs: number of output axes.
+        axis: axes of x to sum over; negative ones count from the end.
+        batch: leading axes 0, 1, ... of x that the kernel also has.
+        outputs: number of output axes.
     """
     letters = iter(string.ascii_letters)
     from_start, from_end = sorted(a for a in axis if a >= 0), sorted(a for a in axis if a < 0)
@@ -145,19 +145,19 @@ def einsum(
     """Einsum of x and kernel, plus bias; with an adapter if `method` and `params` are given.
 
     Args:
-      equation: "x,kernel->y"; see the module docstring.
-      x, kernel: arrays with the axes in the equation.
-      bias: has the kernel axes that are also in y, in y's order; or None.
-      params: the adapter's parameters for `to_matrices(equation, kernel)`, or None.
-      method: the adapter's method; required with `params`.
-      dropout_key: as for `dense`.
+        equation: "x,kernel->y"; see the module docstring.
+        x, kernel: arrays with the axes in the equation.
+        bias: has the kernel axes that are also in y, in y's order; or None.
+        params: the adapter's parameters for `to_matrices(equation, kernel)`, or None.
+        method: the adapter's method; required with `params`.
+        dropout_key: as for `dense`.
 
     Returns:
-      y in the dtype of x, and the adapter's aux. Losses are averaged over the batch axes; the other
-      arrays in aux have these as leading axes.
+        y in the dtype of x, and the adapter's aux. Losses are averaged over the batch axes; the
+        other arrays in aux have these as leading axes.
 
     Raises:
-      ValueError: the equation cannot be adapted, or the shapes do not match it.
+        ValueError: the equation cannot be adapted, or the shapes do not match it.
     """
     axes, sizes = _sizes(equation, x, kernel)
     tokens = "".join(c for c in axes.x if c not in axes.kernel)

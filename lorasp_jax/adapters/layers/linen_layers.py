@@ -46,10 +46,10 @@ class LayerCall(NamedTuple):
     """The kernel, equation and input of a layer in one call.
 
     Attributes:
-      module: the layer.
-      name: parameter name of the kernel.
-      equation: the einsum's equation; None for an embedding or a convolution.
-      x: the einsum's input.
+        module: the layer.
+        name: parameter name of the kernel.
+        equation: the einsum's equation; None for an embedding or a convolution.
+        x: the einsum's input.
     """
 
     module: nn.Module
@@ -82,7 +82,7 @@ class LayerCall(NamedTuple):
         """Function (key, kernel [I, O]) that initializes a method's parameters.
 
         Raises:
-          ValueError: the layer does not support the method.
+            ValueError: the layer does not support the method.
         """
         return method.init if self.equation else nnx_layers.lora_init(self.module, method)
 
@@ -101,8 +101,8 @@ def layer_call(module: nn.Module, einsums: nnx_layers.Einsums, args: Any, kwargs
     """Inspect a call of a supported layer.
 
     Raises:
-      ValueError: the layer has a custom matmul or precision, or its equation, input or kernel is
-        missing.
+        ValueError: the layer has a custom matmul or precision, or its equation, input or kernel is
+            missing.
     """
     cls = supported_class(module, einsums)
     if cls is nn.Embed or cls is nn.Conv:

@@ -47,7 +47,7 @@ class EinsumLayer(AdaptedLayer):
     """Mixin for a layer that computes an einsum of its input and its kernel.
 
     Attributes:
-      kernel_equation: see `lorasp_jax.adapters.layers.einsum`.
+        kernel_equation: see `lorasp_jax.adapters.layers.einsum`.
     """
 
     kernel_equation: str
@@ -56,7 +56,7 @@ class EinsumLayer(AdaptedLayer):
         """Compute y, see `einsum.einsum`.
 
         Raises:
-          ValueError: out_sharding is not None.
+            ValueError: out_sharding is not None.
         """
         if out_sharding is not None:
             reject_out_sharding()
@@ -167,9 +167,9 @@ def convolve(layer: Any, a: jax.Array, inputs: jax.Array) -> jax.Array:
     """Convolve inputs with A, using the layer's strides, padding and other settings.
 
     Args:
-      layer: an NNX or Linen convolution; both have the same attribute names.
-      a: LoRA's A, [sizes · I, R].
-      inputs: [..., *spatial, I].
+        layer: an NNX or Linen convolution; both have the same attribute names.
+        a: LoRA's A, [sizes · I, R].
+        inputs: [..., *spatial, I].
     """
     sizes = (layer.kernel_size,) if isinstance(layer.kernel_size, int) else layer.kernel_size
     same = ("strides", "padding", "input_dilation", "kernel_dilation", "dtype", "precision")
@@ -189,8 +189,8 @@ def lora_init(layer: Any, method: Method) -> Callable[[jax.Array, jax.Array], An
     """Function (key, kernel) that initializes LoRA for an embedding or a convolution.
 
     Raises:
-      ValueError: the method is not plain LoRA, its initialization needs the kernel or statistics,
-        or the convolution is grouped or masked.
+        ValueError: the method is not plain LoRA, its initialization needs the kernel or statistics,
+            or the convolution is grouped or masked.
     """
     if type(method) is not LoRA or method.splits_kernel or method.needs_statistics:
         raise ValueError(
@@ -210,20 +210,19 @@ def make_adaptable(layer: nnx.Module, einsums: Einsums) -> AdaptedLayer:
     The layer is not modified; an `AdaptedLayer` is returned as is.
 
     Raises:
-      ValueError: the layer has a custom matmul or precision, its equation cannot be adapted, or an
-        attribute that adapted layers need already exists.
+        ValueError: the layer has a custom matmul or precision, its equation cannot be adapted, or
+            an attribute that adapted layers need already exists.
     """
     if isinstance(layer, AdaptedLayer):
         return layer
     known = supported_class(layer, einsums)
     if isinstance(layer, nnx.Linear) and known is nnx.Linear:
         return to_dense(layer)
-    if known not in (nnx.Embed, nnx.Conv):
-        check_settings(layer)
     if known is nnx.Embed:
         return _with_mixin(layer, EmbedLayer, "embedding")
     if known is nnx.Conv:
         return _with_mixin(layer, ConvLayer, "kernel")
+    check_settings(layer)
     name, equation = kernel_and_equation(layer, known, einsums)
     return _with_mixin(layer, EinsumLayer, name, equation)
 
@@ -234,7 +233,7 @@ def make_adaptable_like(layer: Any, other: AdaptedLayer) -> AdaptedLayer:
     The layer is not modified; it is returned as is if it can already carry the adapter.
 
     Raises:
-      ValueError: the layer is not of the other layer's original class.
+        ValueError: the layer is not of the other layer's original class.
     """
     if isinstance(layer, type(other)):
         return layer
@@ -259,7 +258,7 @@ def kernel_and_equation(layer: Any, known: type | None, einsums: Einsums) -> tup
     """Kernel name and equation of an einsum layer.
 
     Raises:
-      ValueError: the equation cannot be adapted, or the layer has no such kernel.
+        ValueError: the equation cannot be adapted, or the layer has no such kernel.
     """
     assert known is not None
     name, equation = describe_einsum({**EINSUMS, **einsums}[known], layer)
@@ -284,25 +283,19 @@ def check_einsums(einsums: Any) -> None:
 
 
 def describe_einsum(describe: Callable[[Any], Any], layer: Any) -> tuple[str, str | None]:
-    """Call an `Einsums` function; raise ValueError if it fails or returns a wrong type."""
-    try:
-        name, equation = describe(layer)
-    except (TypeError, ValueError, AttributeError) as error:
-        raise ValueError(
-            f"the einsums function of {type(layer).__name__} failed: {error}"
-        ) from error
-    if not isinstance(name, str) or not isinstance(equation, str | None):
-        raise ValueError(
-            f"einsums functions must return (name, equation), got {short((name, equation))}"
-        )
-    return name, equation
+    """Call an `Einsums` function; raise ValueError if it returns a wrong type."""
+    result = describe(layer)
+    is_pair = isinstance(result, tuple) and len(result) == 2
+    if not is_pair or not isinstance(result[0], str) or not isinstance(result[1], str | None):
+        raise ValueError(f"einsums functions must return (name, equation), got {short(result)}")
+    return result
 
 
 def matrices_shape(layer: Any, einsums: Einsums) -> tuple[int, ...]:
     """Shape [..., *batch, I, O] of the kernel matrices of a dense layer or einsum, adapted or not.
 
     Raises:
-      ValueError: the equation cannot be adapted.
+        ValueError: the equation cannot be adapted.
     """
     if isinstance(layer, AdaptedLayer):
         return tuple(layer.kernel_matrices().shape)
@@ -332,7 +325,7 @@ def to_dense(linear: Dense | nnx.Linear) -> Dense:
     """Convert `nnx.Linear` to a `Dense` that shares its variables; a `Dense` is returned as is.
 
     Raises:
-      ValueError: the layer has a custom matmul or precision.
+        ValueError: the layer has a custom matmul or precision.
     """
     if isinstance(linear, Dense):
         return linear

@@ -167,9 +167,9 @@ def fuse_layers(layers: Sequence[Layer], *, copy_kernels: bool = True) -> list[L
     and all have the same explicit dtype.
 
     Args:
-      layers: layers in call order.
-      copy_kernels: whether to copy W, unless one is quantized; best unless the fused layers are
-        called once.
+        layers: layers in call order.
+        copy_kernels: whether to copy W, unless one is quantized; best unless the fused layers are
+            called once.
     """
     # A concatenated W would have to be dequantized, which is what quantization saves.
     copy_kernels = copy_kernels and not any(map(_is_quantized, layers))

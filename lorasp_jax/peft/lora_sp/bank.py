@@ -3,6 +3,8 @@
 Inputs are rows here, so both are stored transposed: U as u [R, O] and V as v [I, R].
 """
 
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 
@@ -45,6 +47,9 @@ class BankMethod(Method):
     the R remaining ones, and their energy is part of E_k.
     """
 
+    score_arrays: ClassVar[tuple[str, ...]]
+    """Names of the router's arrays whose last axis indexes the scores."""
+
     rank: int
     energy_target: float
     alpha: float | None
@@ -59,11 +64,6 @@ class BankMethod(Method):
     def scale(self) -> float:
         """α/R."""
         return 2.0 if self.alpha is None else self.alpha / self.rank
-
-    @property
-    def score_arrays(self) -> tuple[str, ...]:
-        """Names of the router's arrays whose last axis indexes the scores."""
-        raise NotImplementedError
 
     def down(self, params: Params) -> jax.Array:
         """P = [V, W1]: one matmul projects x onto the bank and into the router's hidden layer."""

@@ -39,12 +39,6 @@ class FusedBottleneck(Bottleneck):
     interpret: bool = False
     """Run the kernels in interpret mode, which is slow but needs no GPU."""
 
-    @property
-    def is_supported(self) -> bool:
-        """Whether Triton supports the sizes."""
-        sizes = self.rank, self.num_scores, self.hidden_width
-        return all(size == supported_size(size) for size in sizes)
-
     def pack(self, params: Any) -> Any:
         """Pack the router into one flat array."""
         return PackedTree.of(params["router"])
@@ -107,17 +101,17 @@ def bottleneck_block(
     """Compute the bottleneck for a block of n rows, inside the kernel.
 
     Args:
-      router: b1 [H], w2 [H, S], b2 [S], with S >= R scores.
-      columns: V x [n, R] and x W1 [n, H], of the same dtype.
-      valid: bool [n, 1], False for padding.
-      mask: int32 [n, S], 0 or 1, the gate's mask without gradient. None in the forward pass, which
-        computes it.
-      energy_target: η.
-      scale: α/R.
+        router: b1 [H], w2 [H, S], b2 [S], with S >= R scores.
+        columns: V x [n, R] and x W1 [n, H], of the same dtype.
+        valid: bool [n, 1], False for padding.
+        mask: int32 [n, S], 0 or 1, the gate's mask without gradient. None in the forward pass,
+            which computes it.
+        energy_target: η.
+        scale: α/R.
 
     Returns:
-      z [n, R], the losses' sums over rows, the mask, and [active rank, kept energy], f32 [n, 1]
-      each.
+        z [n, R], the losses' sums over rows, the mask, and [active rank, kept energy], f32 [n, 1]
+        each.
     """
     v_x, hidden = columns
     matmul = _matmul if mask is None else _differentiable_matmul

@@ -16,6 +16,7 @@ choices here are our own, documented where they are made.
 """
 
 import dataclasses
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +25,7 @@ from lorasp_jax.kernels.energy_gate import default_implementation, energy_gate, 
 from lorasp_jax.kernels.low_rank_matmul import Bottleneck
 from lorasp_jax.peft.auxiliary import Aux
 from lorasp_jax.peft.lora_sp.bank import BankMethod, apply_masked_scores, init_bank
-from lorasp_jax.peft.lora_sp.gpu_kernel import FusedBottleneck
+from lorasp_jax.peft.lora_sp.gpu_kernel import FusedBottleneck, supported_size
 from lorasp_jax.peft.lora_sp.losses import Losses, loss_sums
 from lorasp_jax.peft.lora_sp.router import RouterKind, init_output_layer, router_scores
 from lorasp_jax.peft.method import Params, kaiming_uniform
@@ -38,8 +39,10 @@ class LoRASP(BankMethod):
     "softmax", b1 [H], b2 [R]. In total R (I + O) + H (I + R), plus H + R for the biases.
 
     Raises:
-      ValueError: a rank or width below 1, or η outside (0, 1].
+        ValueError: a rank or width below 1, or η outside (0, 1].
     """
+
+    score_arrays: ClassVar[tuple[str, ...]] = ("w2", "b2")
 
     rank: int = 128
     """R, size of the bank; it may exceed I and O (128 throughout the paper)."""
@@ -66,11 +69,6 @@ class LoRASP(BankMethod):
         The paper does not state the width; only 4 reproduces both percentages of the table.
         """
         return cls(rank=rank, energy_target=energy_target, hidden_width=4, router="softmax")
-
-    @property
-    def score_arrays(self) -> tuple[str, ...]:
-        """See `BankMethod.score_arrays`."""
-        return "w2", "b2"
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
         """Initialize V and the router randomly and U to zero; the delta is zero."""
@@ -105,5 +103,6 @@ class LoRASP(BankMethod):
         if self.router != "gelu" or default_implementation() != "pallas":
             return self
         sizes = self.rank, num_scores, self.hidden_width
-        kernel = FusedBottleneck(*sizes, self.energy_target, self.scale)
-        return kernel if kernel.is_supported else self
+        if any(size != supported_size(size) for size in sizes):
+            return self
+        return FusedBottleneck(*sizes, self.energy_target, self.scale)

@@ -57,14 +57,14 @@ def router_scores(
     The GPU kernel traces this function too, so it uses only operations that Triton supports.
 
     Args:
-      router: w2 [H, R], and b1 [H], b2 [R] unless `kind` is "softmax".
-      hidden: x W1, [..., H] of any dtype.
-      kind: the router variant.
-      matmul: multiplies by W2, unless `kind` is "softmax".
+        router: w2 [H, R], and b1 [H], b2 [R] unless `kind` is "softmax".
+        hidden: x W1, [..., H] of any dtype.
+        kind: the router variant.
+        matmul: multiplies by W2, unless `kind` is "softmax".
 
     Returns:
-      scores f32 [..., R], and the logits for the z-loss: the input of ψ [..., R], or that of φ
-      [..., H] if `kind` is "softmax".
+        scores f32 [..., R], and the logits for the z-loss: the input of ψ [..., R], or that of φ
+        [..., H] if `kind` is "softmax".
     """
     hidden = cast_and_clip(hidden)
     if kind == "softmax":

@@ -8,6 +8,7 @@ import pytest
 from lorasp_jax import peft
 from lorasp_jax.adapters.combine.adapter_set import AdapterSet, empty_bank, get_slot, set_slot
 from lorasp_jax.peft import DoRA, LoRA, LoRAMoE, LoRASP
+from tests.models.random_models import with_noise
 
 D_IN, D_OUT = 6, 5
 LORAS = {"a": LoRA(rank=2, alpha=3), "b": LoRA(rank=4, alpha=5, rank_stabilized=True)}
@@ -34,14 +35,10 @@ def x():
 @pytest.fixture(scope="module")
 def members(kernel):
     """Parameters of each adapter, with noise added."""
-    params_by_name = {}
-    for i, (name, method) in enumerate(METHODS.items()):
-        leaves, structure = jax.tree.flatten(method.init(jax.random.key(i), kernel)[0])
-        keys = jax.random.split(jax.random.key(100 + i), len(leaves))
-        noise = [0.5 * jax.random.normal(k, x.shape) for k, x in zip(keys, leaves, strict=True)]
-        noisy = [a + b for a, b in zip(leaves, noise, strict=True)]
-        params_by_name[name] = jax.tree.unflatten(structure, noisy)
-    return params_by_name
+    return {
+        name: with_noise(method.init(jax.random.key(i), kernel)[0], 0.5, i)
+        for i, (name, method) in enumerate(METHODS.items())
+    }
 
 
 @pytest.fixture(scope="module")

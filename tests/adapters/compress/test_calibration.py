@@ -21,11 +21,6 @@ def net():
 
 
 @pytest.fixture(scope="module")
-def batches():
-    return [jax.random.normal(jax.random.key(i), (6, 5)) for i in range(4)]
-
-
-@pytest.fixture(scope="module")
 def moments(net, batches):
     return calibration.input_moments(net, batches)
 

@@ -50,20 +50,12 @@ def test_pruning_inactive_directions_preserves_outputs(method, batches):
         before, after = call(model, x), call(smaller, x)
         np.testing.assert_allclose(after, before, rtol=1e-4, atol=1e-4)
     assert report.output_error < 1e-5
-    assert all((error < 1e-5).all() for error in report.layer_errors.values())
 
 
 @pytest.mark.slow
 def test_a_stack_gets_the_largest_rank_that_a_layer_needs(batches):
     """Three layers need ranks 7, 9 and 8: all get rank 9 and keep the directions they use."""
-    model = lora_sp_model(dataclasses.replace(VARIANTS[0], energy_target=1.0))
     inactive = [[0, 1, 2, 5, 11], [3, 4, 10], [0, 6, 7, 8]]
-    for layer, directions in enumerate(inactive):
-        model = deactivate(model, "blocks", layer, directions)
-    smaller, report = lorasp_jax.prune(model, batches, 0.0, forward=forward)
-    # With η = 1 every positive score is active, even softplus(-30), so nothing is dropped.
-    np.testing.assert_array_equal(report.ranks["blocks"], 12)
-
     method = dataclasses.replace(VARIANTS[0], energy_target=0.99)
     model = lora_sp_model(method)
     for layer, directions in enumerate(inactive):
@@ -114,8 +106,7 @@ def test_a_tolerance_drops_rarely_active_directions_and_reports_the_error(batche
 
 
 @pytest.mark.slow
-def test_layer_errors_ignore_padding():
-    """For a single layer, the layer error equals the output error, over valid tokens only."""
+def test_padding_is_ignored():
     layer = Dense(5, 4, use_bias=False, method=VARIANTS[0], rngs=nnx.Rngs(0))
     model = perturbed(nnx.List([layer]))
     x = jax.random.normal(jax.random.key(3), (2, 20, 5))
@@ -128,7 +119,6 @@ def test_layer_errors_ignore_padding():
     _, clean = lorasp_jax.prune(model, [x], 0.4, forward=valid)
     garbage = jnp.where(mask[..., None], x, 1e3)
     _, padded = lorasp_jax.prune(model, [garbage], 0.4, forward=valid)
-    assert clean.layer_errors["0"] == pytest.approx(clean.output_error, rel=1e-5)
     assert clean.output_error > 1e-3
     assert padded.output_error == pytest.approx(clean.output_error, rel=1e-4)
     np.testing.assert_array_equal(clean.ranks["0"], padded.ranks["0"])

@@ -5,7 +5,6 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 from flax import nnx
 
@@ -84,57 +83,12 @@ def test_methods_on_a_quantized_base(name):
     assert adaptation.count(model) == count
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_gradients_and_training(kind):
-    """Gradients match those with dequantized kernels, and a step reduces the loss."""
-    model = trained(("blocks|inp", LoRA(rank=2)), seed=1, net=quantized(kind))
-
-    def loss(adapters, x, graphdef, frozen):
-        return jnp.mean((nnx.merge(graphdef, adapters, frozen)(x) - 1) ** 2)
-
-    all_gradients = []
-    for one in (model, dequantized(model)):
-        graphdef, adapters, frozen = adaptation.split(one)
-        gradient = jax.jit(jax.grad(loss, (0, 1)), static_argnums=2)
-        all_gradients.append(gradient(adapters, X, graphdef, frozen))
-    for a, b in zip(*map(jax.tree.leaves, all_gradients), strict=True):
-        assert (a != 0).any()
-        assert_close(a, b)
-    graphdef, adapters, frozen = adaptation.split(model)
-    updates = jax.tree.map(lambda g: -0.1 * g, all_gradients[0][0])
-    after = loss(optax.apply_updates(adapters, updates), X, graphdef, frozen)
-    assert after < loss(adapters, X, graphdef, frozen)
-
-
 def test_adapters_on_a_quantized_base_are_saved(tmp_path):
     model = trained(("inp|blocks", SP), seed=1, net=quantized("int8"))
     save_adapters(tmp_path, model)
     assert_close(call(load_adapters(tmp_path, quantized("int8")), X), call(model, X))
     own, _ = lorasp_jax.quantize(load_adapters(tmp_path, NET), [("", "int8")])
     assert_close(call(own, X), call(model, X))
-
-
-def test_merge_dequantizes_only_adapted_kernels():
-    model = trained(("blocks", LoRA(rank=2)), seed=1, net=quantized("nf4"))
-    merged = lorasp_jax.merge(model)
-    assert merged.blocks.kernel.get_value().dtype == jnp.float32
-    assert isinstance(merged.inp.kernel.get_value(), QuantizedKernel)
-    assert_close(call(merged, X), call(model, X))
-    back = lorasp_jax.unmerge(merged, model)
-    assert_close(
-        back.blocks.kernel.get_value(), dequantized(quantized("nf4")).blocks.kernel.get_value()
-    )
-
-
-@pytest.mark.slow
-def test_named_adapters_on_a_quantized_base():
-    models = {
-        n: trained(("", LoRA(rank=i)), seed=i, net=quantized("nf4"))
-        for i, n in ((1, "a"), (2, "b"))
-    }
-    model = lorasp_jax.choose(lorasp_jax.combine(models), ["a", None, "b", "b"])
-    each = [call(m, X) for m in (models["a"], quantized("nf4"), models["b"], models["b"])]
-    assert_close(call(model, X), jnp.stack([y[i] for i, y in enumerate(each)]))
 
 
 def test_adapters_that_split_kernels_come_first():
@@ -181,15 +135,6 @@ def test_rules():
         lorasp_jax.quantize(broken, [("", "nf4")])
     with pytest.raises(ValueError, match="out/kernel is quantized"):
         adaptation.adapt(model, [("out", FullFineTuning())], rngs=nnx.Rngs(0))
-
-
-def test_shared_kernels_stay_shared():
-    tied = nnx.List([nnx.Linear(4, 4, use_bias=False, rngs=nnx.Rngs(i)) for i in range(2)])
-    tied[1].kernel = tied[0].kernel
-    model, errors = lorasp_jax.quantize(tied, [("", "int8")])
-    assert model[0].kernel is model[1].kernel
-    assert errors["0"] == errors["1"] > 0
-    assert size(model) == 4 * 4 + 4 * 4
 
 
 def test_summary_and_aux():

@@ -12,6 +12,7 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io import hugging_face
 from lorasp_jax.dense import Dense
 from tests import GOLDEN
+from tests.models.random_models import with_noise
 
 FOLDER = GOLDEN / "adapter_lora"
 SIZES = (24, 40, 24, 16)
@@ -49,12 +50,7 @@ class Stack(nnx.Module):
 def trained(model, seed=5):
     """Add noise to the adapters, so that none is zero."""
     graphdef, adapters, frozen = adaptation.split(model)
-    leaves, structure = jax.tree.flatten(adapters)
-    keys = jax.random.split(jax.random.key(seed), len(leaves))
-    noise = [
-        leaf + 0.3 * jax.random.normal(k, leaf.shape) for leaf, k in zip(leaves, keys, strict=True)
-    ]
-    return nnx.merge(graphdef, jax.tree.unflatten(structure, noise), frozen)
+    return nnx.merge(graphdef, with_noise(adapters, 0.3, seed), frozen)
 
 
 def adapted(*rules, seed=5):

@@ -7,13 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import safetensors.numpy
-from flax import linen as nn
 from flax import nnx
-from flax.traverse_util import flatten_dict, unflatten_dict
 
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io import hugging_face
-from lorasp_jax.adapters.io.hugging_face_linen import load_peft_linen
 from lorasp_jax.peft import AdaLoRA, DoRA, LoRA
 from tests import GOLDEN
 from tests.adapters.io.peft_folder import (
@@ -88,20 +85,6 @@ def test_round_trip(methods, tmp_path):
     assert np.abs(again(X) - Net()(X)).max() > 0.1
 
 
-def test_adalora_saved_by_peft(tmp_path):
-    rng = np.random.default_rng(0)
-    a, b, e = rng.normal(size=(2, 24)), rng.normal(size=(40, 2)), rng.normal(size=(2, 1))
-    parts = {"lora_A": a, "lora_B": b, "lora_E": e}
-    tensors = {f"base_model.model.lin.0.{k}": v.astype(np.float32) for k, v in parts.items()}
-    safetensors.numpy.save_file(tensors, tmp_path / hugging_face.TENSORS)
-    config = {"peft_type": "ADALORA", "init_r": 6, "target_r": 2, "lora_alpha": 16, "r": 8}
-    (tmp_path / hugging_face.CONFIG).write_text(json.dumps(config))
-    model = hugging_face.load_peft(tmp_path, Net())
-    kernel = adaptation.merge(model).lin[0].kernel.get_value()
-    expected = Net().lin[0].kernel.get_value() + (b @ (a * e)).T * 16 / (6 + 1e-5)
-    np.testing.assert_allclose(kernel, expected, atol=1e-4)
-
-
 def test_patterns_match_name_suffixes(copy):
     edit_config(copy, alpha_pattern={r"lin\.2": 16}, rank_pattern={"2": 4})
     model = hugging_face.load_peft(copy, Net())
@@ -125,11 +108,6 @@ def test_names_that_are_suffixes_of_others(tmp_path):
         strict=True,
     ):
         np.testing.assert_allclose(ours, theirs, atol=1e-4)
-
-
-def test_rank_stabilized(copy):
-    edit_config(copy, use_rslora=True)
-    assert hugging_face.load_peft(copy, Net()).lin[0].method.scale == 4
 
 
 def test_stacks(tmp_path):
@@ -228,29 +206,6 @@ def test_attention_with_head_axes_and_user_defined_einsums(tmp_path):
         np.testing.assert_array_equal(ours[name], value)
     with pytest.raises(ValueError, match=r"'model.head', .* model\."):
         hugging_face.load_peft(tmp_path, base, names=torch_names)
-
-
-def test_linen_attention_loads_the_same_folder(tmp_path):
-    """Outputs match those of merged parameters."""
-
-    class Linen(nn.Module):
-        @nn.compact
-        def __call__(self, x):
-            x = nn.MultiHeadDotProductAttention(2, name="attn")(x)
-            return nn.Dense(4, use_bias=False, name="own")(x)
-
-    updates, x = attention_folder(tmp_path), jax.random.normal(jax.random.key(0), (1, 5, 6))
-    variables = Linen().init(jax.random.key(1), x)
-    adapter, loaded = load_peft_linen(tmp_path, Linen(), variables, x, names=torch_names)
-    by_path = {("attn", "query"): "q_proj", ("attn", "out"): "out_proj", ("own",): "head"}
-    flat = flatten_dict(variables["params"])
-    for path, name in by_path.items():
-        kernel = flat[(*path, "kernel")]
-        flat[(*path, "kernel")] = kernel + updates[name].reshape(kernel.shape)
-    expected = Linen().apply({"params": unflatten_dict(flat)}, x)
-    np.testing.assert_allclose(adapter.apply(loaded, x), expected, rtol=1e-4, atol=1e-4)
-    with pytest.raises(ValueError, match="NNX module"):
-        hugging_face.load_peft(tmp_path, Linen())
 
 
 def test_adapters_on_other_layers_are_kept():

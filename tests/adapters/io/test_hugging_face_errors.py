@@ -1,7 +1,5 @@
 """Invalid and unsupported PEFT folders and adapters are rejected with a clear message."""
 
-import os
-
 import numpy as np
 import pytest
 
@@ -10,25 +8,18 @@ from lorasp_jax.peft import DoRA, LoRA, LoRASP
 from tests.adapters.io.peft_folder import Net, adapted, edit_config, edit_tensors
 
 
-def test_catastrophic_patterns_are_rejected(copy):
-    """The module is named to trigger the backtracking."""
-    edit_tensors(copy, lambda t: {n.replace("lin.0", "a" * 60): v for n, v in t.items()})
-    edit_config(copy, alpha_pattern={"(a+)+b": 8})
-    with pytest.raises(ValueError, match="too long"):
-        hugging_face.load_peft(copy, Net())
-
-
 @pytest.mark.parametrize(
     ("changes", "name"),
     [
         *[({"peft_type": kind}, "LORA") for kind in ("LOHA", "ADALORA")],
         ({"lora_bias": True}, "lora_bias"),
-        ({"lora_dropout": 1.0}, "lora_dropout"),
+        ({"lora_dropout": 1.0}, "dropout must be"),
         ({"use_dora": True}, "lora_magnitude_vector"),
         *[({"lora_alpha": bad}, "lora_alpha") for bad in (None, 0, 1e308, True)],
         *[({name: bad}, name) for name in ("use_rslora", "use_dora") for bad in ("x", 1)],
         *[({"alpha_pattern": bad}, "alpha_pattern") for bad in ({"lin.0": "8"}, 3)],
-        ({"alpha_pattern": {"l(": 8}}, "regular expression"),
+        *[({"alpha_pattern": {p: 8}}, "alpha_pattern has") for p in ("l(", "(a+)+b", "a|b")],
+        ({"alpha_pattern": {"l\\": 8}}, "is damaged"),
         ({"bias": 0}, "bias"),
         ({"init_lora_weights": "pissa"}, "init_lora_weights"),
     ],
@@ -87,10 +78,3 @@ def test_unsupported_adapters_are_not_saved(rules, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         hugging_face.save_peft(tmp_path / "new", model)
     assert not (tmp_path / "new").exists()
-
-
-@pytest.mark.parametrize("name", ["adapter_config.json", "adapter_model.safetensors"])
-def test_files_larger_than_memory(copy, name):
-    os.truncate(copy / name, 2**43)
-    with pytest.raises(ValueError, match=name):
-        hugging_face.load_peft(copy, Net())

@@ -4,9 +4,7 @@ import dataclasses
 import json
 import shutil
 
-import flax.linen as nn
 import huggingface_hub
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,10 +13,10 @@ from flax import nnx
 
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io import hugging_face
-from lorasp_jax.adapters.io.hugging_face_linen import load_peft_linen
 from lorasp_jax.peft import FullFineTuning, LoRA
 from tests import GOLDEN
 from tests.adapters.io.peft_folder import FOLDER, Net, edit_config, edit_tensors
+from tests.models.random_models import with_noise
 
 
 @pytest.mark.parametrize(
@@ -93,10 +91,7 @@ def numbered(path, index):
 def perturbed(model):
     """Add noise to all trainable parameters."""
     graphdef, adapters, frozen = adaptation.split(model)
-    adapters = jax.tree.map(
-        lambda x: x + 0.1 * jnp.cos(jnp.arange(x.size)).reshape(x.shape), adapters
-    )
-    return nnx.merge(graphdef, adapters, frozen)
+    return nnx.merge(graphdef, with_noise(adapters, 0.1), frozen)
 
 
 IDS = jnp.array([[1, 2, 3], [4, 5, 6]])
@@ -123,39 +118,6 @@ def test_round_trip_of_stacks(name, tmp_path):
     assert adaptation.methods(again).keys() == adaptation.methods(model).keys()
     with pytest.raises(ValueError, match="is a stack"):
         hugging_face.load_peft(tmp_path, Stack())
-
-
-class LinenBlock(nn.Module):
-    @nn.compact
-    def __call__(self, x, _):
-        return x + nn.Dense(6, name="lin")(nn.LayerNorm(name="norm")(x)), None
-
-
-class LinenStack(nn.Module):
-    """`Stack` in Linen."""
-
-    @nn.compact
-    def __call__(self, ids):
-        x = nn.Embed(7, 6, name="embed")(ids)
-        scan = nn.scan(LinenBlock, {"params": 0}, split_rngs={"params": True}, length=2)
-        x = nn.DenseGeneral((2, 3), name="split")(scan(name="blocks")(x, None)[0])
-        return nn.Dense(4, name="head")(x.reshape(*ids.shape, 6))
-
-
-@pytest.mark.parametrize("name", RULES)
-def test_linen_loads_the_same_folder(name, tmp_path):
-    """The same base in Linen gives the outputs of the saved NNX model."""
-    base = Stack()
-    model = perturbed(adaptation.adapt(base, RULES[name], rngs=nnx.Rngs(1)))
-    hugging_face.save_peft(tmp_path, model, names=numbered)
-    params = nnx.to_pure_dict(nnx.state(base, nnx.Param))
-    adapter, loaded = load_peft_linen(
-        tmp_path, LinenStack(), {"params": params}, IDS, names=numbered
-    )
-    np.testing.assert_allclose(adapter.apply(loaded, IDS), model(IDS), rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(
-        LinenStack().apply(adapter.merge(loaded, IDS), IDS), model(IDS), rtol=1e-5, atol=1e-5
-    )
 
 
 def test_fully_trained_convolution(tmp_path):

@@ -42,6 +42,10 @@ class Net(nnx.Module):
         return y + second[..., :8], aux
 
 
+ROWS = jnp.sin(jnp.arange(48.0)).reshape(6, 8)
+run = jax.jit(lambda model, x: model(x))
+
+
 def adapted(method, dtype="bfloat16"):
     net = Net(dtype)
     net.second.bias.set_value(jnp.arange(12.0))
@@ -67,11 +71,11 @@ def fused_counts(model):
 def test_fused_layers_match_the_original_ones(name):
     model, x = adapted(METHODS[name], "float32"), jnp.sin(jnp.arange(96.0)).reshape(2, 6, 8)
     mask = jnp.arange(12).reshape(2, 6) % 5 != 0
-    run = jax.jit(lambda model, x: model(x, mask))
-    expected, aux = run(model, x)
+    masked = jax.jit(lambda model, x: model(x, mask))
+    expected, aux = masked(model, x)
     fused = prepare(model)
     assert fused_counts(fused) == [2, 0, 1]
-    actual, actual_aux = run(fused, x)
+    actual, actual_aux = masked(fused, x)
     np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-4)
     assert jax.tree.structure(actual_aux) == jax.tree.structure(aux)
     jax.tree.map(
@@ -89,7 +93,6 @@ def test_wide_layers_match_the_original_ones(monkeypatch, rank):
     arrays = fused.first.fused.get_value()
     assert isinstance(arrays, prepared.SharedProjection)
     assert [kernel.shape[0] for kernel in arrays.kernels] == [8 + rank + -rank % 8] * 2
-    run = jax.jit(lambda model, x: model(x))
     close = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-4)
     jax.tree.map(close, run(fused, x), run(model, x))
 
@@ -99,11 +102,11 @@ def test_fused_stack_matches_the_original_one(name):
     """Check inputs with fewer and with more rows than features."""
     model = adapted(METHODS[name], "float32")
     stack = jax.tree.map(lambda leaf: jnp.stack([leaf, 0.5 * leaf]), model)
-    run = jax.jit(jax.vmap(lambda model, x: model(x), in_axes=(0, None)))
+    mapped = jax.jit(jax.vmap(lambda model, x: model(x), in_axes=(0, None)))
     fused = prepared.fuse_stack(stack)
     for rows in (4, 12):
         x = jnp.sin(jnp.arange(8.0 * rows)).reshape(1, rows, 8)
-        (expected, aux), (actual, actual_aux) = run(stack, x), run(fused, x)
+        (expected, aux), (actual, actual_aux) = mapped(stack, x), mapped(fused, x)
         np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-4)
         assert jax.tree.structure(actual_aux) == jax.tree.structure(aux)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), actual_aux, aux)
@@ -130,25 +133,19 @@ def test_fused_kernel_gets_packed_router_parameters():
     fused = prepare(model)
     params = fused.first.fused.get_value().params
     assert [leaf.shape for leaf in jax.tree.leaves(params)] == [(2, 16 * 32 + 16 + 32)]
-    run = jax.jit(lambda model, x: model(x))
     close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-4)
     jax.tree.map(close, run(fused, x), run(model, x))
 
 
-def test_fused_quantized_layers_match_the_original_ones():
+@pytest.mark.parametrize("copy_kernels", [True, False])
+def test_fused_layers_stay_quantized(copy_kernels):
     model = quantize(adapted(METHODS["lora"], "float32"), [(".*", "int8")]).model
-    fused, x = prepare(model), jnp.sin(jnp.arange(48.0)).reshape(6, 8)
-    assert fused_counts(fused) == [2, 0, 1]
-    np.testing.assert_allclose(fused(x)[0], model(x)[0], rtol=1e-4, atol=1e-4)
-
-
-def test_kernels_stay_quantized_if_they_are_not_copied():
-    model = quantize(adapted(METHODS["lora"], "float32"), [(".*", "int8")]).model
-    expected, x = model(jnp.ones((6, 8)))[0], jnp.ones((6, 8))
-    prepared.fuse_projections(model, copy_kernels=False)
+    expected, x = run(model, ROWS)[0], ROWS
+    prepared.fuse_projections(model, copy_kernels=copy_kernels)
+    assert fused_counts(model) == [2, 0, 1]
     codes = [leaf for leaf in jax.tree.leaves(nnx.state(model)) if leaf.dtype == jnp.int8]
     assert len(codes) == 3
-    np.testing.assert_allclose(model(x)[0], expected, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(run(model, x)[0], expected, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -177,10 +174,13 @@ def test_split_k_equals_matmul():
     np.testing.assert_allclose(half.astype(jnp.float32), x @ matrix, atol=1)
 
 
+def matmuls(model, x):
+    return str(jax.make_jaxpr(lambda x: model(x)[0])(x)).count("dot_general")
+
+
 def test_layers_with_a_shared_input_run_two_matmuls():
     model, x = adapted(METHODS["lora"]), jnp.ones((2, 8), jnp.bfloat16)
-    matmuls = lambda model: str(jax.make_jaxpr(lambda x: model(x)[0])(x)).count("dot_general")  # noqa: E731
-    assert matmuls(model) > matmuls(prepare(model)) == 4
+    assert matmuls(model, x) > matmuls(prepare(model), x) == 4
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
@@ -189,9 +189,8 @@ def test_layers_without_adapters_share_one_matmul(dtype):
     model.second.bias.set_value(jnp.arange(12.0))
     fused = prepare(model)
     assert (type(fused.first), type(fused.third)) == (prepared.Prepared, Dense)
-    matmuls = lambda model: str(jax.make_jaxpr(lambda x: model(x)[0])(x)).count("dot_general")  # noqa: E731
-    assert (matmuls(model), matmuls(fused)) == (3, 2)
-    (actual, actual_aux), (expected, aux) = fused(x), model(x)
+    assert (matmuls(model, x), matmuls(fused, x)) == (3, 2)
+    (actual, actual_aux), (expected, aux) = run(fused, x), run(model, x)
     assert actual.dtype == expected.dtype
     np.testing.assert_allclose(*(y.astype(jnp.float32) for y in (actual, expected)), rtol=1e-2)
     assert jax.tree.structure(actual_aux) == jax.tree.structure(aux)
@@ -199,17 +198,14 @@ def test_layers_without_adapters_share_one_matmul(dtype):
 
 @pytest.mark.parametrize("kind", ["float8", "int8", "nf4"])
 def test_quantized_layers_are_fused_after_they_are_dequantized(kind):
-    model, x = (
-        quantize(Net("float32"), [(".*", kind)]).model,
-        jnp.sin(jnp.arange(48.0)).reshape(6, 8),
-    )
-    expected = model(x)[0]
+    model = quantize(Net("float32"), [(".*", kind)]).model
+    expected = run(model, ROWS)[0]
     assert type(prepare(model).first) is Dense
     dequantize(model)
     fused = prepare(model)
     assert (type(fused.first), type(fused.third)) == (prepared.Prepared, Dense)
     assert {leaf.dtype for leaf in jax.tree.leaves(nnx.state(fused))} == {jnp.dtype("float32")}
-    np.testing.assert_allclose(fused(x)[0], expected, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(run(fused, ROWS)[0], expected, rtol=1e-5, atol=1e-5)
 
 
 def test_layers_without_adapters_are_not_fused_if_that_would_copy():
@@ -241,15 +237,13 @@ def test_layers_of_two_methods_are_fused_individually(second):
     model, x = trained(*rules, seed=1, net=Net("float32")), jnp.ones((2, 8))
     fused = prepare(model)
     assert fused_counts(fused) == [1, int(second == "ada_lora"), 1]
-    (actual, actual_aux), (expected, aux) = fused(x), model(x)
+    (actual, actual_aux), (expected, aux) = run(fused, x), run(model, x)
     np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-4)
     assert jax.tree.structure(actual_aux) == jax.tree.structure(aux)
 
 
-@pytest.mark.parametrize("adapted", [True, False], ids=["adapted", "bare"])
-@pytest.mark.parametrize(
-    "backbone", [pi0, pytest.param(smolvla, marks=pytest.mark.slow)], ids=["pi0", "smolvla"]
-)
+@pytest.mark.parametrize("adapted", mostly_slow([True, False], [True]), ids=["adapted", "bare"])
+@pytest.mark.parametrize("backbone", mostly_slow([pi0, smolvla], [pi0]), ids=["pi0", "smolvla"])
 def test_sampling_follows_the_velocity(backbone, adapted):
     config = backbone.Config.dummy()
     model = random_backbone(config)

@@ -1,6 +1,7 @@
 """LoRA-SP's equations, losses, parameter counts, GPU kernel and equivalence with LoRA."""
 
 import dataclasses
+import functools
 import re
 
 import jax
@@ -25,14 +26,20 @@ def x():
     return jax.random.normal(jax.random.key(0), (3, 7, D_IN))
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def _initial(method, key):
+    return method.init(key, KERNEL)[0]
+
+
 def initial(method, key=1):
-    return jax.jit(lambda key: method.init(key, KERNEL)[0])(jax.random.key(key))
+    return _initial(method, jax.random.key(key))
 
 
 def scores_of(router, x, kind="gelu"):
     return router_scores(router, x @ router["w1"], kind)
 
 
+@jax.jit
 def losses_of(scores, kept_energy=1.0, valid=None):
     """The three losses for scores that are also the logits; every positive score is active."""
     valid = jnp.ones((len(scores), 1), bool) if valid is None else valid
