@@ -3,7 +3,7 @@
 import argparse
 import functools
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -57,14 +57,13 @@ def convert(options: argparse.Namespace, console: Console) -> None:
         raise ValueError(f"--to {options.to} converts exactly one dataset, got {len(sources)}")
     if options.to != "cache" and isinstance(sources[0], cache.Cache):
         sources[0].verify_images()
-    with _progress_bar(f"writing {options.out.name}") as (progress, print_line):
+    with _progress_bar(f"writing {options.out.name}") as progress:
         if options.to == "rlds":
             rlds_export.to_rlds(sources[0], options.out, progress)
         elif options.to == "lerobot":
             lerobot_export.to_lerobot(sources[0], options.out, progress)
         else:
-            wait = f"another process is writing {options.out}; waiting for it"
-            cache.write(sources, options.out, progress, waiting=lambda: print_line(wait))
+            cache.write(sources, options.out, progress)
     episodes = sum(len(source) for source in sources)
     console.print(f"{options.out}: {episodes} episodes", soft_wrap=True, highlight=False)
 
@@ -142,13 +141,10 @@ def _camera(text: str) -> tuple[str, str]:
 
 
 @contextmanager
-def _progress_bar(title: str) -> Iterator[tuple["Report", Callable[[str], None]]]:
-    """Yield a progress callback and a line printer; the callback's first call shows the bar."""
+def _progress_bar(title: str) -> Iterator["Report"]:
+    """Yield a progress callback, whose first call shows the bar."""
     progress = bars(Console(stderr=True), "steps")
     bar = progress.add_task(title, total=None)
-    print_line = functools.partial(
-        progress.console.print, soft_wrap=True, highlight=False, markup=False
-    )
     with ExitStack() as stack:
 
         def report(done: int, total: int) -> None:
@@ -156,7 +152,7 @@ def _progress_bar(title: str) -> Iterator[tuple["Report", Callable[[str], None]]
                 stack.enter_context(progress)
             progress.update(bar, completed=done, total=total)
 
-        yield report, print_line
+        yield report
 
 
 if __name__ == "__main__":
