@@ -73,4 +73,4 @@ def _checksum(array: Any, *, rounded: bool = False) -> int:
     array = np.asarray(array)
     if rounded and jnp.issubdtype(array.dtype, jnp.floating):
         array = array.astype(jnp.bfloat16)
-    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
+    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)

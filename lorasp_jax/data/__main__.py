@@ -1,12 +1,13 @@
 """Inspect or convert datasets: `python -m lorasp_jax.data --help`."""
 
 import argparse
+import dataclasses
 import functools
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
@@ -119,17 +120,13 @@ def _add_keys(parser: argparse.ArgumentParser) -> None:
 
 
 def _keys(options: argparse.Namespace) -> Keys:
-    return Keys(
-        state=options.state,
-        action=options.action,
-        state_numbers=tuple(options.state_numbers),
-        action_numbers=tuple(options.action_numbers),
-        cameras=dict(options.cameras),
-        angles=options.angles,
-        gripper=options.gripper,
-        every=options.every,
-        image_size=options.image_size,
-    )
+    values: dict[str, Any] = {
+        field.name: getattr(options, field.name) for field in dataclasses.fields(Keys)
+    }
+    for name in ("state_numbers", "action_numbers"):
+        values[name] = tuple(values[name])
+    values["cameras"] = dict(options.cameras)
+    return Keys(**values)
 
 
 def _camera(text: str) -> tuple[str, str]:

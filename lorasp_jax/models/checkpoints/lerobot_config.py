@@ -58,10 +58,7 @@ def _types() -> dict[str, Callable[[Fields], BackboneConfig]]:
     types: dict[str, Callable[[Fields], BackboneConfig]] = {}
     for name in backbone.names():
         package = backbone.find(name).__module__.rpartition(".")[0]
-        found = importlib.import_module(f"{package}.lerobot").TYPES
-        if repeated := sorted(types.keys() & found):
-            raise ValueError(f"{package}.lerobot defines {', '.join(repeated)}, as another does")
-        types |= found
+        types |= importlib.import_module(f"{package}.lerobot").TYPES
     return types
 
 

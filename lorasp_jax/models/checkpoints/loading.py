@@ -69,17 +69,11 @@ class ModelFolder:
         except ModelMismatchError as error:
             if config is not None:
                 raise
-            raise ValueError(f"{error}; {self._size_source()}") from error
+            source = native.CONFIG if self.layout == "lerobot" else "the published pi0"
+            raise ValueError(f"{error}; sizes are those of {source}: pass a config") from error
         if unused:
             _log.info("%s: skipped unused tensors %s", self.folder, ", ".join(unused))
         return model
-
-    def _size_source(self) -> str:
-        """Explain where the sizes come from when the caller passed no config."""
-        if self.layout == "openpi":
-            return "openpi stores no sizes, so those of the published pi0 were used: pass a config"
-        policy = self.fields["type"]
-        return f"the sizes come from {self.folder / native.CONFIG}, which has type {policy!r}"
 
 
 def find(where: str | os.PathLike[str]) -> ModelFolder:
