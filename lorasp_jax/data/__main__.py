@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from lorasp_jax.base.bars import bars
-from lorasp_jax.base.errors import parse_arguments, run_command
+from lorasp_jax.base.errors import run_command
 from lorasp_jax.base.files import check_local
 from lorasp_jax.data.keys import Keys
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.data") -> int:
     """Run a command and return its exit code: 0 for success, or one of `lorasp_jax.base.errors`."""
-    options = parse_arguments(parser(program), arguments)
+    options = parser(program).parse_args(arguments)
     import jax  # imported here to keep --help fast
 
     jax.config.update("jax_platforms", "cpu")  # leave accelerators to other processes

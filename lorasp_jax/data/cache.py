@@ -186,10 +186,10 @@ class Cache:
         self.num_steps: int = self.metadata["steps"]
         self.instructions: tuple[str, ...] = tuple(self.metadata["instructions"])
         self._images: dict[str, Any] = {
-            name: self._map(_IMAGE + name, (self.num_steps, *size, 3), verify=False)
+            name: self._map(_IMAGE + name, (self.num_steps, *size, 3))
             for name, size in self.cameras.items()
         }
-        self._columns = self._map_columns()
+        self._columns = {name: self._map(name) for name in ROWS}
         self._end = np.cumsum(self._columns["length"], dtype=np.int64)
 
     def __len__(self) -> int:
@@ -236,13 +236,7 @@ class Cache:
                 self.path / f"{_IMAGE}{name}.npy", images, self.metadata["crc32"][_IMAGE + name]
             )
 
-    def _map_columns(self) -> dict[str, np.ndarray]:
-        shapes = {"state": (self.num_steps, self.metadata["numbers"])}
-        shapes |= {"action": (self.num_steps, None), "length": (None,)}
-        columns = {name: self._map(name, shape) for name, shape in shapes.items()}
-        return columns | {name: self._map(name, columns["length"].shape) for name in ROWS[3:]}
-
-    def _map(self, name: str, shape: tuple[int | None, ...], *, verify: bool = True) -> np.ndarray:
-        """Memory-map a column and check its dtype and shape; None matches any dimension."""
+    def _map(self, name: str, shape: tuple[int, ...] | None = None) -> np.ndarray:
+        """Memory-map a column; verify its checksum unless a shape is given instead."""
         path, dtype = self.path / f"{name}.npy", _DTYPES.get(name.partition("_")[0], np.int32)
-        return map_column(path, dtype, shape, self.metadata["crc32"][name] if verify else None)
+        return map_column(path, dtype, shape or self.metadata["crc32"][name])

@@ -38,29 +38,22 @@ class Column:
         np.lib.format.write_array_header_1_0(self._file, header)
 
 
-def map_column(
-    path: Path, dtype: Any, shape: tuple[int | None, ...], crc32: int | None = None
-) -> np.ndarray:
-    """Memory-map an array; its data is read only to verify a checksum.
+def map_column(path: Path, dtype: Any, expected: int | tuple[int, ...]) -> np.ndarray:
+    """Memory-map an array.
 
     Args:
         path: the .npy file.
         dtype: expected dtype.
-        shape: expected shape; None matches any dimension.
-        crc32: expected checksum of the array's bytes; None skips the check.
+        expected: checksum of the array's bytes, for which all are read, or its shape.
 
     Raises:
         ValueError: the file is missing or damaged.
     """
     with as_value_error(path):
         array: Any = np.load(check_regular(path, path.parent), mmap_mode="r")
-        expected = tuple(n if n else m for n, m in zip(shape, array.shape, strict=True))
-        if array.shape != expected or array.dtype != np.dtype(dtype):
-            raise ValueError(
-                f"expected {np.dtype(dtype).str} {expected}, got {array.dtype.str} {array.shape}"
-            )
-    if crc32 is not None:
-        verify_column(path, array, crc32)
+        found = array.shape if isinstance(expected, tuple) else zlib.crc32(array.data)
+        if array.dtype != np.dtype(dtype) or found != expected:
+            raise ValueError("its type, shape or checksum does not match")
     return array.view(np.ndarray)
 
 

@@ -1,7 +1,6 @@
 """Kernels of equal size with different heads are different models: every layout rejects them."""
 
 import dataclasses
-import functools
 import json
 
 import numpy as np
@@ -113,19 +112,9 @@ def test_native_hash_covers_the_config(tower, model, tmp_path):
         models.load(tmp_path)
 
 
-@pytest.mark.parametrize("layout", ["openpi", "lerobot", "ours"])
-def test_saving_requires_a_matching_config(layout, tmp_path):
-    model = random_backbone(CONFIG)
-    model.config = dataclasses.replace(CONFIG, vocabulary=CONFIG.vocabulary + 1)
-    save = models.save if layout == "ours" else functools.partial(published.save, layout=layout)
-    with pytest.raises(ValueError, match="language/embedding"):
-        save(tmp_path, model)
-    assert not list(tmp_path.iterdir())
-
-
 UNRELATED_CONFIGS = [
     ({"architectures": ["SmolVLMForConditionalGeneration"]}, "contains no model"),
-    ({"type": "pi0"}, r"lacks .*config\.json.* 'pi0'"),
+    ({"type": "pi0"}, r"lacks .*sizes are those of config\.json"),
     *[({"type": "smolvla", "num_vlm_layers": bad}, "depth") for bad in ("x", 1e30, 10**9)],
     ({"type": "smolvla", "chunk_size": 1.5}, "chunk"),
     ({"type": "smolvla", "expert_width_multiplier": 1e400}, "infinity"),

@@ -9,10 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from lorasp_jax.base.files import TEXT_BYTES, RefusedError, check_memory, check_only_files
-
-MANIFEST = "manifest.ocdbt"
-"""Root file of a TensorStore database, read whole; a checkpoint may have several."""
+from lorasp_jax.base.files import check_memory, check_only_files
 
 
 def check(folder: Path) -> None:
@@ -24,10 +21,7 @@ def check(folder: Path) -> None:
     """
     check_only_files(folder)
     for path in folder.rglob("*"):
-        size = path.stat().st_size
-        check_memory(size, path)
-        if path.name == MANIFEST and size > TEXT_BYTES:
-            raise RefusedError(f"{path} must have at most {TEXT_BYTES} bytes, got {size}")
+        check_memory(path.stat().st_size, path)
 
 
 def suppress_repeated_errors() -> None:
