@@ -199,9 +199,10 @@ def reference(model, loss_of):
     return jax.jit(jax.value_and_grad(loss_of(remat="none")))(nnx.split(model)[1])
 
 
-def test_remat_does_not_change_gradients(model, loss_of, reference):
+def test_remat_does_not_change_gradients(backbone, model, loss_of, reference):
+    """Of SmolVLA, which scans its layers in the same way, with one policy."""
     close = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5)
-    for remat in ("products", "narrow", "full"):
+    for remat in ("products", "narrow", "full") if backbone is pi0 else ("full",):
         result = jax.jit(jax.value_and_grad(loss_of(remat=remat)))(nnx.split(model)[1])
         jax.tree.map(close, result, reference)
 
