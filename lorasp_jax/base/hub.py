@@ -91,7 +91,8 @@ def _is_shipped(path: Path) -> bool:
 def _not_found_message(name: str, path: Path) -> str:
     inside = path.relative_to(shipped.ROOT) if path.is_relative_to(shipped.ROOT) else path
     if _is_shipped(inside):
-        return shipped.missing_base_message(name)
+        found = sorted(file.parent.name for file in shipped.ROOT.glob("assets/*/config.json"))
+        return f"{name} does not exist; bases in {shipped.ROOT / shipped.BASES}: {', '.join(found)}"
     if REPOSITORY.fullmatch(name):
         return f"{name} does not exist; for a Hub repository, pass {HUB}{name}"
     return f"{name} does not exist; pass a path, {HUB}owner/name or gs://bucket/path"

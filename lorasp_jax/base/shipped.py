@@ -15,9 +15,3 @@ BASES, EXPERIMENTS = "assets", "configs"
 def is_under(path: Path, folder: str) -> bool:
     """Return whether a relative path is below a shipped folder, such as assets/pi0_nano."""
     return path.parts[:1] == (folder,) and len(path.parts) > 1 and ".." not in path.parts
-
-
-def missing_base_message(name: str) -> str:
-    """Return the error message for a missing base in assets/; it lists the bases that exist."""
-    bases = ", ".join(sorted(file.parent.name for file in ROOT.glob(f"{BASES}/*/config.json")))
-    return f"{name} does not exist; bases in {ROOT / BASES}: {bases or 'none'}"

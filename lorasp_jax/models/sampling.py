@@ -23,11 +23,7 @@ if TYPE_CHECKING:
     from lorasp_jax.models.backbone import Backbone
 
 
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["weights"],
-    meta_fields=["structure", "config", "methods"],
-)
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sampler:
     """Samples action chunks from a backbone, with input-independent results precomputed once.
@@ -41,10 +37,10 @@ class Sampler:
     """
 
     weights: list[jax.Array]
-    structure: Any
+    structure: Any = dataclasses.field(metadata={"static": True})
     """Graph definitions and treedef that rebuild the modules from `weights`."""
-    config: BackboneConfig
-    methods: tuple[Method, ...]
+    config: BackboneConfig = dataclasses.field(metadata={"static": True})
+    methods: tuple[Method, ...] = dataclasses.field(metadata={"static": True})
     """Distinct adapter methods of the backbone."""
 
     @classmethod

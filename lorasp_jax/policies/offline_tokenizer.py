@@ -14,6 +14,7 @@ import tokenizers
 from tokenizers import models, normalizers, pre_tokenizers
 
 from lorasp_jax.models.config import VOCABULARY_SIZE
+from lorasp_jax.policies.prompts import pad
 
 _SPECIAL = ("[PAD]", "[UNK]")
 _CHARACTERS = tuple(chr(code) for code in range(33, 127) if not chr(code).isupper())
@@ -72,14 +73,10 @@ class Offline:
                 outside the vocabulary or words of more than 100 characters.
         """
         del complete
-        ids = np.zeros((len(texts), max_tokens), np.int32)
-        valid = np.zeros((len(texts), max_tokens), bool)
-        for row, text in enumerate(texts):
-            tokens = _tokenizer().encode(text).ids
-            if not 0 < len(tokens) <= max_tokens:
-                raise ValueError(f"{text!r} must have 1 to {max_tokens} tokens, got {len(tokens)}")
-            if VOCABULARY["[UNK]"] in tokens:
+        rows = [_tokenizer().encode(text).ids for text in texts]
+        for text, row in zip(texts, rows, strict=True):
+            if not 0 < len(row) <= max_tokens:
+                raise ValueError(f"{text!r} must have 1 to {max_tokens} tokens, got {len(row)}")
+            if VOCABULARY["[UNK]"] in row:
                 raise ValueError(f"cannot encode {text!r}: only ASCII words up to 100 characters")
-            ids[row, : len(tokens)] = tokens
-            valid[row, : len(tokens)] = True
-        return ids, valid
+        return pad(texts, rows, max_tokens, pad=0)

@@ -55,7 +55,8 @@ def read(where: str | os.PathLike[str], *, dataset: str = "") -> Statistics:
     """
     path = hub.local(where)
     for pattern, reader in _READERS.items():
-        files = [path] if path.is_file() else _files(path, pattern)
+        found = [path] if path.is_file() else sorted(path.glob(pattern))
+        files = [file for file in found if file.is_file()]
         if files and files[0].match(pattern.rpartition("/")[2]):
             with as_value_error(files[0], safetensors.SafetensorError):
                 groups = reader(files)
@@ -139,11 +140,6 @@ _READERS: dict[str, Callable[[list[Path]], dict[str, Stats]]] = {
     PIPELINES[0]: _policy,
     "*.safetensors": _weights,
 }
-
-
-def _files(folder: Path, pattern: str) -> list[Path]:
-    """Return the files that match the pattern, without folders."""
-    return [path for path in sorted(folder.glob(pattern)) if path.is_file()]
 
 
 def _arrays(stats: Mapping[str, Any]) -> dict[str, np.ndarray]:

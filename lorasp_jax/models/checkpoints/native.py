@@ -75,7 +75,12 @@ def save(folder: Folder, model: Any) -> None:
         index = {"metadata": split.metadata, "weight_map": split.tensor_to_filename}
         files[INDEX] = json.dumps(index, indent=1).encode()
     files[CONFIG] = (json.dumps(description, indent=1) + "\n").encode()
-    _write(folder, files)
+    folder.mkdir(parents=True, exist_ok=True)
+    for file, data in files.items():
+        write_bytes(folder / file, data)
+    for stale in {*folder.glob("model*.safetensors"), folder / INDEX}:
+        if stale.name not in files:
+            stale.unlink(missing_ok=True)
 
 
 def base_arrays(model: nnx.Module) -> dict[str, np.ndarray]:
@@ -89,16 +94,6 @@ def base_arrays(model: nnx.Module) -> dict[str, np.ndarray]:
     if is_quantized(model):
         raise ValueError("saving needs unquantized kernels: save the base before quantizing")
     return {name: np.asarray(leaf) for name, leaf in named_arrays(model).items()}
-
-
-def _write(folder: pathlib.Path, files: Mapping[str, bytes]) -> None:
-    """Write files by name, and delete weight files of a previous model."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for file, data in files.items():
-        write_bytes(folder / file, data)
-    for stale in {*folder.glob("model*.safetensors"), folder / INDEX}:
-        if stale.name not in files:
-            stale.unlink(missing_ok=True)
 
 
 def load_native(folder: Folder, config: Any = None) -> Any:
