@@ -181,6 +181,11 @@ def test_other_arguments(call, name, tmp_path):
     assert not (tmp_path / "new").exists()
 
 
+def test_long_values_are_truncated():
+    check_error(lambda: lorasp_jax.adapt(NET, [(LONG, METHOD)], **RNGS), "qqq")
+    check_error(lambda: LoRA(initialization=LONG), "qqq")
+
+
 def test_full_fine_tuning_of_an_adapted_kernel():
     rules = [("kernel$", FullFineTuning()), ("inp", METHOD)]
     check_error(lambda: lorasp_jax.adapt(NET, rules, **RNGS), "inp/kernel")
