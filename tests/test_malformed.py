@@ -157,10 +157,7 @@ DAMAGE: dict[str, list[Damage]] = {
     ],
     "statistics": [cut("stats.json"), field("stats.json", "action/mean", [HUGE])],
     "tokenizer": [missing("*.json"), cut("*.json"), field("*.json", "model/vocab", None)],
-    "run": [
-        *[cut("results.json"), missing("config.json"), field("config.json", "tasks", 3)],
-        *[field("results.json", name, bad) for name in ("tasks", "seconds") for bad in (3, None)],
-    ],
+    "run": [cut("results.json"), cut("config.json")],
     "adapter": [
         *[missing("adapter.json"), cut("adapter.json"), cut(TENSORS[0]), *BAD_TENSORS],
         *[field("adapter.json", "version", 1), field("adapter.json", "sha256", None)],

@@ -93,11 +93,11 @@ class _Writer:
         self._columns: dict[str, Column] = {}
 
     def complete(self) -> None:
-        """Close all files and write the header."""
+        """Write the lengths of all columns, and cache.json."""
         if not self.num_steps:
             raise ValueError("there are no episodes to write")
         for column in self._columns.values():
-            column.close()
+            column.complete()
         header = {"format": FORMAT, **self._metadata, "steps": self.num_steps}
         header |= {"tasks": self._tasks, "instructions": self._instructions}
         header["crc32"] = {name: column.crc32 for name, column in self._columns.items()}

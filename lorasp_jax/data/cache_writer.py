@@ -14,28 +14,28 @@ class Column:
 
     def __init__(self, path: Path, like: np.ndarray) -> None:
         """Create an empty file for rows of the same dtype and shape as those of `like`."""
-        self._file = path.open("wb")
+        self._path = path
         self._header = {"descr": np.lib.format.dtype_to_descr(like.dtype), "fortran_order": False}
         self._row_shape, self._length, self.crc32 = like.shape[1:], 0, 0
-        self._write_header()
+        self._write_header("wb")
 
     def append(self, rows: np.ndarray) -> None:
         """Append rows."""
         rows = np.ascontiguousarray(rows)
-        self._file.write(rows.data)
+        with self._path.open("ab") as file:
+            file.write(rows.data)
         self.crc32 = zlib.crc32(rows.data, self.crc32)
         self._length += len(rows)
 
-    def close(self) -> None:
-        """Write the final length and close the file."""
-        self._file.seek(0)
-        self._write_header()
-        self._file.close()
+    def complete(self) -> None:
+        """Write the final length."""
+        self._write_header("r+b")
 
-    def _write_header(self) -> None:
+    def _write_header(self, mode: str) -> None:
         # NumPy pads the header so that the first dimension can grow in place.
         header = self._header | {"shape": (self._length, *self._row_shape)}
-        np.lib.format.write_array_header_1_0(self._file, header)
+        with self._path.open(mode) as file:
+            np.lib.format.write_array_header_1_0(file, header)
 
 
 def map_column(path: Path, dtype: Any, expected: int | tuple[int, ...]) -> np.ndarray:
