@@ -88,10 +88,11 @@ def in_float8(monkeypatch):
     jax.clear_caches()
 
 
-def test_a_float8_sampler_gives_the_actions_of_its_model(in_float8):
-    """Of the kernels in float8, `up_proj` has an adapter, and the two others have none."""
+@pytest.mark.parametrize("adapted", [pytest.param(True, marks=pytest.mark.slow), False])
+def test_a_float8_sampler_gives_the_actions_of_its_model(in_float8, adapted):
     model, obs = random_backbone(DUMMY), observation(DUMMY, 2)
-    model = trained(("(q|up)_proj", METHODS["lora"]), seed=1, net=model, size=0.1)
+    if adapted:
+        model = trained((".*_proj", METHODS["lora_sp"]), seed=1, net=model, size=0.1)
     model = cast(Any, quantize(model, [(".*", "float8")]).model)
     noise = jax.random.normal(jax.random.key(0), (2, DUMMY.chunk, DUMMY.action_dim))
 
