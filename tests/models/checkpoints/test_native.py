@@ -54,7 +54,7 @@ def test_config_sets_the_runtime_fields(folder):
 def test_hash_covers_the_base_without_adapters(folder, model):
     loaded = models.load(folder)
     assert models.weights_hash(loaded) == models.weights_hash(folder)
-    adapted = lorasp_jax.adapt(loaded, [("^action", LoRA(rank=2))], rngs=nnx.Rngs(0))
+    adapted = lorasp_jax.adapt(loaded, [("state_proj", LoRA(rank=2))], rngs=nnx.Rngs(0))
     assert models.weights_hash(adapted) == models.weights_hash(folder)
     assert models.weights_hash(model) != models.weights_hash(folder)  # not yet rounded to bf16
     for has_adapters in (adapted, lorasp_jax.combine({"own": adapted})):
