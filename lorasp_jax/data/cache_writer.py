@@ -55,9 +55,3 @@ def map_column(path: Path, dtype: Any, expected: int | tuple[int, ...]) -> np.nd
         if array.dtype != np.dtype(dtype) or found != expected:
             raise ValueError("its type, shape or checksum does not match")
     return array.view(np.ndarray)
-
-
-def verify_column(path: Path, array: np.ndarray, crc32: int) -> None:
-    """Raise ValueError unless an array, mapped from `path`, has this checksum."""
-    if zlib.crc32(array.data) != crc32:
-        raise ValueError(f"{path} is damaged (its checksum does not match)")
