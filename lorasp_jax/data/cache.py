@@ -233,11 +233,8 @@ class Cache:
             ValueError: a file is damaged.
         """
         for name, images in self._images.items():
-            path, expected = (
-                self.path / f"{_IMAGE}{name}.npy",
-                self.metadata["crc32"][_IMAGE + name],
-            )
-            if zlib.crc32(images.data) != expected:
+            path = self.path / f"{_IMAGE}{name}.npy"
+            if zlib.crc32(images.data) != self.metadata["crc32"][_IMAGE + name]:
                 raise ValueError(f"{path} is damaged (its checksum does not match)")
 
     def _map(self, name: str, shape: tuple[int, ...] | None = None) -> np.ndarray:
