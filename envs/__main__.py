@@ -15,7 +15,7 @@ from envs.experts.collection import Record
 from envs.names import MODES, names
 from envs.scene import distractors
 from lorasp_jax.base import compilation_cache as cache
-from lorasp_jax.base.errors import parse_arguments, run_command
+from lorasp_jax.base.errors import run_command
 
 _DEFAULT = "(default: %(default)s)"
 
@@ -25,10 +25,10 @@ def main(
 ) -> int:
     """Run a command and return its exit code.
 
-    The code is 0 on success, 2 after an error, 130 if interrupted and 141 if stdout was closed.
+    The code is 0 on success, 2 after an error, and 130 if interrupted.
     `program` is the name shown in help and errors; `record` is as in `envs.collect`.
     """
-    options = parse_arguments(parser(program), arguments)
+    options = parser(program).parse_args(arguments)
     options.record = record
     console = Console(stderr=True)
     # Preallocating GPU memory would add a second to commands that take half a minute (measured).

@@ -1,7 +1,4 @@
-"""Small Gemma models: Flax's example if it is importable, and a copy with the same layers.
-
-Flax's example is not a package: add examples/gemma of the Flax repository to `PYTHONPATH`.
-"""
+"""A small Gemma model with the layers of Flax's example (examples/gemma), which is no package."""
 
 import jax
 import jax.numpy as jnp
@@ -57,29 +54,3 @@ class Gemma(nnx.Module):
         for layer in self.layers:
             x = layer(x, mask)
         return self.embedder.attend(self.final_norm(x)), cache
-
-
-def flax_gemma(rngs):
-    """Return Flax's example at the same size."""
-    from modules import AttentionType  # pyright: ignore[reportMissingImports]
-    from transformer import Transformer  # pyright: ignore[reportMissingImports]
-    from transformer_cfg import (  # pyright: ignore[reportMissingImports]
-        QueryPreAttentionNormalisation,
-        TransformerConfig,
-    )
-
-    config = TransformerConfig(
-        num_layers=2,
-        num_embed=VOCABULARY,
-        embed_dim=WIDTH,
-        hidden_dim=MLP,
-        num_heads=HEADS,
-        head_dim=HEAD,
-        num_kv_heads=KV_HEADS,
-        final_logit_softcap=None,
-        use_post_attn_norm=False,
-        use_post_ffw_norm=False,
-        attention_types=[AttentionType.GLOBAL] * 2,
-        query_pre_attn_norm=QueryPreAttentionNormalisation.BY_ONE_OVER_SQRT_HEAD_DIM,
-    )
-    return Transformer(config, rngs=rngs)

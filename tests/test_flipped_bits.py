@@ -91,7 +91,6 @@ def read_dataset(folder: Path) -> Any:
     return (
         source.metadata,
         [leaves(source.episode(n)) for n in range(len(source))],
-        leaves(source.statistics),
     )
 
 

@@ -1,6 +1,5 @@
 """Test that `--help` does not import slow packages or start a JAX backend."""
 
-import os
 import re
 import subprocess
 import sys
@@ -84,22 +83,3 @@ def test_unknown_name_fails_before_slow_imports(option):
     )
     assert "'juggle': choose from" in process.stderr
     assert_nothing_slow(process)
-
-
-@pytest.mark.parametrize(
-    "arguments", [["train.py"], ["-m", "envs"], ["-m", "lorasp_jax.data"]], ids=str
-)
-def test_closed_pipe_prints_no_error(arguments):
-    read_end, write_end = os.pipe()
-    os.close(read_end)
-    process = subprocess.run(
-        [sys.executable, *arguments, "--help"],
-        cwd=ROOT,
-        env={name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"},
-        stdout=write_end,
-        stderr=subprocess.PIPE,
-        text=True,
-        check=False,
-    )
-    os.close(write_end)
-    assert (process.returncode, process.stderr) == (141, "")

@@ -1,4 +1,4 @@
-"""Test that malformed files are refused in one line and not modified; `test_fuzz` tries more."""
+"""Test that malformed files are refused in one line and not modified."""
 
 import hashlib
 import json
@@ -22,9 +22,12 @@ from lorasp_jax.base.digest import DIGEST, with_digest
 from lorasp_jax.data import cache
 from lorasp_jax.data.opening import open_source
 from lorasp_jax.peft import LoRASP
+from lorasp_jax.policies import statistics_files, tokenizer
+from lorasp_jax.report.html import write_report
 from tests.data.lerobots import GOLDEN, digest, golden
 from tests.envs.datasets.test_episodes import make
 from tests.malformed import Net, check_refusal
+from tests.runs import finish
 
 NAN, HUGE = float("nan"), 1e999
 Damage = Callable[[Path], None]
@@ -123,18 +126,6 @@ LEROBOT = [
 ]
 METADATA = {"format": ["x"], "cameras": [3, ["front"]], "control_dt": ["x", 0, NAN], "steps": ["x"]}
 METADATA |= {"instructions": [3, []], "actions": ["x"]}
-HEADER = {
-    "format": ["x"],
-    "cameras": [{"front": [8, 8]}, {"side": "xy"}],
-    "control_dt": [0.0, HUGE],
-}
-HEADER |= {
-    "steps": [0, HUGE],
-    "numbers": [5],
-    "crc32": [{}],
-    "crc32/state": [1],
-    "tasks": [[], "x"],
-}
 METHODS = {"": [[], {}, {"nowhere": {}}], "/lin~0/method": ["lorra", None], "/lin~0/unknown": [1]}
 METHODS |= {"/lin~0/rank": ["8", 0, NAN, 4, 10**9], "/lin~0/router": ["x"]}
 PEFT = {"peft_type": [None, "LOHA"], "lora_alpha": ["x", 0, HUGE], "use_dora": [True, "x"]}
@@ -156,14 +147,17 @@ DAMAGE: dict[str, list[Damage]] = {
         *[field("metadata.json", name, bad) for name, values in METADATA.items() for bad in values],
     ],
     "cache": [
-        *[missing("state.npy"), cut(cache.HEADER), cut("image_side.npy"), cut(cache.STATISTICS)],
-        *[field(cache.HEADER, name, bad) for name, values in HEADER.items() for bad in values],
+        *[missing("state.npy"), cut(cache.HEADER), cut("image_side.npy")],
+        *[field(cache.HEADER, "format", bad) for bad in ("x", None)],
     ],
     "npz": [
         *[missing("*.npz"), cut("*.npz"), array("state", np.full((3, 4, 7), NAN, np.float32))],
         *[array("action", np.zeros((3, 4, 6), np.float32)), array("length", [5, 0, 7])],
         array("image/side", np.zeros((3, 8, 8, 8, 3), np.uint8)),
     ],
+    "statistics": [cut("stats.json"), field("stats.json", "action/mean", [HUGE])],
+    "tokenizer": [missing("*.json"), cut("*.json"), field("*.json", "model/vocab", None)],
+    "run": [cut("results.json"), cut("config.json")],
     "adapter": [
         *[missing("adapter.json"), cut("adapter.json"), cut(TENSORS[0]), *BAD_TENSORS],
         *[field("adapter.json", "version", 1), field("adapter.json", "sha256", None)],
@@ -191,6 +185,9 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "npz": lambda folder: read(folder / "episodes.npz"),
     "adapter": lambda folder: load_adapters(folder, Net()),
     "peft": lambda folder: load_peft(folder, Net()),
+    "run": write_report,
+    "statistics": statistics_files.read,
+    "tokenizer": tokenizer.load_tokenizer,
 }
 
 
@@ -204,6 +201,13 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     model = adaptation.adapt(Net(), [(".*", LoRASP(rank=8, hidden_width=4))], rngs=nnx.Rngs(0))
     save_adapters(at / "adapter", model)
     folders = {name: at / name for name in ("rlds", "cache", "npz", "adapter")}
+    for name in ("run", "tokenizer"):
+        folders[name] = at / name
+        folders[name].mkdir()
+    finish(at / "run")
+    file = GOLDEN / "tokenizers" / "smolvlm_like_tokenizer.json"
+    shutil.copy(file, at / "tokenizer" / "tokenizer.json")
+    folders["statistics"] = golden("v3") / "meta"
     folders |= {f"lerobot {version}": golden(version) for version in ("v21", "v3")}
     return folders | {"peft": GOLDEN / "adapter_lora"}
 

@@ -24,12 +24,10 @@ POSITIONS = jnp.broadcast_to(jnp.arange(5), (2, 5))
 MASK = jnp.broadcast_to(jnp.tril(jnp.ones((5, 5), bool)), (2, 5, 5))
 
 
-@pytest.fixture(scope="module", params=["own", "flax"])
-def gemma(request):
-    """Return a Gemma with random weights; Flax's example initializes some to zero."""
-    if request.param == "flax":
-        pytest.importorskip("transformer", reason="flax/examples/gemma is not on the path")
-    model = (gemmas.Gemma if request.param == "own" else gemmas.flax_gemma)(nnx.Rngs(0))
+@pytest.fixture(scope="module")
+def gemma():
+    """Return a Gemma with random weights."""
+    model = gemmas.Gemma(nnx.Rngs(0))
     graphdef, params, rest = nnx.split(model, nnx.Param, ...)
     return nnx.merge(graphdef, with_noise(params, 0.2), rest)
 

@@ -1,17 +1,14 @@
 """Report a command's errors on one line; only bugs show a traceback.
 
 Bad input (ValueError everywhere in this project), inaccessible files and exhausted memory are not
-bugs. Nothing is reported if the reader of stdout has closed the pipe.
+bugs.
 """
 
-import argparse
 import errno
 import importlib.metadata
 import os
 import re
-import select
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # the judge runs where Rich is not installed
@@ -21,36 +18,12 @@ REFUSED = 2
 """Exit code after bad input."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells report SIGINT."""
-BROKEN_PIPE = 141
-"""Exit code if the reader of stdout has closed the pipe, as shells report SIGPIPE."""
 MAX_LENGTH = 1000
 """Maximum number of characters in a message."""
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Error numbers of writes that ran out of space."""
-_STDOUT = 1
 _REQUIREMENTS = {"PIL": "pillow", "can": "piper-sdk", "warp": "mujoco-mjx[warp]"}
 """Requirements that bring modules of another name."""
-
-
-def parse_arguments(
-    parser: argparse.ArgumentParser, arguments: Sequence[str]
-) -> argparse.Namespace:
-    """Parse the options of a command.
-
-    Raises:
-        SystemExit: after help or bad options, as in argparse; with code `BROKEN_PIPE` if the reader
-            of stdout has closed the pipe.
-    """
-    try:
-        return parser.parse_args(arguments)
-    except SystemExit:
-        try:
-            sys.stdout.flush()  # otherwise Python flushes at exit and reports an error
-        except BrokenPipeError as error:
-            if _stdout_is_closed():
-                raise SystemExit(BROKEN_PIPE) from error
-            raise
-        raise
 
 
 def run_command(
@@ -88,8 +61,6 @@ def report_error(error: Exception, errors: "Console", remedy: str = "") -> int:
     Returns:
         The exit code.
     """
-    if isinstance(error, BrokenPipeError) and _stdout_is_closed():
-        return BROKEN_PIPE
     if (reason := describe(error, remedy)) is None:
         raise error
     # Names on the command line are not always valid Unicode.
@@ -133,18 +104,6 @@ def missing_group(error: ModuleNotFoundError) -> str | None:
         return None
     smallest = min(having, key=lambda name: len(groups[name]))
     return f'{module} is not installed: pip install "lorasp_jax[{smallest}]"'
-
-
-def _stdout_is_closed() -> bool:
-    """Return whether the reader of stdout has closed it; if so, discard further output."""
-    poll = select.poll()
-    poll.register(_STDOUT, select.POLLOUT)
-    if not any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0)):
-        return False
-    null = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(null, _STDOUT)  # otherwise Python flushes again at exit and reports an error
-    os.close(null)
-    return True
 
 
 def _is_out_of_memory(error: Exception) -> bool:

@@ -23,11 +23,8 @@ _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
 _FAILURES = (
     *(OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, ArithmeticError),
     *(RuntimeError, zipfile.BadZipFile, zlib.error, struct.error),
-    *(
-        ImportError,
-        SyntaxError,
-        tokenize.TokenError,
-    ),  # of tfds without TensorFlow, of NumPy headers
+    # Of tfds without TensorFlow, and of NumPy headers.
+    *(ImportError, SyntaxError, tokenize.TokenError),
 )
 
 

@@ -3,6 +3,7 @@
 Only hf:// paths reach the Hub, so a missing folder never resolves to a repository of the same name.
 """
 
+import importlib
 import os
 import re
 import sys
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lorasp_jax.base import shipped
-from lorasp_jax.base.files import join_inside
+from lorasp_jax.base.files import first_line, join_inside
 from lorasp_jax.base.locks import locked
 from lorasp_jax.base.writing import atomic_file, atomic_folder
 
@@ -51,6 +52,7 @@ def local(
 
     Raises:
         ValueError: `where` does not exist, is unreachable, or is an unsupported URL.
+        ModuleNotFoundError: gcsfs, which reads gs:// URLs, is not installed.
     """
     name, path = os.fspath(where), Path(where)
     if name.startswith(HUB):
@@ -89,7 +91,8 @@ def _is_shipped(path: Path) -> bool:
 def _not_found_message(name: str, path: Path) -> str:
     inside = path.relative_to(shipped.ROOT) if path.is_relative_to(shipped.ROOT) else path
     if _is_shipped(inside):
-        return shipped.missing_base_message(name)
+        found = sorted(file.parent.name for file in shipped.ROOT.glob("assets/*/config.json"))
+        return f"{name} does not exist; bases in {shipped.ROOT / shipped.BASES}: {', '.join(found)}"
     if REPOSITORY.fullmatch(name):
         return f"{name} does not exist; for a Hub repository, pass {HUB}{name}"
     return f"{name} does not exist; pass a path, {HUB}owner/name or gs://bucket/path"
@@ -114,12 +117,15 @@ def _from_hub(name: str, only: list[str] | None, repository: str) -> Path:
     except (OSError, ValueError, HfHubHTTPError) as error:
         raise ValueError(
             f"cannot download {HUB}{name}: not found, access denied, or no connection "
-            f"({_first_line(error)})"
+            f"({first_line(error)})"
         ) from error
 
 
 def _from_bucket(url: str) -> Path:
     import fsspec
+
+    if url.startswith("gs://"):
+        importlib.import_module("gcsfs")  # whose absence fsspec would report in its own words
 
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "lorasp_jax"
     target = cache / url.rstrip("/").replace("://", "/", 1)
@@ -128,11 +134,8 @@ def _from_bucket(url: str) -> Path:
         with locked(target, lambda: print(waiting, file=sys.stderr)):
             if not target.exists():
                 _copy(*fsspec.core.url_to_fs(url), target)
-    except ImportError as error:  # fsspec's message names only the backend's package
-        install = 'pip install "lorasp_jax[buckets]"'
-        raise ValueError(f"cannot download {url}: a package is missing (run {install})") from error
     except Exception as error:  # each backend raises its own errors
-        raise ValueError(f"cannot download {url}: {_first_line(error)}") from error
+        raise ValueError(f"cannot download {url}: {first_line(error)}") from error
     return target
 
 
@@ -147,7 +150,3 @@ def _copy(store: Any, root: str, target: Path) -> None:
             file = unfinished if is_file else join_inside(unfinished, name[len(root) :].lstrip("/"))
             file.parent.mkdir(parents=True, exist_ok=True)
             store.get_file(name, str(file))
-
-
-def _first_line(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}".partition("\n")[0].rstrip(".")

@@ -15,12 +15,7 @@ def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[f
 
     Returns:
         The lower and the upper bound.
-
-    Raises:
-        ValueError: `trials` is not positive, or `successes` is not in 0..`trials`.
     """
-    if trials < 1 or not 0 <= successes <= trials:
-        raise ValueError(f"successes must be in 0..trials, got {successes} of {trials}")
     rate = successes / trials
     spread = z * math.sqrt(rate * (1 - rate) / trials + z**2 / (4 * trials**2))
     center = rate + z**2 / (2 * trials)

@@ -65,8 +65,6 @@ def acquire(file: Path, *, wait: bool = False) -> AbstractContextManager[Any]:
         ValueError: the file cannot be opened or locked.
     """
     try:
-        if file.is_fifo():
-            raise OSError(None, "not a regular file but a pipe", str(file))
         lock = filelock.FileLock(file, fallback_to_soft=False)
         return lock.acquire(timeout=-1 if wait else _RETRY)
     except filelock.Timeout:  # also an OSError

@@ -35,12 +35,7 @@ def announce(what: str) -> Iterator[None]:
         timer.cancel()
     seconds = time.monotonic() - start
     if seconds > PATIENCE:
-        hint = (
-            ""
-            if cached
-            else "; lorasp_jax.base.compilation_cache.enable() caches it for later runs"
-        )
-        _print(f"compiled {what} in {seconds:.0f} s{hint}")
+        _print(f"compiled {what} in {seconds:.0f} s")
 
 
 def _print(line: str) -> None:

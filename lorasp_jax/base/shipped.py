@@ -15,15 +15,3 @@ BASES, EXPERIMENTS = "assets", "configs"
 def is_under(path: Path, folder: str) -> bool:
     """Return whether a relative path is below a shipped folder, such as assets/pi0_nano."""
     return path.parts[:1] == (folder,) and len(path.parts) > 1 and ".." not in path.parts
-
-
-def missing_base_message(name: str) -> str:
-    """Return the error message for a missing base in assets/; it lists the bases that exist."""
-    bases = ", ".join(sorted(file.parent.name for file in ROOT.glob(f"{BASES}/*/config.json")))
-    message = f"{name} does not exist; bases in {ROOT / BASES}: {bases or 'none'}"
-    if ROOT != PACKAGE:
-        return message
-    return (
-        f"{message}; choose one of these, or pass the path to {Path(name).name} in a checkout of "
-        f"the project or to a base trained with {EXPERIMENTS}/pretrain.py"
-    )

@@ -44,10 +44,9 @@ INTERRUPTED = 130
 def main() -> NoReturn:
     """Run the command named on the command line."""
     exit_on_signals()
-    from lorasp_jax.base.errors import parse_arguments
 
     first, rest = sys.argv[1:2], sys.argv[2:]
-    command = parse_arguments(_parser(), first).command
+    command = _parser().parse_args(first).command
     run(command, rest, f"lorasp-jax {command}")
 
 

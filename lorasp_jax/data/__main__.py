@@ -1,17 +1,18 @@
 """Inspect or convert datasets: `python -m lorasp_jax.data --help`."""
 
 import argparse
+import dataclasses
 import functools
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
 from lorasp_jax.base.bars import bars
-from lorasp_jax.base.errors import parse_arguments, run_command
+from lorasp_jax.base.errors import run_command
 from lorasp_jax.base.files import check_local
 from lorasp_jax.data.keys import Keys
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.data") -> int:
     """Run a command and return its exit code: 0 for success, or one of `lorasp_jax.base.errors`."""
-    options = parse_arguments(parser(program), arguments)
+    options = parser(program).parse_args(arguments)
     import jax  # imported here to keep --help fast
 
     jax.config.update("jax_platforms", "cpu")  # leave accelerators to other processes
@@ -57,14 +58,13 @@ def convert(options: argparse.Namespace, console: Console) -> None:
         raise ValueError(f"--to {options.to} converts exactly one dataset, got {len(sources)}")
     if options.to != "cache" and isinstance(sources[0], cache.Cache):
         sources[0].verify_images()
-    with _progress_bar(f"writing {options.out.name}") as (progress, print_line):
+    with _progress_bar(f"writing {options.out.name}") as progress:
         if options.to == "rlds":
             rlds_export.to_rlds(sources[0], options.out, progress)
         elif options.to == "lerobot":
             lerobot_export.to_lerobot(sources[0], options.out, progress)
         else:
-            wait = f"another process is writing {options.out}; waiting for it"
-            cache.write(sources, options.out, progress, waiting=lambda: print_line(wait))
+            cache.write(sources, options.out, progress)
     episodes = sum(len(source) for source in sources)
     console.print(f"{options.out}: {episodes} episodes", soft_wrap=True, highlight=False)
 
@@ -120,17 +120,13 @@ def _add_keys(parser: argparse.ArgumentParser) -> None:
 
 
 def _keys(options: argparse.Namespace) -> Keys:
-    return Keys(
-        state=options.state,
-        action=options.action,
-        state_numbers=tuple(options.state_numbers),
-        action_numbers=tuple(options.action_numbers),
-        cameras=dict(options.cameras),
-        angles=options.angles,
-        gripper=options.gripper,
-        every=options.every,
-        image_size=options.image_size,
-    )
+    values: dict[str, Any] = {
+        field.name: getattr(options, field.name) for field in dataclasses.fields(Keys)
+    }
+    for name in ("state_numbers", "action_numbers"):
+        values[name] = tuple(values[name])
+    values["cameras"] = dict(options.cameras)
+    return Keys(**values)
 
 
 def _camera(text: str) -> tuple[str, str]:
@@ -142,13 +138,10 @@ def _camera(text: str) -> tuple[str, str]:
 
 
 @contextmanager
-def _progress_bar(title: str) -> Iterator[tuple["Report", Callable[[str], None]]]:
-    """Yield a progress callback and a line printer; the callback's first call shows the bar."""
+def _progress_bar(title: str) -> Iterator["Report"]:
+    """Yield a progress callback, whose first call shows the bar."""
     progress = bars(Console(stderr=True), "steps")
     bar = progress.add_task(title, total=None)
-    print_line = functools.partial(
-        progress.console.print, soft_wrap=True, highlight=False, markup=False
-    )
     with ExitStack() as stack:
 
         def report(done: int, total: int) -> None:
@@ -156,7 +149,7 @@ def _progress_bar(title: str) -> Iterator[tuple["Report", Callable[[str], None]]
                 stack.enter_context(progress)
             progress.update(bar, completed=done, total=total)
 
-        yield report, print_line
+        yield report
 
 
 if __name__ == "__main__":

@@ -3,10 +3,8 @@
     cache.write([open_source("my_dataset")], "my_cache", lambda done, total: None)
     steps = cache.Cache("my_cache").steps
 
-A cache is a folder of memory-mapped .npy files, including raw images. There are two more files:
-
-    cache.json        metadata that all episodes share, and checksums of the files
-    statistics.json   statistics of states and actions; only if actions are joint targets
+A cache is a folder of memory-mapped .npy files, including raw images, and cache.json with the
+metadata that all episodes share and the checksums of the files.
 
 Opening verifies all files but the images, which may exceed memory; for them, call
 `Cache.verify_images`. Reading a batch takes one gather per file. On two cores (batches of 64
@@ -15,98 +13,61 @@ shuffled windows, two cameras), this gives 37,000 windows/s at 128 x 128 pixels 
 """
 
 import json
-import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+import zlib
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
-from envs.datasets.episodes import SHARED, Episodes, check_camera
+from envs.datasets.episodes import SHARED, Episodes
 from lorasp_jax.base.digest import verify_digest, with_digest
-from lorasp_jax.base.files import as_value_error, read_json, read_text
-from lorasp_jax.base.json_values import check
+from lorasp_jax.base.files import as_value_error, read_json
 from lorasp_jax.base.locks import locked
 from lorasp_jax.base.writing import atomic_folder
 from lorasp_jax.data.batches import Steps
-from lorasp_jax.data.cache_writer import Column, map_column, verify_column
+from lorasp_jax.data.cache_writer import Column, map_column
 from lorasp_jax.data.source import Progress, Source
-from lorasp_jax.policies.statistics import Statistics
 
-FORMAT = "lorasp-cache-2"
-HEADER, STATISTICS = "cache.json", "statistics.json"
+FORMAT = "lorasp-cache-3"
+HEADER = "cache.json"
 ROWS = ("state", "action", "length", "instruction", "task")
 """Columns other than images: state and action per step, and the others per episode."""
 _IMAGE = "image_"
 _DTYPES = {"state": np.float32, "action": np.float32, "image": np.uint8}
 METADATA = tuple(name for name in SHARED if name not in ("task", "instructions"))
 """Fields of `Episodes` that are the same in all episodes of a cache."""
-_HEADER_TYPES: dict[str, Any] = {
-    "format": str,
-    **dict.fromkeys(("robot", "actions"), str),
-    **dict.fromkeys(("control_dt", "physics_dt"), float),
-    **dict.fromkeys(("steps", "numbers"), int),
-    "tasks": [str],
-    "instructions": [str],
-    "cameras": {str: (int, int)},
-    "crc32": {str: int},
-}
 
 
-def write(
-    sources: Sequence[Source],
-    path: str | os.PathLike[str],
-    progress: Progress,
-    waiting: Callable[[], None] | None = None,
-) -> None:
+def write(sources: Sequence[Source], path: str | os.PathLike[str], progress: Progress) -> None:
     """Write a cache folder, which appears only once it is complete.
 
     Args:
         sources: datasets with the same robot and image size; not modified.
         path: folder to create.
         progress: called with the steps done and the total.
-        waiting: called once if another process is writing this folder, before waiting for it. The
-            other process's cache is accepted if it matches these datasets. None raises an error
-            instead of waiting.
 
     Raises:
-        ValueError: the path already exists, another process is writing it or wrote a cache that
-            does not match, or an episode is damaged or incompatible with the others.
+        ValueError: the path already exists, another process is writing it, or an episode is damaged
+            or incompatible with the others.
         OSError: the disk is full.
     """
-    path, total = Path(path), sum(source.num_steps for source in sources)
-    existed = path.exists()
-    with locked(path, waiting):
-        if path.exists() and not existed:
-            _check_same(Cache(path), sources, total)
-            return
+    total = sum(source.num_steps for source in sources)
+    with locked(Path(path)):
         shared = _metadata(sources[0].episode(0)) if sources[1:] else {}
         for source in sources[1:]:  # fail now, not after hours of reading images
             _check_compatible(shared, source.episode(0))
         for source in sources:  # the copy's checksums would declare damaged images valid
             if isinstance(source, Cache):
                 source.verify_images()
-        with (
-            atomic_folder(path) as folder,
-            Writer(folder) as writer,
-            ThreadPoolExecutor(1) as reader,
-        ):
+        with atomic_folder(path) as folder, ThreadPoolExecutor(1) as reader:
+            writer = _Writer(folder)
             for episode in _prefetch(sources, reader):
                 writer.append(episode)
                 progress(writer.num_steps, total)
-
-
-def _check_same(cache: "Cache", sources: Sequence[Source], steps: int) -> None:
-    """Raise ValueError unless a cache's size and first episode match these datasets."""
-    first, expected = cache.episode(0), sources[0].episode(0)
-    length = int(expected.length[0])
-    same = cache.num_steps == steps and _metadata(first) == _metadata(expected)
-    for name in ("state", "action"):
-        same = same and np.array_equal(getattr(first, name), getattr(expected, name)[:, :length])
-    if not same:
-        raise ValueError(f"{cache.path} was written by another process from different datasets")
+            writer.complete()
 
 
 def _prefetch(sources: Sequence[Source], reader: ThreadPoolExecutor) -> Iterator[Episodes]:
@@ -122,33 +83,22 @@ def _prefetch(sources: Sequence[Source], reader: ThreadPoolExecutor) -> Iterator
         yield pending.result()
 
 
-class Writer:
-    """Write a cache episode by episode; a context manager that completes the cache on success."""
+class _Writer:
+    """Writes a cache episode by episode into an existing folder."""
 
     def __init__(self, folder: Path) -> None:
-        """Start a cache in an existing folder."""
-        self.num_steps: int = 0
+        self.num_steps = 0
         self._folder, self._metadata = folder, {}
         self._tasks: list[str] = []
         self._instructions: list[str] = []
         self._columns: dict[str, Column] = {}
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, error: Any, *_: Any) -> None:
-        """Close all files; on success, write the header and, for joint targets, statistics."""
-        for column in self._columns.values():
-            column.close()
-        if error is not None:
-            return
+    def complete(self) -> None:
+        """Write the lengths of all columns, and cache.json."""
         if not self.num_steps:
             raise ValueError("there are no episodes to write")
-        if self._metadata["actions"] == "joint":
-            state, action = (np.load(self._folder / f"{name}.npy") for name in ROWS[:2])
-            dim, valid = state.shape[1], np.ones(self.num_steps, bool)
-            statistics = Statistics.measure(state, action, valid, slots=range(dim), dim=dim)
-            (self._folder / STATISTICS).write_text(statistics.to_json())
+        for column in self._columns.values():
+            column.complete()
         header = {"format": FORMAT, **self._metadata, "steps": self.num_steps}
         header |= {"tasks": self._tasks, "instructions": self._instructions}
         header["crc32"] = {name: column.crc32 for name, column in self._columns.items()}
@@ -211,8 +161,6 @@ class Cache:
         path: the folder.
         metadata: content of cache.json, including robot, tasks, instructions and control_dt.
         cameras: name -> height and width.
-        statistics: statistics of states and actions in the robot's units; None unless actions are
-            joint targets.
     """
 
     kind = "cache"
@@ -227,25 +175,23 @@ class Cache:
         header = self.path / HEADER
         if not header.is_file():
             raise ValueError(f"{path} is not a cache: it has no {HEADER}")
-        with as_value_error(header):
-            self.metadata: dict[str, Any] = _read_header(header)
+        with as_value_error(header):  # what the digest confirms needs no other check
+            self.metadata: dict[str, Any] = verify_digest(read_json(header, self.path))
+            if self.metadata["format"] != FORMAT:
+                raise ValueError(
+                    f"format {self.metadata['format']!r} is not {FORMAT!r}: convert the dataset "
+                    "again, or, if it is the cache of a run, use another --name"
+                )
         self.cameras: dict[str, list[int]] = self.metadata["cameras"]
         self.control_dt: float = self.metadata["control_dt"]
         self.num_steps: int = self.metadata["steps"]
         self.instructions: tuple[str, ...] = tuple(self.metadata["instructions"])
         self._images: dict[str, Any] = {
-            name: self._map(_IMAGE + name, (self.num_steps, *size, 3), verify=False)
+            name: self._map(_IMAGE + name, (self.num_steps, *size, 3))
             for name, size in self.cameras.items()
         }
-        self._columns = self._map_columns()
+        self._columns = {name: self._map(name) for name in ROWS}
         self._end = np.cumsum(self._columns["length"], dtype=np.int64)
-        self._check_columns()
-        with as_value_error(header):
-            self.episode(0, ()).validate_numbers()
-            for name in ("state", "action"):
-                if not np.isfinite(self._columns[name]).all():
-                    raise ValueError(f"{name} has values that are not finite")
-        self.statistics: Statistics | None = self._statistics()
 
     def __len__(self) -> int:
         """Number of episodes."""
@@ -287,63 +233,11 @@ class Cache:
             ValueError: a file is damaged.
         """
         for name, images in self._images.items():
-            verify_column(
-                self.path / f"{_IMAGE}{name}.npy", images, self.metadata["crc32"][_IMAGE + name]
-            )
+            path = self.path / f"{_IMAGE}{name}.npy"
+            if zlib.crc32(images.data) != self.metadata["crc32"][_IMAGE + name]:
+                raise ValueError(f"{path} is damaged (its checksum does not match)")
 
-    def _map_columns(self) -> dict[str, np.ndarray]:
-        shapes = {"state": (self.num_steps, self.metadata["numbers"])}
-        shapes |= {"action": (self.num_steps, None), "length": (None,)}
-        columns = {name: self._map(name, shape) for name, shape in shapes.items()}
-        return columns | {name: self._map(name, columns["length"].shape) for name in ROWS[3:]}
-
-    def _check_columns(self) -> None:
-        """Raise ValueError if lengths, task indices or instruction indices are invalid."""
-        length = self._columns["length"]
-        if not len(length) or length.min() < 1 or self._end[-1] != self.num_steps:
-            total = int(self._end[-1]) if len(length) else 0
-            raise ValueError(
-                f"{self.path} must have {self.num_steps} steps and no empty episodes, got {total} "
-                f"steps in {len(length)} episodes"
-            )
-        for name, texts in (("task", self.metadata["tasks"]), ("instruction", self.instructions)):
-            low, high = self._columns[name].min(), self._columns[name].max()
-            if low < 0 or high >= len(texts):
-                raise ValueError(
-                    f"{self.path} is damaged ({name} indices must be 0 to {len(texts) - 1}, got "
-                    f"{low} to {high})"
-                )
-
-    def _map(self, name: str, shape: tuple[int | None, ...], *, verify: bool = True) -> np.ndarray:
-        """Memory-map a column and check its dtype and shape; None matches any dimension."""
+    def _map(self, name: str, shape: tuple[int, ...] | None = None) -> np.ndarray:
+        """Memory-map a column; verify its checksum unless a shape is given instead."""
         path, dtype = self.path / f"{name}.npy", _DTYPES.get(name.partition("_")[0], np.int32)
-        return map_column(path, dtype, shape, self.metadata["crc32"][name] if verify else None)
-
-    def _statistics(self) -> Statistics | None:
-        path = self.path / STATISTICS
-        if self.metadata["actions"] != "joint":
-            return None
-        with as_value_error(path):
-            return Statistics.from_json(read_text(path, self.path))
-
-
-def _read_header(path: Path) -> dict[str, Any]:
-    header: dict[str, Any] = read_json(path, path.parent)
-    header = verify_digest(header)
-    if unknown := sorted(header.keys() - _HEADER_TYPES.keys()):
-        raise ValueError(f"unknown field {unknown[0]!r}")
-    if header["format"] != FORMAT:
-        raise ValueError(
-            f"format {header['format']!r} is not {FORMAT!r}: convert the dataset again, or, if it "
-            "is the cache of a run, use another --name"
-        )
-    check(header, _HEADER_TYPES)
-    if not 0 < header["control_dt"] < math.inf:
-        raise ValueError(f"control_dt must be positive and finite, got {header['control_dt']}")
-    if header["numbers"] < 1:
-        raise ValueError(f"numbers, the state dimension, must be positive, got {header['numbers']}")
-    for name in header["cameras"]:
-        check_camera(name)
-    if header["crc32"].keys() != {*ROWS, *(_IMAGE + name for name in header["cameras"])}:
-        raise ValueError("checksums are missing")
-    return header
+        return map_column(path, dtype, shape or self.metadata["crc32"][name])

@@ -14,65 +14,44 @@ class Column:
 
     def __init__(self, path: Path, like: np.ndarray) -> None:
         """Create an empty file for rows of the same dtype and shape as those of `like`."""
-        self._file = path.open("wb")
+        self._path = path
         self._header = {"descr": np.lib.format.dtype_to_descr(like.dtype), "fortran_order": False}
         self._row_shape, self._length, self.crc32 = like.shape[1:], 0, 0
-        self._write_header()
+        self._write_header("wb")
 
     def append(self, rows: np.ndarray) -> None:
         """Append rows."""
         rows = np.ascontiguousarray(rows)
-        self._file.write(rows.data)
+        with self._path.open("ab") as file:
+            file.write(rows.data)
         self.crc32 = zlib.crc32(rows.data, self.crc32)
         self._length += len(rows)
 
-    def close(self) -> None:
-        """Write the final length and close the file."""
-        self._file.seek(0)
-        self._write_header()
-        self._file.close()
+    def complete(self) -> None:
+        """Write the final length."""
+        self._write_header("r+b")
 
-    def _write_header(self) -> None:
+    def _write_header(self, mode: str) -> None:
         # NumPy pads the header so that the first dimension can grow in place.
         header = self._header | {"shape": (self._length, *self._row_shape)}
-        np.lib.format.write_array_header_1_0(self._file, header)
+        with self._path.open(mode) as file:
+            np.lib.format.write_array_header_1_0(file, header)
 
 
-def map_column(
-    path: Path, dtype: Any, shape: tuple[int | None, ...], crc32: int | None = None
-) -> np.ndarray:
-    """Memory-map an array; its data is read only to verify a checksum.
+def map_column(path: Path, dtype: Any, expected: int | tuple[int, ...]) -> np.ndarray:
+    """Memory-map an array.
 
     Args:
         path: the .npy file.
         dtype: expected dtype.
-        shape: expected shape; None matches any dimension.
-        crc32: expected checksum of the array's bytes; None skips the check.
+        expected: checksum of the array's bytes, for which all are read, or its shape.
 
     Raises:
         ValueError: the file is missing or damaged.
     """
     with as_value_error(path):
         array: Any = np.load(check_regular(path, path.parent), mmap_mode="r")
-        expected = tuple(n if n else m for n, m in zip(shape, array.shape, strict=True))
-        if (
-            array.shape != expected
-            or array.dtype != np.dtype(dtype)
-            or not array.flags.c_contiguous
-        ):
-            order = "" if array.flags.c_contiguous else " in Fortran order"
-            raise ValueError(
-                f"expected {np.dtype(dtype).str} {expected}, got {array.dtype.str} {array.shape}"
-                f"{order}"
-            )
-        if path.stat().st_size != array.offset + array.nbytes:
-            raise ValueError(f"its size does not match the shape {expected}")
-    if crc32 is not None:
-        verify_column(path, array, crc32)
+        found = array.shape if isinstance(expected, tuple) else zlib.crc32(array.data)
+        if array.dtype != np.dtype(dtype) or found != expected:
+            raise ValueError("its type, shape or checksum does not match")
     return array.view(np.ndarray)
-
-
-def verify_column(path: Path, array: np.ndarray, crc32: int) -> None:
-    """Raise ValueError unless an array, mapped from `path`, has this checksum."""
-    if zlib.crc32(array.data) != crc32:
-        raise ValueError(f"{path} is damaged (its checksum does not match)")

@@ -79,12 +79,13 @@ def report(source: Source, console: Console) -> None:
     """Print a summary of a dataset."""
     summary = summarize(source)
     steps, hertz = int(summary.length.sum()), 1 / source.control_dt
+    image = source.episode(0).image
     minutes = steps * source.control_dt / 60
     lines = {
         "format": source.kind,
         "robot": summary.robot,
         "tasks": ", ".join(summary.tasks),
-        "cameras": ", ".join(_image_sizes(source)),
+        "cameras": ", ".join(f"{name} {x.shape[3]} x {x.shape[2]}" for name, x in image.items()),
         "episodes": f"{len(source)}, {summary.length.min()} to {summary.length.max()} steps each, "
         f"median {np.median(summary.length):g}",
         "steps": f"{steps} at {hertz:g} Hz, {minutes:.1f} minutes",
@@ -114,12 +115,6 @@ def hints(summary: Summary) -> list[str]:
             f"the gripper opens to {gripper:.4g} m; if that is in mm, add --gripper millimetres"
         )
     return texts
-
-
-def _image_sizes(source: Source) -> list[str]:
-    """Return each camera with its image size [px], such as "wrist 128 x 96"."""
-    image = source.episode(0).image
-    return [f"{name} {x.shape[3]} x {x.shape[2]}" for name, x in image.items()]
 
 
 def _value_table(summary: Summary) -> Table:

@@ -19,6 +19,7 @@ from envs.datasets.episodes import Episodes
 from lorasp_jax.base.locks import locked
 from lorasp_jax.base.writing import atomic_folder, write_text
 from lorasp_jax.data.source import Progress, Source
+from lorasp_jax.policies import statistics_files
 
 _FILES_PER_CHUNK = 1000
 _ROWS = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -70,7 +71,7 @@ class _Writer:
         self._episodes: list[dict[str, Any]] = []
         self._features: dict[str, Any] = {}
         self._robot = ""
-        self._moments: dict[str, _Moments] = {}
+        self._statistics: dict[str, list[dict[str, Any]]] = {}
 
     def append(self, episode: Episodes) -> None:
         number, length = len(self._episodes), int(episode.length[0])
@@ -90,7 +91,7 @@ class _Writer:
             "task_index": np.full(length, self._tasks.setdefault(task, len(self._tasks))),
         }
         for name, array in arrays.items():
-            self._moments.setdefault(name, _Moments()).add(array)
+            self._statistics.setdefault(name, []).append(_statistics(array))
         chunk, file = divmod(number, _FILES_PER_CHUNK)
         rows = self.folder / _ROWS.format(chunk_index=chunk, file_index=file)
         _write_table(rows, {name: _column(array) for name, array in arrays.items()})
@@ -108,8 +109,7 @@ class _Writer:
         _write_table(meta / "episodes" / "chunk-000" / "file-000.parquet", episodes)
         tasks = {"task_index": list(self._tasks.values()), "task": list(self._tasks)}
         _write_table(meta / "tasks.parquet", tasks, {"pandas": json.dumps(_TASK_INDEX)})
-        stats = {name: moments.summary() for name, moments in self._moments.items()}
-        write_text(meta / "stats.json", json.dumps(stats, indent=2))
+        write_text(meta / "stats.json", json.dumps(self._all_statistics(), indent=2))
         info = {
             "codebase_version": "v3.0",
             "robot_type": self._robot,
@@ -127,31 +127,23 @@ class _Writer:
         }
         write_text(meta / "info.json", json.dumps(info, indent=2))
 
+    def _all_statistics(self) -> dict[str, Any]:
+        """Return the dataset's statistics; those of pictures have shape `[3, 1, 1]`."""
+        stats = {}
+        for name, episodes in self._statistics.items():
+            shape = (3, 1, 1) if name.startswith(_key("")) else (-1,)
+            found = statistics_files.aggregate(episodes)
+            stats[name] = {key: value.reshape(shape).tolist() for key, value in found.items()}
+            stats[name]["count"] = [self.steps]
+        return stats
 
-class _Moments:
-    """Running statistics over steps, and over the pixels of pictures, in [0, 1] by channel."""
 
-    def __init__(self) -> None:
-        self.count, self.rows, self.sums = 0, 0, (0.0, 0.0)
-        self.low, self.high, self.picture = np.inf, -np.inf, False
-
-    def add(self, array: np.ndarray) -> None:
-        """Add `[T]`, `[T, N]`, or pictures `[T, H, W, 3]`."""
-        self.count, self.picture = self.count + len(array), array.ndim == 4
-        width = array.shape[-1] if array.ndim > 1 else 1
-        rows = array.reshape(-1, width).astype(np.float64) / (255 if self.picture else 1)
-        self.rows += len(rows)
-        self.sums = (self.sums[0] + rows.sum(0), self.sums[1] + np.square(rows).sum(0))
-        self.low, self.high = np.minimum(self.low, rows.min(0)), np.maximum(self.high, rows.max(0))
-
-    def summary(self) -> dict[str, Any]:
-        """Return LeRobot's statistics; those of pictures have shape `[3, 1, 1]`."""
-        mean, square = (total / self.rows for total in self.sums)
-        std = np.sqrt(np.maximum(square - np.square(mean), 0))
-        values = {"min": self.low, "max": self.high, "mean": mean, "std": std}
-        shape = (3, 1, 1) if self.picture else (-1,)
-        arrays = {name: np.reshape(value, shape).tolist() for name, value in values.items()}
-        return arrays | {"count": [self.count]}
+def _statistics(array: np.ndarray) -> dict[str, Any]:
+    """Return an episode's statistics, of pictures `[T, H, W, 3]` by channel and in [0, 1]."""
+    width = array.shape[-1] if array.ndim > 1 else 1
+    rows = array.reshape(-1, width).astype(np.float64) / (255 if array.ndim == 4 else 1)
+    moments = {"mean": rows.mean(0), "std": rows.std(0), "min": rows.min(0), "max": rows.max(0)}
+    return moments | {"count": [len(array)]}
 
 
 def _features(episode: Episodes) -> dict[str, Any]:

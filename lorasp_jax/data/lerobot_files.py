@@ -73,11 +73,6 @@ class Index:
     episodes: Sequence[EpisodeEntry]
 
 
-def is_lerobot(folder: Path) -> bool:
-    """Return whether a folder looks like a LeRobot dataset."""
-    return (folder / "meta" / "info.json").is_file()
-
-
 def read_index(folder: Path) -> Index:
     """Read the metadata of a dataset.
 

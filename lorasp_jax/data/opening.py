@@ -10,7 +10,6 @@ from envs.datasets.episodes import Episodes
 from lorasp_jax.base import hub
 from lorasp_jax.data.cache import HEADER, Cache
 from lorasp_jax.data.lerobot import Keys, LeRobot
-from lorasp_jax.data.lerobot_files import is_lerobot
 from lorasp_jax.data.source import Source
 
 
@@ -27,7 +26,7 @@ def open_source(where: str | os.PathLike[str], keys: Keys | None = None) -> Sour
             its format.
     """
     path = hub.local(where, repository="dataset")
-    if is_lerobot(path):
+    if (path / "meta" / "info.json").is_file():
         return LeRobot(path, keys, name=Path(where).name)
     if keys and dataclasses.replace(keys, image_size=0) != Keys():
         raise ValueError(f"{where} is not a LeRobot dataset: --state, --angles etc. do not apply")

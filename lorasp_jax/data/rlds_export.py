@@ -9,21 +9,17 @@ from lorasp_jax.base.locks import locked
 from lorasp_jax.base.writing import atomic_folder
 from lorasp_jax.data.source import Progress, Source
 
+EPISODES_PER_FILE = 16
+"""Number of episodes per file, all in memory until it is written."""
 
-def to_rlds(
-    source: Source,
-    path: str | os.PathLike[str],
-    progress: Progress,
-    *,
-    episodes_per_file: int = 16,
-) -> None:
+
+def to_rlds(source: Source, path: str | os.PathLike[str], progress: Progress) -> None:
     """Write an RLDS folder (see `envs.datasets.rlds`), which appears only once it is complete.
 
     Args:
         source: a dataset of one task; not modified.
         path: folder to create.
         progress: called with the steps done and the total.
-        episodes_per_file: number of episodes per file, all in memory until it is written.
 
     Raises:
         ValueError: the path already exists, another process is writing it, there are several tasks,
@@ -35,8 +31,8 @@ def to_rlds(
         raise ValueError(f"an RLDS dataset can hold only one task, got {', '.join(tasks)}")
     with locked(Path(path)), atomic_folder(path) as folder:
         writer, done = rlds.ShardWriter(folder, {}), 0
-        for first in range(0, len(source), episodes_per_file):
-            numbers = range(first, min(first + episodes_per_file, len(source)))
+        for first in range(0, len(source), EPISODES_PER_FILE):
+            numbers = range(first, min(first + EPISODES_PER_FILE, len(source)))
             shard = []
             for number in numbers:
                 shard.append(source.episode(number))

@@ -38,19 +38,15 @@ class Stream:
 
         Args:
             steps: steps to sample from, see `Cache.steps`.
-            batch_size: number of windows in a batch, over all processes.
+            batch_size: number of windows in a batch, over all processes; a multiple of their
+                number.
             chunk: C, the number of actions in a window.
             seed: seed of the shuffling; every epoch has a different order.
             start: `position` to resume from.
             process: index of this process, and number of processes; each gets an equal share of a
                 batch.
-
-        Raises:
-            ValueError: `batch_size` is not a multiple of the number of processes.
         """
         index, count = process
-        if batch_size % count:
-            raise ValueError(f"batch_size {batch_size} is no multiple of {count} processes")
         self.position: int = start
 
         share = batch_size // count

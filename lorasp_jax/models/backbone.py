@@ -14,7 +14,7 @@ from lorasp_jax.dense import Dense
 from lorasp_jax.models import flow_matching
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.observation import Observation
-from lorasp_jax.models.sampling import Prefix, Sampler
+from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.models.transformer.layers import (
     LayerAux,
     ModelAux,
@@ -95,8 +95,11 @@ class Backbone(nnx.Module):
         h, out_aux = self.action_time_mlp_out(h, token_mask=token_mask, return_aux=True)
         return h, aux | {"action_time_mlp_in": in_aux, "action_time_mlp_out": out_aux}
 
-    def run_prefix(self, obs: Observation) -> tuple[Prefix, ModelAux]:
-        """Encode the observation for `run_suffix`; see `sampling.Prefix`."""
+    def run_prefix(self, obs: Observation) -> tuple[Any, ModelAux]:
+        """Encode the observation for `run_suffix`.
+
+        The result has a method `by_layer`, which splits all that is stacked over layers.
+        """
         raise NotImplementedError
 
     def run_suffix(

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Iterator
-from typing import Any, Protocol, Self, cast
+from typing import TYPE_CHECKING, Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -19,39 +19,11 @@ from lorasp_jax.models.transformer.depth import unstack
 from lorasp_jax.models.transformer.layers import LayerAux, ModelAux, merge_action_aux
 from lorasp_jax.peft import Method
 
-
-class Prefix(Protocol):
-    """An encoded observation."""
-
-    def by_layer(self) -> Any:
-        """Return the same for `run_suffix`, with all that is stacked over layers split."""
-        ...
+if TYPE_CHECKING:
+    from lorasp_jax.models.backbone import Backbone
 
 
-class FlowModel(Protocol):
-    """Backbone interface that a sampler requires; see `backbone.Backbone`."""
-
-    config: BackboneConfig
-    vision: Any
-    language: Any
-    action: Any
-
-    def run_prefix(self, obs: Observation) -> tuple[Prefix, ModelAux]:
-        """Encode the observation."""
-        ...
-
-    def run_suffix(
-        self, prefix: Any, obs: Observation, x_t: jax.Array, flow_time: jax.Array
-    ) -> tuple[jax.Array, LayerAux]:
-        """Compute the velocity at one flow step."""
-        ...
-
-
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["weights"],
-    meta_fields=["structure", "config", "methods"],
-)
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sampler:
     """Samples action chunks from a backbone, with input-independent results precomputed once.
@@ -65,14 +37,14 @@ class Sampler:
     """
 
     weights: list[jax.Array]
-    structure: Any
+    structure: Any = dataclasses.field(metadata={"static": True})
     """Graph definitions and treedef that rebuild the modules from `weights`."""
-    config: BackboneConfig
-    methods: tuple[Method, ...]
+    config: BackboneConfig = dataclasses.field(metadata={"static": True})
+    methods: tuple[Method, ...] = dataclasses.field(metadata={"static": True})
     """Distinct adapter methods of the backbone."""
 
     @classmethod
-    def from_model(cls, model: FlowModel, *, once: bool = False) -> Self:
+    def from_model(cls, model: "Backbone", *, once: bool = False) -> Self:
         """Create a sampler; the backbone is not modified.
 
         Args:
@@ -83,7 +55,7 @@ class Sampler:
         models = (_prefix_model(model, once), _suffix_model(model))
         graphdefs, states = zip(*map(nnx.split, models), strict=True)
         weights, tree = jax.tree.flatten(states)
-        methods = dict.fromkeys(adaptation.methods(cast(nnx.Module, model)).values())
+        methods = dict.fromkeys(adaptation.methods(model).values())
         return cls(weights, (graphdefs, tree), model.config, tuple(methods))
 
     def sampler(self) -> Self:
@@ -140,7 +112,7 @@ class Sampler:
         actions, action_aux = sample(velocity, noise, num_steps=num_steps, slots=slots)
         return (actions, _with_steps(aux, action_aux, num_steps)) if return_aux else actions
 
-    def _models(self) -> Iterator[FlowModel]:
+    def _models(self) -> Iterator["Backbone"]:
         """Rebuild the modules of the prefix and of the flow steps."""
         graphdefs, tree = self.structure
         return map(nnx.merge, graphdefs, jax.tree.unflatten(tree, self.weights))
@@ -153,7 +125,7 @@ def _with_steps(aux: ModelAux, action_aux: LayerAux, num_steps: int) -> ModelAux
     return merge_action_aux({**aux, "action": each_step}, action_aux)
 
 
-def _prefix_model(model: FlowModel, once: bool) -> FlowModel:
+def _prefix_model(model: "Backbone", once: bool) -> "Backbone":
     """Copy a model for the prefix, blocks unstacked so that an outer loop slices no weights."""
     model = nnx.merge(*nnx.split(model))
     for tower in (model.vision, model.language):
@@ -167,12 +139,12 @@ def _prefix_model(model: FlowModel, once: bool) -> FlowModel:
     return model
 
 
-def _suffix_model(model: FlowModel) -> FlowModel:
+def _suffix_model(model: "Backbone") -> "Backbone":
     """Copy a model for the flow steps, with input-independent results precomputed."""
     model = nnx.merge(*nnx.split(model))
     del model.vision, model.language
     model.action.blocks = unstack(model.action.blocks)
-    quantization.dequantize(cast(nnx.Module, model))
+    quantization.dequantize(model)
     for module in (model, *(module for _, module in nnx.iter_modules(model.action))):
-        prepared.fuse_projections(cast(nnx.Module, module))
+        prepared.fuse_projections(module)
     return model

@@ -14,6 +14,7 @@ import tokenizers
 from tokenizers import models, normalizers, pre_tokenizers
 
 from lorasp_jax.models.config import VOCABULARY_SIZE
+from lorasp_jax.policies.prompts import pad
 
 _SPECIAL = ("[PAD]", "[UNK]")
 _CHARACTERS = tuple(chr(code) for code in range(33, 127) if not chr(code).isupper())
@@ -50,40 +51,32 @@ def _tokenizer() -> tokenizers.Tokenizer:
 
 
 class Offline:
-    """The offline tokenizer as an implementation of `tokenizer.Tokenizer`."""
+    """The offline tokenizer; see `tokenizer.Tokenizer`."""
 
     vocabulary = VOCABULARY_SIZE
 
     def encode(
         self, texts: Sequence[str], max_tokens: int, *, complete: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Encode the instructions without a prompt template; see the function `encode`."""
+        """Encode P texts, padded on the right with id 0.
+
+        Args:
+            texts: instructions; case is ignored.
+            max_tokens: T.
+            complete: has no effect, because there is no prompt template.
+
+        Returns:
+            ids `[P, T]` int32, valid `[P, T]` bool.
+
+        Raises:
+            ValueError: a text is empty, needs more than `max_tokens` tokens, or contains characters
+                outside the vocabulary or words of more than 100 characters.
+        """
         del complete
-        return encode(texts, max_tokens)
-
-
-def encode(texts: Sequence[str], max_tokens: int) -> tuple[np.ndarray, np.ndarray]:
-    """Encode P texts, padded on the right with id 0.
-
-    Args:
-        texts: instructions; case is ignored.
-        max_tokens: T.
-
-    Returns:
-        ids `[P, T]` int32, valid `[P, T]` bool.
-
-    Raises:
-        ValueError: a text is empty, needs more than `max_tokens` tokens, or contains characters
-            outside the vocabulary or words of more than 100 characters.
-    """
-    ids = np.zeros((len(texts), max_tokens), np.int32)
-    valid = np.zeros((len(texts), max_tokens), bool)
-    for row, text in enumerate(texts):
-        tokens = _tokenizer().encode(text).ids
-        if not 0 < len(tokens) <= max_tokens:
-            raise ValueError(f"{text!r} must have 1 to {max_tokens} tokens, got {len(tokens)}")
-        if VOCABULARY["[UNK]"] in tokens:
-            raise ValueError(f"cannot encode {text!r}: only ASCII words up to 100 characters")
-        ids[row, : len(tokens)] = tokens
-        valid[row, : len(tokens)] = True
-    return ids, valid
+        rows = [_tokenizer().encode(text).ids for text in texts]
+        for text, row in zip(texts, rows, strict=True):
+            if not 0 < len(row) <= max_tokens:
+                raise ValueError(f"{text!r} must have 1 to {max_tokens} tokens, got {len(row)}")
+            if VOCABULARY["[UNK]"] in row:
+                raise ValueError(f"cannot encode {text!r}: only ASCII words up to 100 characters")
+        return pad(texts, rows, max_tokens, pad=0)

@@ -4,7 +4,6 @@ The file format implies the prompt template: openpi reads PaliGemma's SentencePi
 LeRobot reads Hugging Face tokenizer files for both pi0 and SmolVLA.
 """
 
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -48,7 +47,7 @@ class SentencePiece:
             # Encoded separately, so that the newline never merges with the end of the text.
             newline = self._model.encode("\n")
             rows = [row + newline for row in rows]
-        return _pad(texts, rows, max_tokens, pad=0)
+        return prompts.pad(texts, rows, max_tokens, pad=0)
 
 
 class TokenizersFile:
@@ -84,20 +83,4 @@ class TokenizersFile:
         """
         full_prompts = [text if complete else prompts.lerobot(text) for text in texts]
         rows = [encoding.ids for encoding in self._model.encode_batch(full_prompts)]
-        return _pad(texts, rows, max_tokens, pad=self._pad)
-
-
-def _pad(
-    texts: Sequence[str], rows: Sequence[Sequence[int]], max_tokens: int, pad: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Truncate or right-pad the rows to ids `[P, T]` int32 and valid `[P, T]` bool."""
-    ids = np.full((len(rows), max_tokens), pad, np.int32)
-    valid = np.zeros((len(rows), max_tokens), bool)
-    for i, (text, row) in enumerate(zip(texts, rows, strict=True)):
-        if len(row) > max_tokens:
-            warnings.warn(
-                f"{text!r} has {len(row)} tokens; truncated to {max_tokens}", stacklevel=3
-            )
-        ids[i, : len(row)] = row[:max_tokens]
-        valid[i, : len(row)] = True
-    return ids, valid
+        return prompts.pad(texts, rows, max_tokens, pad=self._pad)

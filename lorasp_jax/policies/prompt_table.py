@@ -94,16 +94,6 @@ class PromptTable:
             raise ValueError(f"the policy has no prompt for {missing[0]!r}")
         return np.array([self.instructions.index(text) for text in instructions], np.int32)
 
-    def select(self, instructions: Sequence[str]) -> "PromptTable":
-        """Return a table of only these instructions, in this order.
-
-        Raises:
-            ValueError: the table lacks one of them.
-        """
-        rows = self.rows(instructions)
-        start = Ids(*(array[rows] for array in self.start))
-        return dataclasses.replace(self, start=start, instructions=tuple(instructions))
-
     def shared(self) -> "PromptTable":
         """Drop the instructions and repeat rows up to a multiple of `SHARED_ROWS`.
 

@@ -1,4 +1,7 @@
-"""Prompt templates of published policies."""
+"""Prompt templates of published policies, and padding."""
+
+import warnings
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -40,3 +43,19 @@ def pi05(text: str, state: np.ndarray) -> str:
 def pi05_start(text: str) -> str:
     """Return pi0.5's prompt up to the space before the first state value."""
     return f"Task: {openpi(text)}, State:"
+
+
+def pad(
+    texts: Sequence[str], rows: Sequence[Sequence[int]], max_tokens: int, pad: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Truncate or right-pad the rows to ids `[P, T]` int32 and valid `[P, T]` bool."""
+    ids = np.full((len(rows), max_tokens), pad, np.int32)
+    valid = np.zeros((len(rows), max_tokens), bool)
+    for i, (text, row) in enumerate(zip(texts, rows, strict=True)):
+        if len(row) > max_tokens:
+            warnings.warn(
+                f"{text!r} has {len(row)} tokens; truncated to {max_tokens}", stacklevel=3
+            )
+        ids[i, : len(row)] = row[:max_tokens]
+        valid[i, : len(row)] = True
+    return ids, valid

@@ -16,7 +16,7 @@ model.safetensors         older LeRobot policy: tensors among the weights, named
 import json
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +55,8 @@ def read(where: str | os.PathLike[str], *, dataset: str = "") -> Statistics:
     """
     path = hub.local(where)
     for pattern, reader in _READERS.items():
-        files = [path] if path.is_file() else _files(path, pattern)
+        found = [path] if path.is_file() else sorted(path.glob(pattern))
+        files = [file for file in found if file.is_file()]
         if files and files[0].match(pattern.rpartition("/")[2]):
             with as_value_error(files[0], safetensors.SafetensorError):
                 groups = reader(files)
@@ -95,11 +96,14 @@ def _episodes(files: list[Path]) -> dict[str, Stats]:
     lines = read_text(files[0]).splitlines()
     rows = [json.loads(line)["stats"] for line in lines if line.strip()]
     kinds = {"state": "observation.state", "action": "action"}
-    return {"": {kind: _aggregate([row[name] for row in rows]) for kind, name in kinds.items()}}
+    return {"": {kind: aggregate([row[name] for row in rows]) for kind, name in kinds.items()}}
 
 
-def _aggregate(episodes: list[Mapping[str, Any]]) -> dict[str, np.ndarray]:
-    """Aggregate as LeRobot 0.3.3 (compute_stats.py, aggregate_feature_stats), without quantiles."""
+def aggregate(episodes: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
+    """Aggregate the statistics of episodes, without quantiles.
+
+    As LeRobot 0.3.3 does (compute_stats.py, aggregate_feature_stats).
+    """
     values = {
         name: np.array([stats[name] for stats in episodes], float) for name in _EPISODE_STATISTICS
     }
@@ -136,11 +140,6 @@ _READERS: dict[str, Callable[[list[Path]], dict[str, Stats]]] = {
     PIPELINES[0]: _policy,
     "*.safetensors": _weights,
 }
-
-
-def _files(folder: Path, pattern: str) -> list[Path]:
-    """Return the files that match the pattern, without folders."""
-    return [path for path in sorted(folder.glob(pattern)) if path.is_file()]
 
 
 def _arrays(stats: Mapping[str, Any]) -> dict[str, np.ndarray]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from lorasp_jax.base.errors import parse_arguments, run_command
+from lorasp_jax.base.errors import run_command
 
 RANK_MAP = "rank-map"
 
@@ -16,9 +16,9 @@ def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.report")
     """Write a run's report.html or rank maps; return an exit code of `base.errors`."""
     maps = [*arguments[:1]] == [RANK_MAP]
     if maps:
-        options = parse_arguments(rank_map_parser(f"{program} {RANK_MAP}"), arguments[1:])
+        options = rank_map_parser(f"{program} {RANK_MAP}").parse_args(arguments[1:])
     else:
-        options = parse_arguments(parser(program), arguments)  # before slow imports
+        options = parser(program).parse_args(arguments)  # before slow imports
     write = _write_rank_maps if maps else _write_report
     return run_command(lambda: write(options, Console()), Console(stderr=True))
 

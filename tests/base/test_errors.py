@@ -56,6 +56,7 @@ def test_an_interruption_says_what_is_left():
         ("msgpack", "serving"),
         ("piper_sdk", "piper"),
         ("brax.envs", "brax"),
+        ("gcsfs", "buckets"),
     ],
 )
 def test_a_missing_group_is_named(module, group):

@@ -47,28 +47,43 @@ def test_the_users_flag_stays():
     python(f"import os, envs\nassert os.environ['XLA_FLAGS'] == {flags!r}", flags)
 
 
+LATE = (
+    "import time, warnings, jax\n"
+    "jax.devices()\n"
+    "import envs\n"
+    "with warnings.catch_warnings(record=True) as caught:\n"
+    "    warnings.simplefilter('always')\n"
+    "    env = [envs.make('press'), envs.make('press')][0]\n"
+    "(output,) = map(str, [w.message for w in caught if w.category is UserWarning])\n"
+    "assert '15 to 400 times slower' in output and 'Import envs before' in output, output\n"
+)
+FAST = (
+    "state = env.reset(jax.random.key(0))\n"
+    "state = env.step(state, state.info['command'])\n"
+    "jax.eval_shape(jax.jit(env.step), state, state.info['command'])\n"
+    "start = time.process_time()\n"
+    "for _ in range(10):\n"
+    "    state = env.step(state, state.info['command'])\n"
+    "jax.block_until_ready(state)\n"
+    "assert time.process_time() - start < 1.5"  # otherwise 10 s
+)
+
+
 @old
-def test_too_late_warns_once_and_our_programs_are_fast():
-    python(
-        "import time, warnings, jax\n"
-        "jax.devices()\n"
-        "import envs, lorasp_jax.base.compilation_cache\n"
-        "lorasp_jax.base.compilation_cache.enable()\n"
-        "with warnings.catch_warnings(record=True) as caught:\n"
-        "    warnings.simplefilter('always')\n"
-        "    env = [envs.make('press'), envs.make('press')][0]\n"
-        "(output,) = map(str, [w.message for w in caught if w.category is UserWarning])\n"
-        "assert '15 to 400 times slower' in output and 'Import envs before' in output, output\n"
-        "state = env.reset(jax.random.key(0))\n"
-        "state = env.step(state, state.info['command'])\n"
-        "jax.eval_shape(jax.jit(env.step), state, state.info['command'])\n"
-        "start = time.process_time()\n"
-        "for _ in range(10):\n"
-        "    state = env.step(state, state.info['command'])\n"
-        "jax.block_until_ready(state)\n"
-        "assert time.process_time() - start < 1.5",  # otherwise 10 s
-        xla.UNOPTIMIZED,
-    )
+@pytest.mark.parametrize("then", ["", pytest.param(FAST, marks=pytest.mark.slow)])
+def test_too_late_warns_once_and_our_programs_are_fast(then):
+    python(LATE + then, xla.UNOPTIMIZED)
+
+
+@old
+@pytest.mark.parametrize(
+    ("late", "used"),
+    [(False, {}), (True, {"compiler_options": {"xla_cpu_use_fusion_emitters": False}})],
+)
+def test_our_programs_get_the_option_if_it_is_too_late(late, used, monkeypatch):
+    monkeypatch.setattr(fast_cpu, "is_late", lambda: late)
+    monkeypatch.setattr(jax, "jit", lambda function, **options: lambda x: (function(x), options))
+    assert fast_cpu.jit(abs)(-1) == (1, used)
 
 
 def test_programs_without_simulation_use_jaxs_defaults():

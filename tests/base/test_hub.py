@@ -1,6 +1,7 @@
 """No test uses the network: the Hub client is patched, and the bucket is in memory."""
 
 import re
+import sys
 
 import fsspec
 import huggingface_hub
@@ -74,18 +75,6 @@ def test_shipped_bases_resolve_from_any_folder(tmp_path, monkeypatch, no_hub):
             hub.local(name)
 
 
-def test_an_installed_package_names_its_bases(tmp_path, monkeypatch, no_hub):
-    (tmp_path / "assets" / "pi0_nano").mkdir(parents=True)
-    (tmp_path / "assets" / "pi0_nano" / "config.json").touch()
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(shipped, "ROOT", tmp_path)
-    monkeypatch.setattr(shipped, "PACKAGE", tmp_path)
-    with pytest.raises(
-        ValueError, match=r"bases in .*/assets: pi0_nano; choose one .* path to pi0_small "
-    ):
-        hub.local("assets/pi0_small")
-
-
 def test_portable_paths_resolve_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine").mkdir()
@@ -139,7 +128,7 @@ def test_unreadable_bucket(bucket, tmp_path, monkeypatch):
         raise OSError("connection lost")
 
     monkeypatch.setattr(type(bucket), "get_file", get_file)
-    with pytest.raises(ValueError, match=r"cannot download .*: OSError: connection lost$"):
+    with pytest.raises(ValueError, match=r"cannot download .*: connection lost$"):
         hub.local("memory://models/pi0")
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".")]
 
@@ -165,12 +154,7 @@ def test_other_urls_are_rejected(where, monkeypatch):
         hub.local(where)
 
 
-def test_a_missing_package_names_the_extra(monkeypatch):
-    def url_to_fs(url):
-        raise ImportError("Please install gcsfs to access Google Storage")
-
-    monkeypatch.setattr("fsspec.core.url_to_fs", url_to_fs)
-    with pytest.raises(
-        ValueError, match=r'package is missing \(run pip install "lorasp_jax\[buckets\]"\)'
-    ):
+def test_a_missing_package_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gcsfs", None)
+    with pytest.raises(ModuleNotFoundError, match="gcsfs"):
         hub.local("gs://openpi-assets/no-such")

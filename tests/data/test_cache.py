@@ -1,23 +1,21 @@
 """The cache: data round-trip, and writes are atomic."""
 
 import dataclasses
-import json
 import shutil
-import zlib
 
 import jax
 import numpy as np
 import pytest
 
 from envs.datasets.episodes import Episodes
-from lorasp_jax.base.digest import DIGEST, with_digest
 from lorasp_jax.base.errors import REFUSED
 from lorasp_jax.data import __main__ as command_line
 from lorasp_jax.data import cache, rlds_export
 from lorasp_jax.data.batches import flatten, gather
 from lorasp_jax.data.lerobot import Keys, LeRobot
 from lorasp_jax.data.opening import open_source
-from tests.data.lerobots import GOLDEN, VERSIONS, copied, digest, edit_rows, golden, set_value
+from lorasp_jax.policies.statistics import Statistics
+from tests.data.lerobots import GOLDEN, VERSIONS, digest, golden
 from tests.runs import random_episodes
 
 
@@ -60,12 +58,11 @@ def test_windows_match_lerobot(version, tmp_path):
         index = truth["index"]
         difference = found.steps.image["wrist"][index].astype(int) - truth["wrist_uint8_hwc"]
         assert np.abs(difference).max() <= 3
+    steps, valid = found.steps, np.ones(126, bool)
+    measured = Statistics.measure(steps.state, steps.action, valid, slots=range(7), dim=7)
     with np.load(GOLDEN / "lerobot_v3" / "truth.npz") as truth:
         for name in ("mean", "std", "min", "max"):
-            for key, known in (
-                ("observation.state", found.statistics.state),
-                ("action", found.statistics.action),
-            ):
+            for key, known in (("observation.state", measured.state), ("action", measured.action)):
                 wanted = truth[f"stats/{key}/{name}"]
                 np.testing.assert_allclose(known[name], wanted, rtol=1e-6, atol=1e-6)
 
@@ -74,6 +71,7 @@ def test_steps_match_those_on_the_device(simulated):
     """Training reads the same from files as from the device."""
     parts, found = simulated
     expected = flatten(parts)
+    np.testing.assert_array_equal(np.load(found.path / "state.npy"), expected.state)  # plain files
     table = np.array([text for part in parts for text in part.instructions])
     names = np.array(found.instructions)
     for name in ("state", "action", "end"):
@@ -98,14 +96,6 @@ def test_episodes_round_trip(simulated):
     assert episode.instructions[episode.instruction[0]] == source.instructions[1]
     assert (episode.task, episode.robot) == ("pour", "piper")
     assert found.episode(4, ()).image == {}
-
-
-def test_files_are_plain(simulated):
-    """NumPy alone can read them."""
-    parts, found = simulated
-    state = np.load(found.path / "state.npy")
-    np.testing.assert_array_equal(state, flatten(parts).state)
-    assert not [path for path in found.path.parent.iterdir() if path.name.startswith(".")]
 
 
 class Broken:
@@ -190,16 +180,6 @@ def test_a_damaged_image_is_not_copied(simulated, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["damaged"]
 
 
-def test_a_broken_dataset_leaves_no_cache(tmp_path):
-    folder = copied("v3", tmp_path)
-    edit_rows(folder, set_value("action", 100, lambda x: [np.nan] * len(x)))
-    before = digest(folder)
-    with pytest.raises(ValueError, match=r"action .* episode 0, step 2, dimension 0"):
-        written(tmp_path / "cache", LeRobot(folder))
-    assert digest(folder) == before
-    assert [path.name for path in tmp_path.iterdir()] == ["dataset"]
-
-
 def test_damage_is_reported_in_one_sentence(simulated, tmp_path):
     for number, file in enumerate(sorted(simulated[1].path.iterdir())):
         for share in (0, 0.5, None):
@@ -229,31 +209,17 @@ def test_opening(tmp_path, simulated):
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "sentence"),
+    ("name", "change"),
     [
-        ("state", lambda x: x.astype(">f4"), "got >f4"),
-        ("state", np.asfortranarray, "Fortran order"),
-        ("action", lambda x: x * np.float32(np.nan), "not finite"),
-        ("length", lambda x: x[:0], "and no empty episodes"),
-        (
-            "length",
-            lambda x: x * np.where(np.arange(len(x)), 1, -1).astype(np.int32),
-            "and no empty episodes",
-        ),
-        ("task", lambda x: x[:-1], "expected <i4"),
-        ("instruction", lambda x: x - np.int32(9), "instruction indices must be"),
+        ("state", lambda x: x.astype(">f4")),
+        ("action", lambda x: x * np.float32(2)),
+        ("task", lambda x: x[:-1]),
+        ("image_side", lambda x: x[:, :-1]),
     ],
 )
-def test_invalid_columns_are_refused(name, change, sentence, simulated, tmp_path):
-    """Even if their checksums are correct."""
+def test_other_columns_are_refused(name, change, simulated, tmp_path):
     folder = shutil.copytree(simulated[1].path, tmp_path / "cache")
     path = folder / f"{name}.npy"
-    array = change(np.load(path))
-    np.save(path, array)
-    header = folder / cache.HEADER
-    facts = json.loads(header.read_text())
-    facts["crc32"][name] = zlib.crc32(array.tobytes())
-    del facts[DIGEST]
-    header.write_text(json.dumps(with_digest(facts)))
-    with pytest.raises(ValueError, match=sentence):
+    np.save(path, change(np.load(path)))
+    with pytest.raises(ValueError, match=rf"{name}\.npy is damaged"):
         cache.Cache(folder)

@@ -78,10 +78,11 @@ def test_convert_between_all_formats(capsys, tmp_path):
     assert info["description"] == "Recorded episodes of dataset by piper."
 
 
-def test_rlds_in_several_files(tmp_path):
+def test_rlds_in_several_files(tmp_path, monkeypatch):
+    monkeypatch.setattr(rlds_export, "EPISODES_PER_FILE", 3)
     reports = []
     report = lambda *done: reports.append(done)  # noqa: E731
-    rlds_export.to_rlds(LeRobot(golden("v21")), tmp_path / "rlds", report, episodes_per_file=3)
+    rlds_export.to_rlds(LeRobot(golden("v21")), tmp_path / "rlds", report)
     assert [done for done, _ in reports] == [25, 58, 98, 126]
     found = rlds.read(tmp_path / "rlds")
     assert found.length.tolist() == [25, 33, 40, 28]

@@ -4,16 +4,13 @@ import os
 import random
 import subprocess
 import sys
-import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
 from lorasp_jax.base.locks import locked
 from lorasp_jax.data import cache
 from lorasp_jax.data.__main__ import main
-from lorasp_jax.data.cache import Cache
 from lorasp_jax.data.lerobot import Keys, LeRobot
 from tests.cases import mostly_slow
 from tests.data.lerobots import golden
@@ -39,20 +36,6 @@ def whole(tmp_path_factory):
     return files(path)
 
 
-def test_one_writes_and_the_others_wait(whole, tmp_path):
-    out = tmp_path / "cache"
-    sentence = f"another process is writing {out}; waiting for it\n"
-    with locked(out):
-        children = [convert(out), convert(out)]
-        assert [child.stderr.readline() for child in children] == [sentence, sentence]
-    output = [child.communicate()[1] for child in children]
-    assert [child.returncode for child in children] == [0, 0]
-    assert sorted("126/126" in text for text in output) == [False, True]
-    assert not any("another" in text for text in output)
-    assert os.listdir(tmp_path) == ["cache"]
-    assert files(out) == whole
-
-
 @pytest.mark.parametrize("seed", mostly_slow(range(KILLS), [6]))
 def test_killed_at_any_moment(whole, tmp_path, seed):
     """Between the first file and a little after the last one."""
@@ -69,33 +52,7 @@ def test_killed_at_any_moment(whole, tmp_path, seed):
     assert files(out) == whole
 
 
-@pytest.mark.parametrize(
-    ("keys", "fits"),
-    [
-        ({}, True),
-        ({"image_size": 64}, False),
-        ({"cameras": {"side": "observation.images.side"}}, False),
-        ({"every": 2}, False),
-        ({"gripper": "millimetres"}, False),
-        ({"action": "observation.state"}, False),
-    ],
-)
-def test_a_cache_of_another_process_must_match(tmp_path, keys, fits):
-    out, asked = tmp_path / "cache", threading.Event()
-    cache.write([LeRobot(golden("v3"))], tmp_path / "other", lambda *_: None)
-    with ThreadPoolExecutor() as pool:
-        with locked(out):
-            mine = LeRobot(golden("v3"), Keys(**keys))
-            waiting = pool.submit(cache.write, [mine], out, lambda *_: None, asked.set)
-            assert asked.wait(60)
-            (tmp_path / "other").rename(out)
-        error = waiting.exception()
-    assert (error is None) == fits
-    assert fits or "from different datasets" in str(error)
-    assert len(Cache(out)) == 4
-
-
-def test_without_waiting_a_second_writer_is_refused(tmp_path):
+def test_a_second_writer_is_refused(tmp_path):
     out = tmp_path / "cache"
     with locked(out), pytest.raises(ValueError, match="cache"):
         cache.write([LeRobot(golden("v3"))], out, lambda *_: None)

@@ -92,9 +92,3 @@ def test_a_streamed_window_trains_as_one_on_the_device():
     windows = gather(steps, start, 4)
     found = jax.jit(lambda key, w: encode(key, w, table, state_noise=0.1))(noise_key, windows)
     jax.tree.map(np.testing.assert_array_equal, found, batch)
-
-
-@pytest.mark.parametrize("process", [(0, 4), (1, 5)])
-def test_an_uneven_batch_is_refused(steps, process):
-    with pytest.raises(ValueError, match=f"{process[1]} processes"):
-        make(steps, process=process)

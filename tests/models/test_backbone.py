@@ -80,10 +80,13 @@ def test_every_action_depends_on_the_state(velocity, obs, actions):
 
 @pytest.fixture(scope="module")
 def adapted(model):
-    """LoRA-SP in every tower and kind of layer; LoRA, which compiles faster, elsewhere."""
+    """LoRA-SP in some layers of every tower; LoRA, which compiles faster, elsewhere."""
     # The gate has its own tests; without its search (η = 1) this compiles in a third of the time.
     sparse = LoRASP(rank=RANK, hidden_width=4, energy_target=1.0)
-    rules = [("vision/head|o_proj|state_proj|cross_layer/k_proj", sparse), (".*", LoRA(rank=2))]
+    rules = [
+        ("vision/head|language/.*o_proj|state_proj|cross_layer/k_proj", sparse),
+        (".*", LoRA(rank=2)),
+    ]
     return lorasp_jax.adapt(model, rules, rngs=nnx.Rngs(1))
 
 
@@ -156,8 +159,10 @@ def test_adapters_have_gradients(trained, backbone):
     assert sum(ups) == 8 + 7 + len(ACTION[backbone]) + 5
 
 
-def test_unused_slots_do_not_affect_the_sample(adapted, config, obs, actions):
+def test_unused_slots_do_not_affect_the_sample(model, config, obs, actions):
     """x_t is zero there, in sampling as in training."""
+    rules = [("state_proj|action_out_proj|^action/.*o_proj", LoRA(rank=2))]
+    adapted = lorasp_jax.adapt(model, rules, rngs=nnx.Rngs(1))
     slots = np.arange(config.action_dim) < 5
 
     @jax.jit
@@ -169,7 +174,8 @@ def test_unused_slots_do_not_affect_the_sample(adapted, config, obs, actions):
     other, _ = sample(jnp.where(slots, actions, 7.0))
     np.testing.assert_array_equal(sampled, other)
     assert not np.any(sampled[..., 5:])
-    assert {layer.active_rank.shape[0] for layer in aux["action"].values()} == {STEPS}
+    ranks = [layer.active_rank for layer in aux["action"].values() if layer.active_rank is not None]
+    assert {rank.shape[0] for rank in ranks} == {STEPS}
     # SmolVLA projects the state once per observation, so its aux is the same in all steps.
     state_rank = aux["action"]["state_proj"].active_rank
     np.testing.assert_array_equal(state_rank[0], state_rank[-1])
@@ -199,9 +205,10 @@ def reference(model, loss_of):
     return jax.jit(jax.value_and_grad(loss_of(remat="none")))(nnx.split(model)[1])
 
 
-def test_remat_does_not_change_gradients(model, loss_of, reference):
+def test_remat_does_not_change_gradients(backbone, model, loss_of, reference):
+    """Of SmolVLA, which scans its layers in the same way, with one policy."""
     close = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5)
-    for remat in ("products", "narrow", "full"):
+    for remat in ("products", "narrow", "full") if backbone is pi0 else ("full",):
         result = jax.jit(jax.value_and_grad(loss_of(remat=remat)))(nnx.split(model)[1])
         jax.tree.map(close, result, reference)
 

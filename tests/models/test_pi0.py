@@ -115,7 +115,7 @@ def compact(obs, example):
     )
 
 
-@pytest.mark.parametrize("pi05", [False, True], ids=["pi0", "pi05"])
+@pytest.mark.parametrize("pi05", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_missing_cameras_and_padding_are_as_if_left_out(pi05):
     config = dataclasses.replace(THREE_CAMERAS, pi05=pi05)
     model, obs, x_t, time = random_backbone(config), gaps(), actions(), jnp.array([0.3, 0.8])

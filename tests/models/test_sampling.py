@@ -13,7 +13,7 @@ from lorasp_jax.adapters.compress.quantization import quantize
 from lorasp_jax.kernels import frozen_matmul
 from lorasp_jax.kernels.quantized_weights import Kind, QuantizedKernel
 from lorasp_jax.models import pi0
-from lorasp_jax.models.sampling import FlowModel, Sampler
+from lorasp_jax.models.sampling import Sampler
 from tests.models.random_models import observation, random_backbone
 from tests.nets import METHODS, trained
 
@@ -88,7 +88,7 @@ def in_float8(monkeypatch):
     jax.clear_caches()
 
 
-@pytest.mark.parametrize("adapted", [True, False], ids=["adapted", "bare"])
+@pytest.mark.parametrize("adapted", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_a_float8_sampler_gives_the_actions_of_its_model(in_float8, adapted):
     model, obs = random_backbone(DUMMY), observation(DUMMY, 2)
     if adapted:
@@ -104,5 +104,5 @@ def test_a_float8_sampler_gives_the_actions_of_its_model(in_float8, adapted):
     assert "f8_e4m3fn[2" in str(jax.make_jaxpr(velocity)(model))  # x is rounded
     prepared = model.sampler()
     assert len(quantized_shapes(towers(prepared)[1])) == 3 * DUMMY.language.depth
-    for sampler in (prepared, Sampler.from_model(cast(FlowModel, model), once=True)):
+    for sampler in (prepared, Sampler.from_model(model, once=True)):
         np.testing.assert_allclose(sample(sampler), noise - velocity(model), rtol=1e-4, atol=1e-5)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import sentencepiece
 
-from lorasp_jax.policies import offline_tokenizer, prompts, tokenizer
+from lorasp_jax.policies import prompts, tokenizer
 from tests import GOLDEN
 
 GOLDEN = GOLDEN / "tokenizers"
@@ -70,7 +70,7 @@ def test_load_from_folder_hub_and_offline(tmp_path, monkeypatch):
     text = ["press the red button"]
     for actual, expected in zip(
         tokenizer.load_tokenizer("").encode(text, 6),
-        offline_tokenizer.encode(text, 6),
+        tokenizer.Offline().encode(text, 6),
         strict=True,
     ):
         np.testing.assert_array_equal(actual, expected)

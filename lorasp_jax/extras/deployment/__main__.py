@@ -8,12 +8,12 @@ from pathlib import Path
 
 from rich.console import Console
 
-from lorasp_jax.base.errors import parse_arguments, run_command
+from lorasp_jax.base.errors import run_command
 
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.deployment") -> int:
     """Measure all variants, or save one; return the exit code, one of `lorasp_jax.base.errors`."""
-    options = parse_arguments(parser(program), arguments)
+    options = parser(program).parse_args(arguments)
     return run_command(lambda: _run(options), Console(stderr=True))
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from lorasp_jax.base.errors import parse_arguments, run_command
+from lorasp_jax.base.errors import run_command
 from lorasp_jax.base.files import check_local
 from lorasp_jax.extras.latency import curve, figure
 from lorasp_jax.extras.latency.execution import EXECUTIONS, Execution, check_delay
@@ -25,7 +25,7 @@ MAX_DELAY = 8
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.latency") -> int:
     """Measure runs and draw the figure; return the exit code, one of `lorasp_jax.base.errors`."""
-    options = parse_arguments(parser(program), arguments)
+    options = parser(program).parse_args(arguments)
     interrupted = "interrupted; the same command continues"
     return run_command(lambda: _measure(options), Console(stderr=True), interrupted)
 

@@ -11,7 +11,7 @@ from typing import Any
 from rich.console import Console
 
 from lorasp_jax.base.arguments import pair
-from lorasp_jax.base.errors import parse_arguments, run_command
+from lorasp_jax.base.errors import run_command
 from lorasp_jax.extras.piper import options as shared
 from lorasp_jax.extras.piper.arm import PiperArm
 from lorasp_jax.extras.piper.asking import InThread
@@ -28,7 +28,7 @@ HELD = 3
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.piper") -> int:
     """Run one episode; return the exit code: `HELD`, or one of `lorasp_jax.base.errors`."""
-    options = parse_arguments(parser(program), arguments)
+    options = parser(program).parse_args(arguments)
     return run_command(lambda: _run(options), Console(stderr=True))
 
 

@@ -15,7 +15,7 @@ from typing import Any
 from rich.console import Console
 
 from lorasp_jax.base.arguments import pair
-from lorasp_jax.base.errors import parse_arguments, run_command
+from lorasp_jax.base.errors import run_command
 
 CHECKPOINT_OPTIONS = ("statistics", "dataset", "joints", "size", "dtype", "camera", "adapter")
 """Options that say what the files of a published checkpoint do not."""
@@ -23,7 +23,7 @@ CHECKPOINT_OPTIONS = ("statistics", "dataset", "joints", "size", "dtype", "camer
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.serving") -> int:
     """Serve until SIGINT or SIGTERM; return the exit code, one of `lorasp_jax.base.errors`."""
-    options = parse_arguments(parser(program), arguments)
+    options = parser(program).parse_args(arguments)
     console = Console(stderr=True)
     return run_command(lambda: _serve(options, Console()), console)
 

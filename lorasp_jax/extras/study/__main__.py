@@ -11,7 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from lorasp_jax.base.arguments import positive
-from lorasp_jax.base.errors import REFUSED, parse_arguments, run_command
+from lorasp_jax.base.errors import REFUSED, run_command
 from lorasp_jax.extras.study import page, progress, results
 from lorasp_jax.extras.study.progress import BROKEN, CellState, Status
 from lorasp_jax.extras.study.study import Study, select
@@ -27,7 +27,7 @@ def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.s
     0: all cells that can run are finished; 2: invalid input, or a cell failed, is damaged or has
     other settings; 130: stopped by a signal.
     """
-    options = parse_arguments(parser(program), arguments)
+    options = parser(program).parse_args(arguments)
     interrupted = "stopped; to resume, give the same command"
     return run_command(lambda: _execute(options, Console()), Console(stderr=True), interrupted)
 

@@ -109,7 +109,7 @@ def to_ours(
     unexpected = theirs.keys() - {name for rule in rules for name in rule.theirs}
     for problem, names in (("lacks", missing), ("has unexpected leaves", sorted(unexpected))):
         if names:
-            raise ModelMismatchError(f"{source} {problem} {_abbreviate(names)}")
+            raise ModelMismatchError(f"{source} {problem} {', '.join(names[:8])}")
 
     def pop(name: str, shape: Shape) -> np.ndarray:
         array = np.asarray(theirs.pop(name))
@@ -137,8 +137,3 @@ def to_theirs(rules: Sequence[Rule], ours: Mapping[str, np.ndarray]) -> dict[str
             name: np.ascontiguousarray(a) for name, a in zip(rule.theirs, arrays, strict=True)
         }
     return theirs
-
-
-def _abbreviate(names: Sequence[str], limit: int = 8) -> str:
-    more = f" and {len(names) - limit} more" if len(names) > limit else ""
-    return ", ".join(names[:limit]) + more

@@ -14,7 +14,6 @@ from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.inputs import Mode
 
 Fields = Mapping[str, Any]
-_IMAGE_PREFIXES = ("observation.images.", "observation.")
 _MODES = {mode.upper(): mode for mode in get_args(Mode)}
 # LeRobot options for which this project's backbones support only one value.
 _FIXED: Fields = {"min_period": 4e-3, "max_period": 4.0, "adapt_to_pi_aloha": False}
@@ -58,10 +57,7 @@ def _types() -> dict[str, Callable[[Fields], BackboneConfig]]:
     types: dict[str, Callable[[Fields], BackboneConfig]] = {}
     for name in backbone.names():
         package = backbone.find(name).__module__.rpartition(".")[0]
-        found = importlib.import_module(f"{package}.lerobot").TYPES
-        if repeated := sorted(types.keys() & found):
-            raise ValueError(f"{package}.lerobot defines {', '.join(repeated)}, as another does")
-        types |= found
+        types |= importlib.import_module(f"{package}.lerobot").TYPES
     return types
 
 
@@ -113,7 +109,6 @@ def _cameras(fields: Fields) -> tuple[str, ...]:
     names = []
     for key, feature in (fields.get("input_features") or {}).items():
         if feature["type"] == "VISUAL":
-            prefix = next((p for p in _IMAGE_PREFIXES if key.startswith(p)), "")
-            names.append(key.removeprefix(prefix))
+            names.append(key.removeprefix("observation.").removeprefix("images."))
     empty = [f"empty_camera_{i}" for i in range(fields.get("empty_cameras", 0))]
     return tuple(dict.fromkeys([*names, *empty]))

@@ -63,23 +63,17 @@ class ModelFolder:
         if self.layout == "ours":
             return native.load_native(self.folder, config)
         if config is not None and self.layout == "lerobot" and "type" in self.fields:
-            _require_same_heads(config, self.folder, self.fields)
+            _require_same_towers(config, self.folder, self.fields)
         try:
             model, unused = published.load_published(self.folder, config or self.config)
         except ModelMismatchError as error:
             if config is not None:
                 raise
-            raise ValueError(f"{error}; {self._size_source()}") from error
+            source = native.CONFIG if self.layout == "lerobot" else "the published pi0"
+            raise ValueError(f"{error}; sizes are those of {source}: pass a config") from error
         if unused:
             _log.info("%s: skipped unused tensors %s", self.folder, ", ".join(unused))
         return model
-
-    def _size_source(self) -> str:
-        """Explain where the sizes come from when the caller passed no config."""
-        if self.layout == "openpi":
-            return "openpi stores no sizes, so those of the published pi0 were used: pass a config"
-        policy = self.fields["type"]
-        return f"the sizes come from {self.folder / native.CONFIG}, which has type {policy!r}"
 
 
 def find(where: str | os.PathLike[str]) -> ModelFolder:
@@ -146,8 +140,8 @@ def _lerobot_config(folder: Path, fields: dict[str, Any]) -> BackboneConfig:
         return lerobot_config.parse(fields)
 
 
-def _require_same_heads(config: Any, folder: Path, fields: dict[str, Any]) -> None:
-    """Raise ValueError if config type or heads differ; tensor shapes do not reveal heads."""
+def _require_same_towers(config: Any, folder: Path, fields: dict[str, Any]) -> None:
+    """Raise ValueError if type or towers differ; tensor shapes do not reveal heads."""
     with as_value_error(folder / native.CONFIG):
         stored = lerobot_config.parse_towers(fields)
     if not isinstance(config, type(stored)):
@@ -155,5 +149,5 @@ def _require_same_heads(config: Any, folder: Path, fields: dict[str, Any]) -> No
         raise ValueError(f"config must be a {expected} for the policy in {folder}, got {actual}")
     for name in ("vision", "language", "action"):
         expected, actual = getattr(stored, name), getattr(config, name)
-        if expected.kernel_sizes == actual.kernel_sizes and expected != actual:
-            raise ValueError(f"{folder} has the {name} heads of {expected}, not of {actual}")
+        if expected != actual:
+            raise ValueError(f"{folder} has the {name} sizes {expected}, not {actual}")

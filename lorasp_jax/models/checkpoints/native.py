@@ -27,13 +27,12 @@ from lorasp_jax.base.files import as_value_error, check_local, read_json
 from lorasp_jax.base.writing import write_bytes
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models import backbone
-from lorasp_jax.models.checkpoints.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
+from lorasp_jax.models.checkpoints.tensor_files import INDEX, TensorFiles, weight_files
 
 CONFIG = "config.json"
-SHARD_BYTES = 15 * 2**20
-"""Maximum shard size, including its header; a larger tensor gets its own shard."""
-HEADER_BYTES = 2**16
-"""Bytes reserved for a shard's header: names, shapes and offsets of a few hundred tensors."""
+SHARD_BYTES = 15 * 2**20 - 2**16
+"""Maximum size of a shard's arrays, so that the file has at most 15 MiB with its header. A larger
+array gets its own shard."""
 RUNTIME_FIELDS = ("dtype", "param_dtype", "remat", "unroll")
 """Config fields that affect how a model runs, but not its architecture."""
 LENGTHS = ("max_tokens", "chunk")
@@ -51,57 +50,50 @@ def save(folder: Folder, model: Any) -> None:
         model: a backbone.
 
     Raises:
-        ValueError: the model has adapters or quantized kernels or does not match its config, or
-            the folder is a URL.
+        ValueError: the model has adapters or quantized kernels, or the folder is a URL.
     """
     check_local(folder := pathlib.Path(folder))
+    import huggingface_hub
+
     arrays = {name: a.astype(jnp.bfloat16) for name, a in base_arrays(model).items()}
     description = {
         "backbone": type(model).__module__.split(".")[-2],
         "config": _saved_fields(model.config),
     }
     description["sha256"] = _digest(description, arrays)
-    shards = _shards(arrays)
-    names = [f"model-{i + 1:05}-of-{len(shards):05}.safetensors" for i in range(len(shards))]
-    names = names if len(shards) > 1 else [SINGLE]
-    weight_map = {name: file for file, shard in zip(names, shards, strict=True) for name in shard}
-    files = {file: safetensors.numpy.save(shard) for file, shard in zip(names, shards, strict=True)}
-    if len(shards) > 1:
-        total = {"total_size": sum(array.nbytes for array in arrays.values())}
-        files[INDEX] = json.dumps({"metadata": total, "weight_map": weight_map}, indent=1).encode()
+    split = huggingface_hub.split_state_dict_into_shards_factory(
+        arrays,
+        get_storage_size=lambda array: array.nbytes,
+        filename_pattern="model{suffix}.safetensors",
+        max_shard_size=SHARD_BYTES,
+    )
+    files = {
+        file: safetensors.numpy.save({name: arrays[name] for name in names})
+        for file, names in split.filename_to_tensors.items()
+    }
+    if split.is_sharded:
+        index = {"metadata": split.metadata, "weight_map": split.tensor_to_filename}
+        files[INDEX] = json.dumps(index, indent=1).encode()
     files[CONFIG] = (json.dumps(description, indent=1) + "\n").encode()
-    _write(folder, files)
-
-
-def base_arrays(model: nnx.Module) -> dict[str, np.ndarray]:
-    """Return every parameter of a model by "/"-joined path, in its own dtype.
-
-    Raises:
-        ValueError: the model has adapters or quantized kernels, or does not match its config.
-    """
-    if jax.tree.leaves(nnx.state(model, (AdapterParam, AdapterSetParam))):
-        raise ValueError("saving needs a model without adapters: merge them or save them apart")
-    if is_quantized(model):
-        raise ValueError("saving needs unquantized kernels: save the base before quantizing")
-    arrays = named_arrays(model)
-    expected = _shapes(named_arrays(nnx.eval_shape(lambda: model.config.create(nnx.Rngs(0)))))
-    if mismatched := sorted(expected.items() ^ _shapes(arrays).items()):
-        raise ValueError(f"the model does not match its config: see {mismatched[0][0]}")
-    return {name: np.asarray(leaf) for name, leaf in arrays.items()}
-
-
-def _shapes(arrays: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
-    return {name: array.shape for name, array in arrays.items()}
-
-
-def _write(folder: pathlib.Path, files: Mapping[str, bytes]) -> None:
-    """Write files by name, and delete weight files of a previous model."""
     folder.mkdir(parents=True, exist_ok=True)
     for file, data in files.items():
         write_bytes(folder / file, data)
     for stale in {*folder.glob("model*.safetensors"), folder / INDEX}:
         if stale.name not in files:
             stale.unlink(missing_ok=True)
+
+
+def base_arrays(model: nnx.Module) -> dict[str, np.ndarray]:
+    """Return every parameter of a model by "/"-joined path, in its own dtype.
+
+    Raises:
+        ValueError: the model has adapters or quantized kernels.
+    """
+    if jax.tree.leaves(nnx.state(model, (AdapterParam, AdapterSetParam))):
+        raise ValueError("saving needs a model without adapters: merge them or save them apart")
+    if is_quantized(model):
+        raise ValueError("saving needs unquantized kernels: save the base before quantizing")
+    return {name: np.asarray(leaf) for name, leaf in named_arrays(model).items()}
 
 
 def load_native(folder: Folder, config: Any = None) -> Any:
@@ -209,19 +201,6 @@ def _hash(arrays: Mapping[str, Any]) -> str:
         digest.update(np.ascontiguousarray(values).data)
         del values  # free it before reading the next one
     return digest.hexdigest()
-
-
-def _shards(arrays: Mapping[str, np.ndarray]) -> list[dict[str, np.ndarray]]:
-    """Split the arrays, in order, into shards of at most `SHARD_BYTES`."""
-    shards: list[dict[str, np.ndarray]] = [{}]
-    free_bytes = SHARD_BYTES - HEADER_BYTES
-    for name, array in arrays.items():
-        if shards[-1] and array.nbytes > free_bytes:
-            shards.append({})
-            free_bytes = SHARD_BYTES - HEADER_BYTES
-        shards[-1][name] = array
-        free_bytes -= array.nbytes
-    return shards
 
 
 def _saved_fields(config: Any) -> dict[str, Any]:

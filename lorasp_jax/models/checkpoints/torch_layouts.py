@@ -40,9 +40,9 @@ def siglip(theirs: str, size: VisionConfig) -> list[Rule]:
     layers = [f"{theirs}.encoder.layers.{i}" for i in range(size.depth)]
     attention = (f"self_attn.{name}_proj" for name in ("q", "k", "v", "out"))
     for name in (*attention, "mlp.fc1", "mlp.fc2"):
-        rules += [_weights("vision/blocks", layers, name), _biases("vision/blocks", layers, name)]
+        rules += [_stacked("vision/blocks", layers, name, leaf) for leaf in ("kernel", "bias")]
     for name in ("layer_norm1", "layer_norm2"):
-        rules += [_scales("vision/blocks", layers, name), _biases("vision/blocks", layers, name)]
+        rules += [_stacked("vision/blocks", layers, name, leaf) for leaf in ("scale", "bias")]
     return rules
 
 
@@ -58,13 +58,13 @@ def decoder(ours: str, theirs: str, layers: Iterable[int], *, adaptive: bool = F
     paths = [f"{theirs}.layers.{i}" for i in layers]
     attention = (f"self_attn.{name}_proj" for name in "qkvo")
     kernels = (*attention, "mlp.gate_proj", "mlp.up_proj", "mlp.down_proj")
-    rules = [_weights(ours, paths, name) for name in kernels]
+    rules = [_stacked(ours, paths, name, "kernel") for name in kernels]
     for name in ("input_layernorm", "post_attention_layernorm"):
         if adaptive:
-            norms = [f"{path}.{name}" for path in paths]
-            rules += [rule(f"{ours}/{name}", norms, "dense") for rule in (_weights, _biases)]
+            leaves = ("kernel", "bias")
+            rules += [_stacked(f"{ours}/{name}", paths, f"{name}.dense", leaf) for leaf in leaves]
         else:
-            rules.append(_scales(ours, paths, name))
+            rules.append(_stacked(ours, paths, name, "scale"))
     return rules
 
 
@@ -80,20 +80,7 @@ def _patches(ours: str, theirs: str, size: VisionConfig) -> Rule:
     )
 
 
-def _weights(ours: str, layers: Sequence[str], name: str) -> Rule:
-    names = [f"{layer}.{name}.weight" for layer in layers]
-    return stacked(f"{ours}/{_basename(name)}/kernel", names, transpose=True)
-
-
-def _biases(ours: str, layers: Sequence[str], name: str) -> Rule:
-    return stacked(f"{ours}/{_basename(name)}/bias", [f"{layer}.{name}.bias" for layer in layers])
-
-
-def _scales(ours: str, layers: Sequence[str], name: str) -> Rule:
-    return stacked(
-        f"{ours}/{_basename(name)}/scale", [f"{layer}.{name}.weight" for layer in layers]
-    )
-
-
-def _basename(name: str) -> str:
-    return name.rpartition(".")[2]
+def _stacked(ours: str, layers: Sequence[str], name: str, leaf: str) -> Rule:
+    """Rule for one leaf ("kernel", "scale" or "bias") of a module of all layers."""
+    names = [f"{layer}.{name}.{'bias' if leaf == 'bias' else 'weight'}" for layer in layers]
+    return stacked(f"{ours}/{name.rpartition('.')[2]}/{leaf}", names, transpose=leaf == "kernel")

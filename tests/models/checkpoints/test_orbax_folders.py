@@ -1,10 +1,7 @@
 """Checks before Orbax opens a folder, and suppression of the errors that it repeats."""
 
-import asyncio
 import logging
 import os
-import sys
-from types import SimpleNamespace
 
 import pytest
 
@@ -14,7 +11,6 @@ from lorasp_jax.models.checkpoints import orbax_folders
 @pytest.mark.parametrize(
     ("name", "size", "message"),
     [
-        ("manifest.ocdbt", 2**30 + 1, "manifest.ocdbt .* 1073741825"),
         ("d/0123", 2**43, "0123 .* memory"),
         ("pipe", None, "pipe"),
     ],
@@ -31,22 +27,8 @@ def test_unsafe_files_are_refused(name, size, message, tmp_path):
     orbax_folders.check(tmp_path)
 
 
-def test_only_errors_from_elsewhere_are_reported(monkeypatch, caplog):
-    """Errors of closed event loops and of Orbax's own code are hidden."""
-    reported = []
-    monkeypatch.setattr(sys, "unraisablehook", reported.append)
-    orbax_folders._filter_unraisable_errors.__wrapped__()
+def test_only_errors_from_elsewhere_are_logged(caplog):
     orbax_folders.suppress_repeated_errors()
-    loop = asyncio.new_event_loop()
-    loop.close()
-    read = compile("1 / 0", "x/orbax/path.py", "exec")
-    for call in (lambda: loop.call_soon_threadsafe(print), lambda: exec(read), lambda: int("x")):
-        try:
-            call()
-        except Exception as error:
-            frames = error.__traceback__.tb_next.tb_next  # as raised in a C++ thread
-            sys.unraisablehook(SimpleNamespace(exc_value=error, exc_traceback=frames))
-    assert [str(unraisable.exc_value)[:7] for unraisable in reported] == ["invalid"]
     for file in ("x/orbax/path.py", "ours.py"):
         try:
             exec(compile("1 / 0", file, "exec"))

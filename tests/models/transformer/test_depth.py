@@ -58,15 +58,14 @@ def assert_close(actual, expected):
     assert np.linalg.norm(actual - expected) <= 1e-3 * np.linalg.norm(expected)
 
 
-@pytest.mark.parametrize("remat", ["none", "products"])
-def test_dropout_is_the_same_unrolled_and_scanned(remat):
+def test_dropout_is_the_same_unrolled_and_scanned():
     """Each layer of the stack has its own key."""
     model = trained((".*", LoRA(rank=4, dropout=0.5)), seed=1, net=Net())
     with_dropout = adaptation.with_dropout(model, jax.random.key(5))
     losses = []
     for net, unroll in ((model, False), (with_dropout, False), (with_dropout, True)):
         graphdef, adapters, frozen = nnx.split(net, AdapterParam, ...)
-        losses.append(jax.jit(loss_of(graphdef, frozen, remat=remat, unroll=unroll))(adapters))
+        losses.append(jax.jit(loss_of(graphdef, frozen, remat="products", unroll=unroll))(adapters))
     np.testing.assert_allclose(losses[1], losses[2], rtol=1e-5)
     assert abs(losses[1] - losses[0]) > 1e-2 * losses[0]
 

@@ -14,7 +14,7 @@ from rich.console import Console
 from envs.rendering.video import side_by_side, write_video
 from lorasp_jax.base import compilation_cache as cache
 from lorasp_jax.base.arguments import positive
-from lorasp_jax.base.errors import parse_arguments, run_command
+from lorasp_jax.base.errors import run_command
 from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.extras.piper import options as shared
 from lorasp_jax.extras.piper.arm import PiperArm
@@ -34,7 +34,7 @@ _CHANNELS = itertools.count()  # the SDK keeps one interface per name in a proce
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.piper.fake") -> int:
     """Run episodes; return the exit code, one of `lorasp_jax.base.errors`."""
-    options = parse_arguments(parser(program), arguments)
+    options = parser(program).parse_args(arguments)
     console = Console()
     return run_command(lambda: _run(options, console), Console(stderr=True))
 
