@@ -74,11 +74,12 @@ def test_unknown_mode():
 @pytest.mark.parametrize("mode", ["delta_joint", "end_effector"])
 def test_expert_works_in_every_mode(env, mode):
     other = dataclasses.replace(env, actions=mode)
-    tries = jax.jit(collection.rollout, static_argnums=0)(other, jax.random.key(0))
-    assert tries.action.shape[-1] == 7
+    rollout = jax.jit(collection.rollout, static_argnums=0)
+    _, _, tries, success = rollout(other, jax.random.key(0))
+    assert tries["action"].shape[-1] == 7
     low, high = other.action_low, other.action_high
-    assert ((tries.action >= low - 1e-6) & (tries.action <= high + 1e-6)).all()
-    assert tries.success.all()
+    assert ((tries["action"] >= low - 1e-6) & (tries["action"] <= high + 1e-6)).all()
+    assert success.all()
 
 
 @pytest.mark.slow

@@ -1,8 +1,6 @@
 """Environments behind Gymnasium's and Brax's interfaces, and in their wrappers."""
 
 import dataclasses
-import importlib
-import sys
 
 import brax.envs
 import gymnasium
@@ -72,15 +70,6 @@ def commands(vector):
 def scaled(env, targets):
     """Convert targets to actions in [-1, 1], as Brax's agents produce."""
     return 2 * (targets - env.action_low) / (env.action_high - env.action_low) - 1
-
-
-@pytest.mark.parametrize("name", ["gymnasium", "brax"])
-def test_a_missing_package_raises_one_sentence(name, monkeypatch):
-    for module in [m for m in sys.modules if m.split(".")[0] == name]:
-        monkeypatch.setitem(sys.modules, module, None)
-    monkeypatch.delitem(sys.modules, f"envs.interop.{name}")
-    with pytest.raises(ImportError, match=f"{name}]"):
-        importlib.import_module(f"envs.interop.{name}")
 
 
 @pytest.mark.parametrize("observation", OBSERVATIONS)
@@ -281,7 +270,7 @@ def test_make_vec_takes_the_options_of_both():
     assert vector.single_observation_space.shape == (72,)
     seen = gymnasium.make_vec("lorasp_jax/press-piper-v0", observation="pictures")
     assert seen.observation_space["image"]["wrist"].shape == (1, 64, 64, 3)
-    with pytest.raises(ValueError, match="pictures or state or full_state"):
+    with pytest.raises(ValueError, match="pictures, state, full_state"):
         gymnasium.make_vec("lorasp_jax/press-piper-v0", observation="image")
 
 

@@ -77,7 +77,7 @@ def test_other_cameras_robots_and_actions(path):
     )
     rlds.write(episodes, path)
     assert_equal(rlds.read(path), trimmed(episodes))
-    form = rlds_schema.features(episodes)["steps"]
+    form = rlds_schema.features(rlds.metadata(path))["steps"]
     assert "joint_7 [rad], gripper opening [m]" in form["observation"]["state"].doc.desc
     assert "rotation vector" in form["action"].doc.desc
     assert set(form["observation"]) == {"top_image", "state"}

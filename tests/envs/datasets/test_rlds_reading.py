@@ -18,7 +18,7 @@ def path(tmp_path):
 
 def rewrite(path, episodes):
     """Replace a dataset's records by ones that `rlds.write` would refuse."""
-    to = rlds_schema.serializer(rlds_schema.features(make()))
+    to = rlds_schema.serializer(rlds_schema.features(rlds.metadata(path)))
     (file,) = path.glob("*array_record*")
     writer = array_record_module.ArrayRecordWriter(str(file), "group_size:1,uncompressed")
     for number in range(episodes.num_episodes):
