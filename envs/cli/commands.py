@@ -157,7 +157,6 @@ def _collect(options: argparse.Namespace, env: envs.Env, out: Path, report: Repo
         _ranges(options),
         collected=writer.num_episodes,
         attempted=writer.attempted,
-        record=options.record,
     ):
         writer.append(shard)
         report(writer.num_episodes, options.num_episodes)

@@ -27,11 +27,6 @@ _NUM_ENVS = {"cpu": 32, "gpu": 256, "tpu": 256}
 _MIN_SUCCESS, _MIN_ATTEMPTS = 0.5, 16
 _MAX_EPISODES = 10**9  # our choice; catches typos
 
-Record = Callable[
-    [Env, jax.Array, float | jax.Array, Randomization | None], tuple[dict[str, Any], jax.Array]
-]
-"""Attempt an episode in every world; return the arrays of `Episodes`, and success `[W]`."""
-
 
 def rollout(
     env: Env,
@@ -86,7 +81,6 @@ def collect(
     action_noise: float = 0.0,
     ranges: Randomization | None = None,
     progress: Callable[[int, int], None] | None = None,
-    record: Record | None = None,
     **options: Any,
 ) -> Episodes:
     """Collect successful demonstrations of the scripted expert, in host memory.
@@ -102,7 +96,6 @@ def collect(
         action_noise: as in `rollout`.
         ranges: as in `rollout`.
         progress: called with (episodes so far, num_episodes), first with 0 before compilation.
-        record: function that attempts an episode in every world; default: the expert in simulation.
         **options: further options of `envs.make`; the backend defaults to jax.
 
     Raises:
@@ -113,7 +106,7 @@ def collect(
     report = progress or (lambda *_: None)
     report(0, num_episodes)
     parts = []
-    for part in gather(env, num_episodes, key, action_noise, ranges, record=record):
+    for part in gather(env, num_episodes, key, action_noise, ranges):
         parts.append(part)
         report(sum(each.num_episodes for each in parts), num_episodes)
     return concatenate(parts)
@@ -127,19 +120,16 @@ def expert_success(
     key: jax.Array,
     num_envs: int | None = None,
     ranges: Randomization | None = None,
-    attempt: Callable[[Env, jax.Array, Randomization | None], jax.Array] | None = None,
     **options: Any,
 ) -> jax.Array:
     """Return whether the expert solves each of `num_episodes` random layouts, bool [num_episodes].
 
-    Arguments are as in `collect`, except `attempt`. It runs an episode in every world and returns
-    success, bool `[W]`; default: the expert in simulation.
+    Arguments are as in `collect`.
     """
     env = make_repeatable(task, robot, num_envs=worlds(num_episodes, num_envs), **options)
     ranges = prepare(ranges, env.control_dt)
     calls = -(-num_episodes // env.num_envs)
-    attempt = attempt or attempt_expert
-    results = [attempt(env, chunk_key, ranges) for chunk_key in jax.random.split(key, calls)]
+    results = [attempt_expert(env, chunk_key, ranges) for chunk_key in jax.random.split(key, calls)]
     return jnp.concatenate(results)[:num_episodes]
 
 
@@ -158,21 +148,18 @@ def gather(
     *,
     collected: int = 0,
     attempted: int = 0,
-    record: Record | None = None,
 ) -> Iterator[Episodes]:
-    """Yield the successful episodes of each call of `record`, `num_episodes` in total.
+    """Yield the successful episodes of each call of `record_expert`, `num_episodes` in total.
 
     Args:
         env: W worlds, one attempt each per call.
         num_episodes, key, action_noise, ranges: as in `collect`.
         collected, attempted: episodes yielded and attempts made before an interruption; resuming
             with them gives the same episodes as an uninterrupted run.
-        record: as in `collect`.
 
     Raises:
         ValueError: the expert fails too often.
     """
-    record = record or record_expert
     ranges = prepare(ranges, env.control_dt)
     if checks.number("action_noise", action_noise) < 0:
         raise ValueError(f"action_noise must be at least 0, got {action_noise}")
@@ -183,7 +170,7 @@ def gather(
         _check_success(env, collected, attempted)
         key, chunk_key = jax.random.split(key)
         # Wait here without holding the GIL, so that other threads can write their episodes.
-        chunk, success = jax.block_until_ready(record(env, chunk_key, action_noise, ranges))
+        chunk, success = jax.block_until_ready(record_expert(env, chunk_key, action_noise, ranges))
         wins = np.flatnonzero(success)[: num_episodes - collected]
         collected += len(wins)
         # Do not count attempts after the last one needed.
@@ -220,7 +207,7 @@ def _check_success(env: Env, collected: int, attempted: int) -> None:
 def record_expert(
     env: Env, key: jax.Array, action_noise: float | jax.Array, ranges: Randomization | None
 ) -> tuple[dict[str, Any], jax.Array]:
-    """Attempt random layouts with the expert and render images; implements `Record`."""
+    """Attempt an episode in every world; return the arrays of `Episodes`, and success `[W]`."""
     first, poses, episodes, success = rollout(env, key, action_noise, ranges)
     worlds, steps = episodes["action"].shape[:2]
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), poses)

@@ -12,6 +12,7 @@ import numpy as np
 
 from envs import __main__ as command_line
 from envs.datasets import rlds, rlds_schema
+from envs.experts import collection
 from tests import ROOT
 
 COLLECT = "collect --task press --robot piper --num-episodes 20 --num-envs 6 --image-size 16"
@@ -19,7 +20,7 @@ COLLECT = "collect --task press --robot piper --num-episodes 20 --num-envs 6 --i
 MOMENTS = {
     "in the middle of a shard": (rlds_schema, "record", 9),
     "before the second shard is listed": (os, "replace", 3),
-    "before the next shard": (sys.modules[__name__], "fake_record", 4),
+    "before the next shard": (collection, "record_expert", 4),
     "when all shards are complete": (rlds.ShardWriter, "complete", 1),
     "before the dataset is in place": (os, "rename", 1),
 }
@@ -62,8 +63,9 @@ def run_child(call):
 
 def collect_and_die(moment, out):
     """In a child process: collect until killed."""
+    collection.record_expert = fake_record
     die_at(*MOMENTS[moment])
-    command_line.main([*COLLECT.split(), "--out", out], record=fake_record)
+    command_line.main([*COLLECT.split(), "--out", out])
 
 
 def collect_and_interrupt(out):
@@ -81,4 +83,5 @@ def collect_and_interrupt(out):
         return fake_record(*arguments)
 
     signal.signal(signal.SIGINT, notice)
-    sys.exit(command_line.main([*COLLECT.split(), "--out", out], record=record))
+    collection.record_expert = record
+    sys.exit(command_line.main([*COLLECT.split(), "--out", out]))

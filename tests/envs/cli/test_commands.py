@@ -40,7 +40,8 @@ def run(capsys, monkeypatch):
     monkeypatch.setattr(command_line.cache, "enable", lambda: None)
 
     def run(text, *more, record=fake_record):
-        code = command_line.main([*text.split(), *map(str, more)], record=record)
+        monkeypatch.setattr(collection, "record_expert", record)
+        code = command_line.main([*text.split(), *map(str, more)])
         return code, " ".join(capsys.readouterr().err.split())
 
     return run
@@ -108,7 +109,6 @@ def test_collect_writes_the_episodes_of_the_library(tmp_path, run):
         num_envs=6,
         actions="delta_joint",
         key=jax.random.key(0),
-        record=fake_record,
     )
     assert expected.attempted > 20
     found = rlds.read(tmp_path / "press")

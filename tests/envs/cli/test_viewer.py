@@ -83,9 +83,9 @@ def test_windows_that_need_another_interpreter(env, monkeypatch):
         viewer.show(env.model, np.zeros((1, env.model.nq)), 0.1)
 
 
-def test_an_expert_that_never_succeeds_is_an_error(env):
-    def act(env, plan, state):
-        return state.info["command"]  # does not move
-
+def test_an_expert_that_never_succeeds_is_an_error(env, monkeypatch):
+    monkeypatch.setattr(viewer, "_TRIES", 1)
+    monkeypatch.setattr(viewer, "_plan", lambda *_: None)
+    monkeypatch.setattr(viewer, "_act", lambda env, plan, state: state.info["command"])  # rests
     with pytest.raises(ValueError, match="4 layouts"):
-        viewer.episode(env, jax.random.key(0), tries=1, plan=lambda *_: None, act=act)
+        viewer.episode(env, jax.random.key(0))

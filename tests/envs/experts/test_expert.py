@@ -9,7 +9,7 @@ import pytest
 
 import envs
 from envs import robots
-from envs.experts import expert
+from envs.experts import collection, expert
 from envs.physics import physics
 from envs.tasks import route
 
@@ -148,7 +148,8 @@ def fake_record(success):
     return record
 
 
-def test_collect_keeps_successes_in_order():
+def test_collect_keeps_successes_in_order(monkeypatch):
+    monkeypatch.setattr(collection, "record_expert", fake_record([True, False, True, True]))
     calls = []
     found = envs.collect(
         "press",
@@ -156,29 +157,27 @@ def test_collect_keeps_successes_in_order():
         num_envs=4,
         key=jax.random.key(0),
         progress=lambda *numbers: calls.append(numbers),
-        record=fake_record([True, False, True, True]),
     )
     assert found.state[:, 0, 0].tolist() == [0, 2, 3, 0, 2]
     assert found.attempted == 7
     assert calls == [(0, 5), (3, 5), (5, 5)]
 
 
-def test_collect_gives_up_on_a_broken_expert():
-    record = fake_record([True, False, False, False])
+def test_collect_gives_up_on_a_broken_expert(monkeypatch):
+    monkeypatch.setattr(collection, "record_expert", fake_record([True, False, False, False]))
     with pytest.raises(ValueError, match="4 of 16"):
-        envs.collect("press", num_episodes=50, num_envs=4, key=jax.random.key(0), record=record)
+        envs.collect("press", num_episodes=50, num_envs=4, key=jax.random.key(0))
 
 
-def test_expert_success_counts_full_and_partial_batches():
+def test_expert_success_counts_full_and_partial_batches(monkeypatch):
     seen = []
 
     def attempt(env, key, ranges):
         seen.append(key)
         return jnp.array([True, True, False])
 
-    success = envs.expert_success(
-        "press", num_episodes=5, num_envs=3, key=jax.random.key(0), attempt=attempt
-    )
+    monkeypatch.setattr(collection, "attempt_expert", attempt)
+    success = envs.expert_success("press", num_episodes=5, num_envs=3, key=jax.random.key(0))
     assert success.tolist() == [True, True, False, True, True]
     assert len(seen) == 2
     assert not np.array_equal(jax.random.key_data(seen[0]), jax.random.key_data(seen[1]))
