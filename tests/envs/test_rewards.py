@@ -1,5 +1,8 @@
 """Dense rewards: properties of every task's potential, and the reward made from it."""
 
+import functools
+import types
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -15,11 +18,18 @@ from envs.tasks import View
 from tests.envs import expert_in_c
 
 EPISODES = 4
+FIELDS = ("qpos", "qvel", "xpos", "xmat", "site_xpos", "site_xmat")  # that tasks read
 
 
 def stages(scene, data, size=1.0) -> np.ndarray:
-    found = scene.task.stages(View(scene.model, data, size))
-    return np.array([*map(float, found.values())])
+    fields = {name: getattr(data, name) for name in FIELDS}
+    return np.asarray(_stages(scene, fields, size))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _stages(scene, fields, size):
+    view = View(scene.model, types.SimpleNamespace(**fields), size)
+    return jnp.stack([*scene.task.stages(view).values()])
 
 
 def potentials(scene, key) -> np.ndarray:

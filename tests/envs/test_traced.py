@@ -43,7 +43,9 @@ class Drawn:
     def __call__(self, env, key, scale, ranges=None):
         self.traced += 1
         noise = scale * jax.random.normal(key, (env.num_envs, env.num_joints))
-        return {"noise": noise}, env.reset(key, ranges).info["success"]
+        return {"noise": noise}, jnp.zeros(env.num_envs) + sum(
+            map(jnp.sum, jax.tree.leaves(ranges))
+        )
 
 
 def new_process(env, *arguments, files=()):

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+import envs
 from envs import actions
 from envs.experts import expert
 from envs.physics import physics
@@ -55,6 +56,14 @@ def unordered(function, *arguments):
 def test_a_step_sums_in_a_fixed_order(env):
     state = jax.eval_shape(env.reset, jax.random.key(0))
     assert not unordered(env.step, state, state.info["command"])
+
+
+def test_models_are_on_a_device_of_this_process(monkeypatch):
+    """MJX's default is the first device of all processes."""
+    monkeypatch.setattr(jax, "local_devices", lambda: jax.devices()[3:])
+    env = envs.make("press", num_envs=2, image_size=16)
+    for leaf in (env.physics._model.opt.timestep, env.physics._data.qpos):
+        assert leaf.devices() == {jax.devices()[3]}
 
 
 def test_unordered_sums_are_detected(env):

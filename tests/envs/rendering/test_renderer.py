@@ -248,9 +248,16 @@ def test_samples_equal_a_larger_image_scaled_down(built, poses, diffuse):
     assert np.mean(np.abs(smooth.astype(float) - expected) > 1) < 1e-3
 
 
-def test_memory_does_not_grow_with_the_samples(built, poses):
+def test_memory_does_not_grow_with_the_samples():
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><geom size=".1"/><camera name="c" pos="0 0 1"/></worldbody></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+
     def memory(samples):
-        lowered = renderer.render.lower(built, poses, height=64, width=64, samples=samples)
+        options = {"height": 64, "width": 64, "samples": samples}
+        lowered = renderer.render.lower(build(model, ["c"]), poses_of(data), **options)
         return lowered.compile().memory_analysis().temp_size_in_bytes
 
     assert memory(8) < 1.5 * memory(1)

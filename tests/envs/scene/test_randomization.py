@@ -122,12 +122,15 @@ def test_cameras_move_along_and_about_their_axes(env, episode, neutral):
 def test_a_higher_table_is_a_lower_robot(env):
     """Objects and the side camera stay; the robot moves with its wrist camera."""
     layout = env.task.place(jax.random.key(0))
-    poses = []
-    for height in (0.0, 0.03):
+
+    @jax.jit
+    def start(height):
         ranges = Randomization(table_height=(height, height))
         draw, placed = randomization.draw(jax.random.key(1), ranges, env.model, layout)
-        assert equal(placed, layout)
-        poses.append(env._start(draw, placed, jnp.append(jnp.asarray(env.robot.home), 0.04)))
+        return env._start(draw, placed, jnp.append(jnp.asarray(env.robot.home), 0.04)), placed
+
+    poses, placed = zip(start(0.0), start(0.03), strict=True)
+    assert all(equal(found, layout) for found in placed)
     moved = {name: np.asarray(getattr(poses[1], name) - getattr(poses[0], name)) for name in (
         "geom_xpos", "cam_xpos", "cam_xmat", "geom_xmat"
     )}  # fmt: skip
