@@ -112,27 +112,6 @@ def collect(
     return concatenate(parts)
 
 
-def expert_success(
-    task: str,
-    robot: AnyRobot = "piper",
-    *,
-    num_episodes: int,
-    key: jax.Array,
-    num_envs: int | None = None,
-    ranges: Randomization | None = None,
-    **options: Any,
-) -> jax.Array:
-    """Return whether the expert solves each of `num_episodes` random layouts, bool [num_episodes].
-
-    Arguments are as in `collect`.
-    """
-    env = make_repeatable(task, robot, num_envs=worlds(num_episodes, num_envs), **options)
-    ranges = prepare(ranges, env.control_dt)
-    calls = -(-num_episodes // env.num_envs)
-    results = [attempt_expert(env, chunk_key, ranges) for chunk_key in jax.random.split(key, calls)]
-    return jnp.concatenate(results)[:num_episodes]
-
-
 def make_repeatable(task: str, robot: AnyRobot, **options: Any) -> Env:
     """Call `envs.make`; the backend defaults to jax, since Warp's order of addition varies."""
     options.setdefault("backend", "jax")
@@ -215,12 +194,6 @@ def record_expert(
     images = env.render(flat, draw=drawn)
     image = {k: x.reshape(worlds, steps, *x.shape[1:]) for k, x in images.items()}
     return {"image": image} | episodes, success
-
-
-@traced.cached
-def attempt_expert(env: Env, key: jax.Array, ranges: Randomization | None) -> jax.Array:
-    """Return whether the expert succeeds in each world, bool `[W]`."""
-    return rollout(env, key, ranges=ranges)[-1]
 
 
 def worlds(num_episodes: int, num_envs: int | None) -> int:

@@ -1,11 +1,8 @@
-"""Code of the child processes of test_commands.py: collections that end abruptly."""
+"""Code of the child processes of test_commands.py: collections that are killed."""
 
 import itertools
 import os
 import signal
-import subprocess
-import sys
-import threading
 
 import jax
 import numpy as np
@@ -13,7 +10,6 @@ import numpy as np
 from envs import __main__ as command_line
 from envs.datasets import rlds, rlds_schema
 from envs.experts import collection
-from tests import ROOT
 
 COLLECT = "collect --task press --robot piper --num-episodes 20 --num-envs 6 --image-size 16"
 # Where a process is killed: a function, and the number of the fatal call.
@@ -54,34 +50,8 @@ def die_at(owner, name, call):
     setattr(owner, name, deadly)
 
 
-def run_child(call):
-    """Run one of the functions below in a child process, and wait for it."""
-    code = f"from tests.envs import children; children.{call}"
-    root = ROOT
-    return subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, check=False)
-
-
 def collect_and_die(moment, out):
     """In a child process: collect until killed."""
     collection.record_expert = fake_record
     die_at(*MOMENTS[moment])
     command_line.main([*COLLECT.split(), "--out", out])
-
-
-def collect_and_interrupt(out):
-    """In a child process: collect, with Ctrl-C during the second shard."""
-    calls, noticed = itertools.count(), threading.Event()
-
-    def notice(*_):
-        noticed.set()
-        raise KeyboardInterrupt
-
-    def record(*arguments):
-        if next(calls) == 1:
-            os.kill(os.getpid(), signal.SIGINT)
-            assert noticed.wait(60)  # the main thread may be slow on a busy machine
-        return fake_record(*arguments)
-
-    signal.signal(signal.SIGINT, notice)
-    collection.record_expert = record
-    sys.exit(command_line.main([*COLLECT.split(), "--out", out]))

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import envs
 from envs import actions, names, robots
 from envs.experts import collection
 
@@ -63,11 +62,6 @@ def test_end_effector_moves_in_the_base_frame(robot):
     np.testing.assert_allclose(end - start, action[:3], atol=2e-3)
     turn = after @ before.T  # about the vertical
     np.testing.assert_allclose(turn[:2, :2], [[0.980, -0.199], [0.199, 0.980]], atol=0.01)
-
-
-def test_unknown_mode():
-    with pytest.raises(ValueError, match=r"'cartesian'.* joint, delta"):
-        envs.make("press", actions="cartesian")
 
 
 @pytest.mark.slow

@@ -14,10 +14,10 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import envs
-from envs.experts import expert
 from envs.interop.brax import BraxEnv
 from envs.interop.gymnasium import OBSERVATIONS, SingleEnv, VectorEnv
 from envs.names import names
+from tests.envs.demonstrations import demonstration
 from tests.jaxprs import primitives
 
 W = 4
@@ -34,14 +34,10 @@ def pressed(env):
     """Run an expert through Gymnasium; return the first success, and the worlds before it."""
     vector = VectorEnv(env, observation="state")
     vector.reset(seed=0)
-    plan = expert.plan(env, vector.state, jax.random.key(1))
-    act = jax.jit(lambda state: expert.act(env, plan, state))
-    for _ in range(env.expert_steps):
-        before, action = vector.state, np.asarray(act(vector.state))
-        outcome = vector.step(action)
-        if np.any(outcome[2]):
-            return before, action, outcome, vector
-    raise AssertionError("the expert never succeeded")
+    walk = demonstration(env, vector.state)
+    before, action, _ = next(step for step in walk if np.any(step[2].info["success"]))
+    vector.state = before
+    return before, np.asarray(action), vector.step(np.asarray(action)), vector
 
 
 @pytest.fixture(scope="module")

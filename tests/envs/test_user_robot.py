@@ -67,10 +67,6 @@ def test_limits_match_the_file(robot):
     assert robot.action_low.shape == (7,)
 
 
-def test_repr_is_one_line(robot):
-    assert repr(robot) == f"<Robot {robot.name!r}: 6 joints, opens {1000 * robot.stroke:.0f} mm>"
-
-
 def test_start_pose_is_the_common_one(robot, model):
     data = at(model, robot.home)
     np.testing.assert_allclose(data.site("tcp").xpos, [0.34, 0, 0.18], atol=1e-3)

@@ -38,13 +38,6 @@ def assert_equal(a, b):
         np.testing.assert_array_equal(x, y)
 
 
-def rewritten(path, **changes):
-    """Rewrite an .npz file with some arrays replaced; None removes one."""
-    with np.load(path) as archive:
-        arrays = {name: archive[name] for name in archive.files} | changes
-    np.savez(path, **{name: x for name, x in arrays.items() if x is not None})
-
-
 def test_round_trip(tmp_path):
     episodes = make()
     path = tmp_path / "new folder" / "press.npz"
@@ -67,24 +60,26 @@ def test_repr_is_one_line():
 @pytest.mark.parametrize(
     ("changes", "name"),
     [
-        ({"action": None}, "action"),
-        ({"header": None}, "header"),
         ({"action": np.zeros((3, 4, 6), np.float32)}, r"action .*3, 4, 7"),
         ({"action": np.zeros((3, 4, 7))}, "action .* float64"),
-        ({"image/side": np.zeros((3, 4, 6, 8), np.uint8)}, "'side'"),
-        ({"image/wrist": np.zeros((3, 4, 6, 8, 3), np.float32)}, "'wrist'"),
-        ({"image/side": None, "image/wrist": None}, "camera"),
+        ({"image": {"side": np.zeros((3, 4, 6, 8), np.uint8)}}, "'side'"),
+        ({"image": {"wrist": np.zeros((3, 4, 6, 8, 3), np.float32)}}, "'wrist'"),
+        ({"image": {}}, "camera"),
         ({"length": np.array([1, 5, 2], np.int32)}, "length"),
         ({"instruction": np.array([0, 1, 2], np.int32)}, "instruction"),
         ({"length": np.array([1, 2, 3], np.float32)}, "length"),
     ],
 )
-def test_bad_contents(tmp_path, changes, name):
-    path = tmp_path / "episodes.npz"
-    make().save(path)
-    rewritten(path, **changes)
+def test_bad_contents(changes, name):
     with pytest.raises(ValueError, match=name):
-        Episodes.load(path)
+        make(**changes).validate()
+
+
+def test_foreign_files(tmp_path):
+    np.savez(tmp_path / "other.npz", x=np.zeros(3))
+    for name in ("other.npz", "missing.npz"):
+        with pytest.raises(ValueError, match=name):
+            Episodes.load(tmp_path / name)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -113,22 +108,13 @@ def test_other_control_period(tmp_path):
         Episodes.load(tmp_path / "e.npz", control_dt=0.1)
 
 
-def test_failed_save_keeps_the_old_file(tmp_path, monkeypatch):
+def test_failed_save_keeps_the_old_file(tmp_path):
     path = tmp_path / "episodes.npz"
     make().save(path)
     before = path.read_bytes()
     with pytest.raises(ValueError, match="length"):
         dataclasses.replace(make(), length=np.array([9, 9, 9])).save(path)
-
-    def full(file, **arrays):
-        file.write(b"half")
-        raise OSError("no space left")
-
-    monkeypatch.setattr(np, "savez", full)
-    with pytest.raises(OSError, match="no space"):
-        make(2).save(path)
     assert path.read_bytes() == before
-    assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_select_keeps_order():

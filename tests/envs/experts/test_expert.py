@@ -12,6 +12,7 @@ from envs import robots
 from envs.experts import collection, expert
 from envs.physics import physics
 from envs.tasks import route
+from tests.envs.demonstrations import expert_success
 
 LAYOUTS = 256 if jax.default_backend() == "cpu" else 1024
 """Random layouts; pouring in 1,024 takes more than ten minutes on CPU."""
@@ -30,13 +31,8 @@ def test_experts_succeed(episodes):
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("backend", sorted({"jax", physics.default_backend()}))
 def test_experts_succeed_on_many_layouts(task_name, robot_name, backend):
-    success = envs.expert_success(
-        task_name,
-        robot_name,
-        num_episodes=LAYOUTS,
-        num_envs=256,
-        key=jax.random.key(1),
-        backend=backend,
+    success = expert_success(
+        task_name, robot_name, num_episodes=LAYOUTS, num_envs=256, backend=backend
     )
     assert success.shape == (LAYOUTS,)
     assert success.dtype == bool
@@ -166,25 +162,3 @@ def test_collect_gives_up_on_a_broken_expert(monkeypatch):
     monkeypatch.setattr(collection, "record_expert", fake_record([True, False, False, False]))
     with pytest.raises(ValueError, match="4 of 16"):
         envs.collect("press", num_episodes=50, num_envs=4, key=jax.random.key(0))
-
-
-def test_expert_success_counts_full_and_partial_batches(monkeypatch):
-    seen = []
-
-    def attempt(env, key, ranges):
-        seen.append(key)
-        return jnp.array([True, True, False])
-
-    monkeypatch.setattr(collection, "attempt_expert", attempt)
-    success = envs.expert_success("press", num_episodes=5, num_envs=3, key=jax.random.key(0))
-    assert success.tolist() == [True, True, False, True, True]
-    assert len(seen) == 2
-    assert not np.array_equal(jax.random.key_data(seen[0]), jax.random.key_data(seen[1]))
-
-
-@pytest.mark.parametrize("number", [0, -1])
-def test_number_of_episodes_must_be_positive(number):
-    with pytest.raises(ValueError, match="num_episodes"):
-        envs.collect("press", num_episodes=number, key=jax.random.key(0))
-    with pytest.raises(ValueError, match="num_episodes"):
-        envs.expert_success("press", num_episodes=number, key=jax.random.key(0))

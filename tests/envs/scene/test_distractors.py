@@ -37,12 +37,6 @@ def test_only_the_chosen_number_is_there(robot_name):
     assert plain.model.nu == full.model.nu
 
 
-@pytest.mark.parametrize("count", [-1, 5])
-def test_count_is_checked(count):
-    with pytest.raises(ValueError, match="distractors"):
-        envs.make("press", distractors=count)
-
-
 def test_a_grape_does_not_fall_through(monkeypatch):
     model = envs.make("pick_place", distractors=1).model
     data = mujoco.MjData(model)

@@ -14,6 +14,7 @@ from envs import actions, robots
 from envs.experts import collection, expert
 from envs.scene import randomization
 from envs.scene.ranges import Randomization
+from tests.envs.demonstrations import expert_success
 
 WORLDS, STEPS = 2, 50  # the expert lifts the grape at about step 35
 FIELDS = [field.name for field in dataclasses.fields(Randomization)]
@@ -147,9 +148,7 @@ def test_a_higher_table_is_a_lower_robot(env):
 @pytest.mark.parametrize("height", [-0.04, 0.04])
 def test_experts_succeed_at_other_table_heights(task_name, robot_name, height):
     ranges = Randomization(table_height=(height, height))
-    success = envs.expert_success(
-        task_name, robot_name, num_episodes=32, key=jax.random.key(1), ranges=ranges
-    )
+    success = expert_success(task_name, robot_name, num_episodes=32, num_envs=32, ranges=ranges)
     assert success.mean() >= 0.95
 
 
@@ -240,7 +239,7 @@ def test_invalid_ranges_raise(env, name, value):
     with pytest.raises(ValueError, match=name):
         env.reset(jax.random.key(0), ranges)
     with pytest.raises(ValueError, match=name):
-        envs.expert_success("press", num_episodes=1, key=jax.random.key(0), ranges=ranges)
+        envs.collect("press", num_episodes=1, key=jax.random.key(0), ranges=ranges)
 
 
 @pytest.mark.slow
