@@ -5,6 +5,8 @@ from MuJoCo Menagerie's `agilex_piper` (commit cd165455). Its link masses exclud
 gravity is compensated and the dynamics are not realistic. Shapes are primitives along the links.
 """
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from envs import robots
@@ -23,8 +25,7 @@ _DH = np.array(
     ]
 )
 SDK_OFFSET = np.deg2rad([0.0, 2.0, -2.0, 0.0, 0.0, 0.0])
-"""Angles of this model minus those with the SDK's default zeros (dh_is_offset=1) [rad]. Check which
-zeros your arm's firmware uses."""
+"""Angles of this model minus those with the SDK's default zeros (dh_is_offset=1) [rad]."""
 
 
 _CHAIN = np.stack(
@@ -36,6 +37,27 @@ _CHAIN = np.stack(
         for a, alpha, d, theta0 in _DH
     ]
 )
+
+
+def forward_kinematics(q: jax.Array, *, sdk_offset: bool = False) -> tuple[jax.Array, jax.Array]:
+    """Compute the poses of links 1-6 in the base frame, as `piper_sdk` does.
+
+    Args:
+        q: [..., 6] joint angles [rad].
+        sdk_offset: use the SDK's default zeros (dh_is_offset=1) of joints 2 and 3, which differ by
+            2 degrees from the URDF's. Check which ones your arm's firmware uses.
+
+    Returns:
+        Positions [..., 6, 3] in m and rotations [..., 6, 3, 3].
+
+    Raises:
+        ValueError: the last axis of q is not 6.
+    """
+    q = jnp.asarray(q)
+    if q.shape[-1:] != (6,):
+        raise ValueError(f"q must be [..., 6] joint angles in rad, got shape {q.shape}")
+    return robots.forward_kinematics(_CHAIN, q + SDK_OFFSET.astype(q.dtype) if sdk_offset else q)
+
 
 # Shapes and colors are our choices; masses [kg] are Menagerie's. Link 6 and the hand weigh .45.
 _DARK, _GRAY = 'rgba=".13 .14 .16 1"', 'rgba=".30 .32 .35 1"'

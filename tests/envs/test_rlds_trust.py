@@ -5,9 +5,11 @@ import json
 import os
 import sys
 
+import numpy as np
 import pytest
+from array_record.python import array_record_module
 
-from envs.datasets import rlds
+from envs.datasets import rlds, rlds_schema
 from tests.envs.datasets.test_episodes import assert_equal, make
 from tests.envs.datasets.test_rlds import trimmed
 
@@ -82,3 +84,29 @@ def test_names_of_cameras_are_not_paths(name, tmp_path):
     with pytest.raises(ValueError, match="camera"):
         rlds.write(dataclasses.replace(episodes, image=images), tmp_path / "other")
     assert not list(tmp_path.iterdir())
+
+
+def rewrite(path, episodes):
+    """Replace a dataset's records by ones that `rlds.write` would refuse."""
+    to = rlds_schema.serializer(rlds_schema.features(rlds.metadata(path)))
+    (file,) = path.glob("*array_record*")
+    writer = array_record_module.ArrayRecordWriter(str(file), "group_size:1,uncompressed")
+    for number in range(episodes.num_episodes):
+        writer.write(rlds_schema.record(to, episodes, number, number))
+    writer.close()
+
+
+def test_values_that_are_not_finite(path):
+    episodes = make()
+    episodes.state[1, 0, 2] = np.nan
+    rewrite(path, episodes)
+    with pytest.raises(ValueError, match=r"press is damaged .*state .* dimension 2"):
+        rlds.read(path)
+
+
+def test_an_empty_episode(path):
+    one = make()
+    nothing = {name: picture[:, :0] for name, picture in one.image.items()}
+    rewrite(path, dataclasses.replace(one, image=nothing, length=np.array([1, 0, 1], np.int32)))
+    with pytest.raises(ValueError, match="press is damaged"):
+        rlds.read(path)

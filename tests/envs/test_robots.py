@@ -32,10 +32,16 @@ def test_only_modules_that_define_a_robot_are_robots():
 @pytest.mark.parametrize("offset", [0, 1])
 def test_piper_kinematics_match_the_sdk(offset):
     q = jnp.asarray(GOLDEN["q"], jnp.float32)
-    angles = q + offset * piper.SDK_OFFSET.astype(np.float32)
-    position, rotation = robots.forward_kinematics(piper.ROBOT.chain, angles)
+    position, rotation = jax.jit(piper.forward_kinematics, static_argnames="sdk_offset")(
+        q, sdk_offset=bool(offset)
+    )
     np.testing.assert_allclose(position, GOLDEN[f"position{offset}"], atol=2e-6)
     np.testing.assert_allclose(rotation, GOLDEN[f"rotation{offset}"], atol=5e-6)
+
+
+def test_piper_kinematics_need_six_angles():
+    with pytest.raises(ValueError, match=r"\[\.\.\., 6\]"):
+        piper.forward_kinematics(jnp.zeros(7))
 
 
 @pytest.mark.parametrize("task_name", ["press"])
