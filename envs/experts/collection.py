@@ -158,19 +158,17 @@ def gather(
         if len(wins):
             # To host memory: on the device, training needs the space.
             won = jax.tree.map(lambda x, wins=wins: np.asarray(x)[wins], chunk)
-            yield Episodes(**won, **_metadata(env), attempted=tried)
+            yield Episodes(
+                **won,
+                instructions=env.instructions,
+                task=env.task.name,
+                robot=env.robot.name,
+                control_dt=env.control_dt,
+                physics_dt=env.physics_dt,
+                attempted=tried,
+                actions=env.actions,
+            )
             tried = 0
-
-
-def _metadata(env: Env) -> dict[str, Any]:
-    return {
-        "instructions": env.instructions,
-        "task": env.task.name,
-        "robot": env.robot.name,
-        "control_dt": env.control_dt,
-        "physics_dt": env.physics_dt,
-        "actions": env.actions,
-    }
 
 
 def _check_success(env: Env, collected: int, attempted: int) -> None:

@@ -124,13 +124,6 @@ def test_collect_writes_the_episodes_of_the_library(tmp_path, run):
     )
 
 
-def test_collect_writes_several_datasets(tmp_path, run):
-    code, output = run(COLLECT.replace("press", "pour press"), "--out", tmp_path / "many")
-    assert code == 0, output
-    assert sorted(os.listdir(tmp_path / "many")) == ["pour", "press"]
-    assert rlds.read(tmp_path / "many" / "pour").task == "pour"
-
-
 @pytest.mark.parametrize("moment", mostly_slow(MOMENTS, [*MOMENTS][:1]))
 def test_killed_and_resumed(tmp_path, run, moment):
     run(COLLECT, "--out", tmp_path / "whole")

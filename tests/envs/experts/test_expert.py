@@ -12,6 +12,7 @@ from envs import robots
 from envs.experts import collection, expert
 from envs.physics import physics
 from envs.tasks import route
+from tests.envs.children import fake_record
 from tests.envs.demonstrations import expert_success
 
 LAYOUTS = 256 if jax.default_backend() == "cpu" else 1024
@@ -125,26 +126,19 @@ def test_hurried_experts_slow_down_to_half_the_speed_limits(env):
     assert np.all(share[:, 0].max(axis=-1) > 0.49)  # no slower than necessary
 
 
-def fake_record(success):
-    """Replace `_record`: episodes of one step, numbered by world."""
+def numbered(success):
+    """Replace the simulation: states are the numbers of the worlds."""
 
-    def record(env, key, action_noise, ranges):
-        world = jnp.arange(env.num_envs)
-        numbers = jnp.broadcast_to(world[:, None, None].astype(jnp.float32), (env.num_envs, 1, 7))
-        chunk = {
-            "image": {"side": jnp.zeros((env.num_envs, 1, 2, 2, 3), jnp.uint8)},
-            "state": numbers,
-            "action": numbers,
-            "length": jnp.ones(env.num_envs, jnp.int32),
-            "instruction": jnp.zeros(env.num_envs, jnp.int32),
-        }
-        return chunk, jnp.array(success)
+    def record(env, *arguments):
+        episodes, _ = fake_record(env, *arguments)
+        episodes["state"][:] = np.arange(env.num_envs)[:, None, None]
+        return episodes, np.array(success)
 
     return record
 
 
 def test_collect_keeps_successes_in_order(monkeypatch):
-    monkeypatch.setattr(collection, "record_expert", fake_record([True, False, True, True]))
+    monkeypatch.setattr(collection, "record_expert", numbered([True, False, True, True]))
     calls = []
     found = envs.collect(
         "press",
@@ -159,6 +153,6 @@ def test_collect_keeps_successes_in_order(monkeypatch):
 
 
 def test_collect_gives_up_on_a_broken_expert(monkeypatch):
-    monkeypatch.setattr(collection, "record_expert", fake_record([True, False, False, False]))
+    monkeypatch.setattr(collection, "record_expert", numbered([True, False, False, False]))
     with pytest.raises(ValueError, match="4 of 16"):
         envs.collect("press", num_episodes=50, num_envs=4, key=jax.random.key(0))

@@ -12,7 +12,7 @@ from jax import monitoring
 import envs
 from envs import actions, robots
 from envs.experts import collection, expert
-from envs.scene import randomization
+from envs.scene import randomization, scene
 from envs.scene.ranges import Randomization
 from tests.envs.demonstrations import expert_success
 
@@ -203,7 +203,7 @@ def test_the_model_matches_one_compiled_by_mujoco(env):
         lambda x: x[0], env.reset(jax.random.key(0), Randomization(mass=(2, 2), size=(1.1, 1.1)))
     ).info["draw"]
     found = randomization.changes(draw, env.model, env._objects)
-    model = mujoco.MjModel.from_xml_string(mujoco_xml(env))
+    model = mujoco.MjModel.from_xml_string(scene.mjcf(env.task.scene, env.robot))
     for name in ("geom_size", "geom_pos", "body_pos", "body_ipos", "body_mass", "body_inertia"):
         getattr(model, name)[:] = np.asarray(found[name], np.float64)
     mujoco.mj_setConst(model, mujoco.MjData(model))
@@ -212,12 +212,6 @@ def test_the_model_matches_one_compiled_by_mujoco(env):
         found["body_invweight0"][grape], model.body_invweight0[grape], rtol=1e-4
     )
     assert model.body_mass[grape] == pytest.approx(2 * env.model.body_mass[grape])
-
-
-def mujoco_xml(env):
-    from envs.scene import scene
-
-    return scene.mjcf(env.task.scene, env.robot)
 
 
 def test_changed_ranges():
