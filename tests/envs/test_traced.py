@@ -147,7 +147,7 @@ def test_environments_are_freed():
     call(room, KEY)
     reference = weakref.ref(room)
     del room
-    call._jitted.clear_cache()
+    jax.clear_caches()
     gc.collect()
     assert reference() is None
 
