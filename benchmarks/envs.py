@@ -37,7 +37,7 @@ from benchmarks import measuring
 from benchmarks.measuring import best, print_table, text
 from envs.env import Env
 from envs.physics import physics
-from envs.rendering import renderer
+from envs.rendering.renderer import RayRenderer
 from envs.scene import placing
 from envs.state import Poses, State
 
@@ -107,11 +107,8 @@ class Case:
 def time_images(env: Env, state: State, size: int) -> float:
     """Measure images/s of the ray caster alone: all worlds, both cameras, `size` x `size` px."""
     poses = Poses.of(state.data)
-    draw = jax.jit(
-        lambda poses: renderer.render_batch(
-            env.render_model, poses, height=size, width=size, samples=1
-        )
-    )
+    rays = RayRenderer(env.render_model, size, samples=1)
+    draw = jax.jit(lambda poses: rays(poses, None, None))
     return env.num_envs * len(env.cameras) / best(lambda: draw(poses))
 
 

@@ -6,7 +6,6 @@ from .datasets import rlds as rlds
 from .datasets.episodes import Episodes as Episodes
 from .env import Env as Env
 from .experts.collection import collect as collect
-from .experts.collection import expert_success as expert_success
 from .making import make as make
 from .scene.ranges import Randomization as Randomization
 from .state import State as State

@@ -11,7 +11,6 @@ from typing import Any
 from rich.console import Console
 
 from envs.cli import commands
-from envs.experts.collection import Record
 from envs.names import MODES, names
 from envs.scene import distractors
 from lorasp_jax.base import compilation_cache as cache
@@ -20,16 +19,13 @@ from lorasp_jax.base.errors import run_command
 _DEFAULT = "(default: %(default)s)"
 
 
-def main(
-    arguments: Sequence[str], program: str = "python -m envs", record: Record | None = None
-) -> int:
+def main(arguments: Sequence[str], program: str = "python -m envs") -> int:
     """Run a command and return its exit code.
 
     The code is 0 on success, 2 after an error, and 130 if interrupted.
-    `program` is the name shown in help and errors; `record` is as in `envs.collect`.
+    `program` is the name shown in help and errors.
     """
     options = parser(program).parse_args(arguments)
-    options.record = record
     console = Console(stderr=True)
     # Preallocating GPU memory would add a second to commands that take half a minute (measured).
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")

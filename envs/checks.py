@@ -2,6 +2,7 @@
 
 import math
 import numbers
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -36,6 +37,12 @@ def number(name: str, value: Any) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{name} must be finite, got {value!r}")
     return float(value)
+
+
+def choice(name: str, value: Any, known: Sequence[str]) -> None:
+    """Raise a ValueError that lists the known values unless `value` is one of them."""
+    if value not in known:
+        raise ValueError(f"unknown {name} {value!r}: choose from {', '.join(known)}")
 
 
 def action(value: Any, shape: tuple[int, ...]) -> Any:

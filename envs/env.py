@@ -209,12 +209,9 @@ class Env:
         fingers = state.data.qpos[:, self.num_joints : self.num_joints + 2]
         return jnp.concatenate([joints, jnp.sum(fingers, axis=1, keepdims=True)], axis=1)
 
+    @functools.partial(jax.jit, static_argnums=0)
     def full_state(self, state: State) -> jax.Array:
         """Return the privileged state of robot and objects, f32 [W, D]; see `full_state_layout`."""
-        return self._batched_full_state(state)
-
-    @functools.partial(jax.jit, static_argnums=0)
-    def _batched_full_state(self, state: State) -> jax.Array:
         return jax.vmap(self._full_state)(state)
 
     def _full_state(self, state: State) -> jax.Array:
@@ -266,7 +263,7 @@ class Env:
         low, high = self.robot.action_low, self.robot.action_high
         command = jnp.clip(jnp.append(joints, _START_OPENING), low, high)
         data = self._start(draw, layout, command)
-        _, metrics = self._check(draw, data)
+        _, metrics = self.task.check(self._view(draw, data))
         instruction = jax.random.randint(instruction_key, (), 0, len(self.instructions), jnp.int32)
         zero, false = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
         info = {
@@ -302,7 +299,7 @@ class Env:
         controls = actions.interpolate(commands, self.control_dt, latency)
         changes = self._changes(draw, info["layout"])
         data = self._with_cameras(draw, self.physics.advance(changes, state.data, controls))
-        reached, metrics = self._check(draw, data)
+        reached, metrics = self.task.check(self._view(draw, data))
         held = jnp.where(reached, info["held"] + 1, 0)
         steps = info["steps"] + 1
         success = held >= self.task.hold_steps
@@ -348,9 +345,6 @@ class Env:
 
     def _with_cameras(self, draw: Draw | None, data: Data) -> Data:
         return randomization.move_cameras(draw, data) if draw else data
-
-    def _check(self, draw: Draw | None, data: Data) -> tuple[jax.Array, dict[str, jax.Array]]:
-        return self.task.check(self._view(draw, data))
 
     def _stages(self, state: State) -> dict[str, jax.Array]:
         return self.task.stages(self._view(state.info["draw"], state.data))

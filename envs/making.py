@@ -2,35 +2,30 @@
 
 import importlib
 import os
-from collections.abc import Iterator, Sequence
 from typing import Any, Literal, get_args
 
 import mujoco
 
-import envs.scene.distractors
 from envs import checks, mjcf
 from envs.actions import TARGET_DT
 from envs.env import Env
 from envs.names import MODES, Mode, check
 from envs.physics import physics
 from envs.physics.physics import Backend
-from envs.rendering import renderer as render
+from envs.rendering.model import build as build_render_model
+from envs.rendering.renderer import RayRenderer, Renderer
 from envs.rewards import REWARDS, Reward
 from envs.robots import Robot
 from envs.scene import scene
+from envs.scene.distractors import MAX_COUNT
+from envs.scene.distractors import mjcf as distractor_mjcf
 from lorasp_jax.base import fast_cpu
 
 AnyRobot = str | os.PathLike[str] | Robot
 RendererName = Literal["rays", "warp"]
 RENDERERS: tuple[str, ...] = get_args(RendererName)
-# Upper bound of each argument, then its lower bound unless that is 1. The first three upper bounds
-# are beyond any practical use and only catch typos.
-_RANGES: dict[str, tuple[int, ...]] = {
-    "num_envs": (2**20,),
-    "image_size": (2**12,),
-    "antialias": (16,),
-    "distractors": (envs.scene.distractors.MAX_COUNT, 0),
-}
+# Upper bounds beyond any practical use, which only catch typos.
+_MAX_ENVS, _MAX_IMAGE_SIZE, _MAX_ANTIALIAS = 2**20, 2**12, 16
 
 
 def make(
@@ -73,12 +68,16 @@ def make(
     """
     fast_cpu.warn_if_late()
     task_definition, robot_model = _find("task", task), _find_robot(robot)
-    num_envs, image_size, antialias, distractors = _counts(
-        num_envs=num_envs, image_size=image_size, antialias=antialias, distractors=distractors
-    )
+    num_envs = checks.count("num_envs", num_envs, _MAX_ENVS)
+    image_size = checks.count("image_size", image_size, _MAX_IMAGE_SIZE)
+    antialias = checks.count("antialias", antialias, _MAX_ANTIALIAS)
+    distractors = checks.count("distractors", distractors, MAX_COUNT, minimum=0)
     control_dt = _check_dt(control_dt, task_definition.time_limit)
-    _check_learning(actions, reward, discount)
-    objects = task_definition.scene + envs.scene.distractors.mjcf(distractors)
+    checks.choice("actions", actions, MODES)
+    checks.choice("reward", reward, REWARDS)
+    if not 0 < checks.number("discount", discount) <= 1:
+        raise ValueError(f"discount must be above 0 and at most 1, got {discount!r}")
+    objects = task_definition.scene + distractor_mjcf(distractors)
     model = scene.build(objects, robot_model)
     return Env(
         task=task_definition,
@@ -97,10 +96,10 @@ def make(
 
 def _renderer(
     name: str, model: mujoco.MjModel, image_size: int, antialias: int, num_envs: int
-) -> render.Renderer:
+) -> Renderer:
     """Make the renderer; Warp's takes cameras and appearance from the ray caster."""
-    _check_choices(renderer=(name, RENDERERS))
-    rays = render.RayRenderer(render.build(model, scene.CAMERAS), image_size, antialias)
+    checks.choice("renderer", name, RENDERERS)
+    rays = RayRenderer(build_render_model(model, scene.CAMERAS), image_size, antialias)
     if name == "rays":
         return rays
     physics.require_warp("renderer")
@@ -118,24 +117,6 @@ def _check_dt(value: float, time_limit: float) -> float:
     if round(targets) < 1 or abs(targets - round(targets)) > 1e-6:
         raise ValueError(f"control_dt must be a multiple of {TARGET_DT} s, got {control_dt}")
     return control_dt
-
-
-def _counts(**values: Any) -> Iterator[int]:
-    """Check integers against `_RANGES`, and return them as ints."""
-    return (checks.count(name, value, *_RANGES[name]) for name, value in values.items())
-
-
-def _check_choices(**values: tuple[Any, Sequence[str]]) -> None:
-    """Check choices by name, each passed as argument=(value, valid choices)."""
-    for name, (value, known) in values.items():
-        if value not in known:
-            raise ValueError(f"unknown {name} {value!r}: choose from {', '.join(known)}")
-
-
-def _check_learning(actions: Mode, reward: Reward, discount: float) -> None:
-    _check_choices(actions=(actions, MODES), reward=(reward, REWARDS))
-    if not 0 < checks.number("discount", discount) <= 1:
-        raise ValueError(f"discount must be above 0 and at most 1, got {discount!r}")
 
 
 def _find_robot(robot: AnyRobot) -> Robot:

@@ -33,7 +33,7 @@ PUBLIC = {
     "lorasp_jax.evaluation": "Result evaluate make_rollout",
     "lorasp_jax.extras.study": "Cell Derived Study",
     "envs": """
-        Env Episodes Randomization State Trajectory collect expert_success interop
+        Env Episodes Randomization State Trajectory collect interop
         make mjcf rlds robots
     """,
 }

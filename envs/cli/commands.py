@@ -2,17 +2,20 @@
 
 import argparse
 import contextlib
+import dataclasses
 import threading
 from collections.abc import Mapping
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from pathlib import Path
+from typing import Any
 
 import jax
+import mujoco
 import numpy as np
 from rich.console import Console
 
 import envs
-from envs.cli import recipes
+from envs import traced
 from envs.datasets import rlds
 from envs.datasets.episodes import Episodes
 from envs.experts import collection
@@ -98,7 +101,7 @@ def _env(options: argparse.Namespace, task: str) -> envs.Env:
         actions=options.actions,
         distractors=options.distractors,
     )
-    if ranges := recipes.ranges(options):
+    if ranges := _ranges(options):
         ranges.check(env.control_dt)
     return env
 
@@ -111,7 +114,7 @@ def _is_done(options: argparse.Namespace, env: envs.Env, file: Path) -> bool:
     """
     if not file.exists():
         return False
-    if rlds.metadata(file)["options"] != recipes.recipe(options, env):  # raises for other folders
+    if rlds.metadata(file)["options"] != _recipe(options, env):  # raises for other folders
         _refuse_existing(file)
     return True
 
@@ -144,17 +147,16 @@ def _collect_concurrently(
 
 def _collect(options: argparse.Namespace, env: envs.Env, out: Path, report: Report) -> str:
     """Collect the episodes of one task, resuming an interrupted call; return a summary."""
-    writer = rlds.ShardWriter(_partial(out), recipes.recipe(options, env))
+    writer = rlds.ShardWriter(_partial(out), _recipe(options, env))
     report(writer.num_episodes, options.num_episodes)
     for shard in collection.gather(
         env,
         options.num_episodes,
         jax.random.key(options.seed),
         options.action_noise,
-        recipes.ranges(options),
+        _ranges(options),
         collected=writer.num_episodes,
         attempted=writer.attempted,
-        record=options.record,
     ):
         writer.append(shard)
         report(writer.num_episodes, options.num_episodes)
@@ -203,3 +205,31 @@ def _refuse_existing(file: Path) -> None:
     check_local(file)
     if file.exists():
         raise ValueError(f"{file} already exists: choose another --out")
+
+
+def _recipe(options: argparse.Namespace, env: envs.Env) -> dict[str, Any]:
+    """Return everything that the episodes depend on, as JSON values."""
+    return {
+        "task": env.task.name,
+        "robot": options.robot,
+        "model": traced.digest(env),  # changes if the user edits the robot's file
+        "num_episodes": options.num_episodes,
+        "num_envs": env.num_envs,
+        "image_size": env.image_size,
+        "antialias": env.antialias,
+        "control_dt": env.control_dt,
+        "actions": env.actions,
+        "distractors": env.distractors,
+        "action_noise": options.action_noise,
+        "randomize": dataclasses.asdict(drawn) if (drawn := _ranges(options)) else None,
+        "seed": options.seed,
+        "physics": env.physics.backend,
+        "device": jax.default_backend(),
+        "jax": jax.__version__,
+        "mujoco": mujoco.__version__,
+    }
+
+
+def _ranges(options: argparse.Namespace) -> envs.Randomization | None:
+    """Return the ranges of domain randomization, if any."""
+    return envs.Randomization.typical() if options.randomize else None

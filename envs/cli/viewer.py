@@ -3,8 +3,6 @@
 import itertools
 import time
 import warnings
-from collections.abc import Callable
-from typing import Any
 
 import glfw
 import jax
@@ -15,8 +13,11 @@ import numpy as np
 from envs.env import Env
 from envs.experts import expert
 from envs.scene import placing
-from envs.state import State
 from lorasp_jax.base import fast_cpu
+
+_TRIES = 8  # maximum number of resets; our choice
+_plan = fast_cpu.jit(expert.plan, static_argnums=0)
+_act = fast_cpu.jit(expert.act, static_argnums=0)
 
 
 def check_display() -> None:
@@ -27,21 +28,12 @@ def check_display() -> None:
             raise ValueError("cannot open a window without a display: add --out FILE.mp4")
 
 
-def episode(
-    env: Env,
-    key: jax.Array,
-    *,
-    tries: int = 8,
-    plan: Callable[[Env, State, jax.Array], Any] | None = None,
-    act: Callable[[Env, Any, State], jax.Array] | None = None,
-) -> tuple[mujoco.MjModel, np.ndarray]:
+def episode(env: Env, key: jax.Array) -> tuple[mujoco.MjModel, np.ndarray]:
     """Simulate a successful episode of the expert.
 
     Args:
         env: environment; its parallel worlds are independent attempts.
         key: source of all randomness.
-        tries: maximum number of resets.
-        plan, act: replacements for the compiled `expert.plan` and `expert.act`.
 
     Returns:
         Model of the successful world, and the joint positions `[T, nq]` over time.
@@ -49,24 +41,22 @@ def episode(
     Raises:
         ValueError: the expert never succeeds.
     """
-    plan, act = plan or _plan, act or _act
-    for _ in range(tries):
+    for _ in range(_TRIES):
         key, try_key = jax.random.split(key)
         reset_key, plan_key, _ = jax.random.split(try_key, 3)  # as in envs.experts.collection
         state = env.reset(reset_key)
-        planned = plan(env, state, plan_key)
+        planned = _plan(env, state, plan_key)
         states = [state]
         for _ in range(env.expert_steps):
-            states.append(env.step(states[-1], act(env, planned, states[-1])))
+            states.append(env.step(states[-1], _act(env, planned, states[-1])))
         wins = np.flatnonzero(states[-1].info["success"])
         if len(wins):
             world = wins[0]
             steps = int(states[-1].info["steps"][world])
             positions = [np.asarray(state.data.qpos[world]) for state in states[: steps + 1]]
-            return placing.world_model(env.model, states[0].info["layout"], world), np.stack(
-                positions
-            )
-    raise ValueError(f"the expert failed in all {tries * env.num_envs} layouts")
+            model = placing.world_model(env.model, states[0].info["layout"], world)
+            return model, np.stack(positions)
+    raise ValueError(f"the expert failed in all {_TRIES * env.num_envs} layouts")
 
 
 def show(model: mujoco.MjModel, positions: np.ndarray, seconds: float) -> None:
@@ -91,7 +81,3 @@ def show(model: mujoco.MjModel, positions: np.ndarray, seconds: float) -> None:
             time.sleep(max(0.0, start + seconds - time.monotonic()))
             if not window.is_running():
                 return
-
-
-_plan = fast_cpu.jit(expert.plan, static_argnums=0)
-_act = fast_cpu.jit(expert.act, static_argnums=0)

@@ -1,4 +1,4 @@
-"""Recorded episodes: batched arrays in memory, one .npz file on disk."""
+"""Recorded episodes: batched arrays in memory, and in the cache of a run."""
 
 import dataclasses
 import functools
@@ -7,7 +7,6 @@ import math
 import numbers
 import os
 import re
-import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -16,22 +15,17 @@ import jax
 import numpy as np
 
 from envs.names import MODES
-from lorasp_jax.base.files import as_value_error, check_local, check_memory, check_regular
+from lorasp_jax.base.files import as_value_error
 from lorasp_jax.base.writing import atomic_file
 
 Array = jax.Array | np.ndarray
 
-_FORMAT = "envs-episodes-1"
 SHARED = ("task", "robot", "control_dt", "physics_dt", "actions", "instructions")
 """Fields that must be equal in order to concatenate episodes."""
 _ARRAYS = ("state", "action", "length", "instruction")
 _METADATA = (*SHARED, "attempted")
 _IMAGE = "image/"
 _CAMERA = re.compile(r"[\w-][\w .-]{0,99}")
-_HEADERS: Any = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
 
 
 @functools.partial(
@@ -98,9 +92,8 @@ class Episodes:
             ValueError: the arrays are inconsistent.
         """
         self.validate()
-        check_local(path := Path(path))
-        metadata = {name: getattr(self, name) for name in _METADATA}
-        header = json.dumps({"format": _FORMAT, **metadata}).encode()
+        path = Path(path)
+        header = json.dumps({name: getattr(self, name) for name in _METADATA}).encode()
         arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
         arrays |= {_IMAGE + name: np.asarray(images) for name, images in self.image.items()}
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -119,14 +112,13 @@ class Episodes:
             ValueError: the file is missing or damaged, or has another format or control period.
         """
         with as_value_error(path := Path(path)):
-            arrays: dict[str, Any] = _read(path)
-            metadata = json.loads(arrays.pop("header").tobytes())
-            if metadata["format"] != _FORMAT:
-                raise ValueError(f"its format is not {_FORMAT}")
-            metadata["instructions"] = tuple(metadata["instructions"])
-            image = {k.removeprefix(_IMAGE): arrays[k] for k in arrays if k.startswith(_IMAGE)}
-            fields = {name: arrays[name] for name in _ARRAYS}
-            fields |= {name: metadata[name] for name in _METADATA}
+            with np.load(path) as archive:
+                fields: dict[str, Any] = dict(archive)
+            header = json.loads(fields.pop("header").tobytes())
+            fields |= {name: header[name] for name in _METADATA}
+            fields["instructions"] = tuple(fields["instructions"])
+            images = [name for name in fields if name.startswith(_IMAGE)]
+            image = {name.removeprefix(_IMAGE): fields.pop(name) for name in images}
             episodes = cls(image=image, **fields)
             episodes.validate()
             if control_dt is not None and abs(episodes.control_dt - control_dt) > 1e-9:
@@ -233,20 +225,3 @@ def _pad(array: Array, steps: int) -> Array:
     if array.ndim == 1 or array.shape[1] == steps:
         return array
     return np.pad(array, [(0, 0), (0, steps - array.shape[1])] + [(0, 0)] * (array.ndim - 2))
-
-
-def _read(path: Path) -> dict[str, np.ndarray]:
-    with zipfile.ZipFile(check_regular(path)) as archive:
-        members = archive.infolist()
-        check_memory(sum(member.file_size for member in members), path)
-        return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
-
-
-def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    """Read one array after checking its size, since NumPy trusts the size in its header."""
-    with archive.open(member) as file:
-        shape, _, dtype = _HEADERS[np.lib.format.read_magic(file)](file)
-        if math.prod(shape) * dtype.itemsize != member.file_size - file.tell():
-            raise ValueError(f"the size of {member.filename} does not match its header")
-    with archive.open(member) as file:
-        return np.lib.format.read_array(file, allow_pickle=False)

@@ -13,33 +13,41 @@ import functools
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import jax
 import tensorflow_datasets as tfds
 from array_record.python import array_record_module
+from array_record.python.array_record_data_source import ArrayRecordDataSource
+from google.protobuf.message import DecodeError
 
 from envs.datasets import rlds_schema
-from envs.datasets.episodes import SHARED, Episodes
-from envs.datasets.rlds_reading import (
-    FORMAT,
-    METADATA,
-    SPLIT,
-    THREADS,
-    Reader,
-    as_value_error,
-    metadata,
-    read,
-)
-from lorasp_jax.base.files import check_regular, first_line
+from envs.datasets.episodes import SHARED, Episodes, concatenate
+from lorasp_jax.base import json_values
+from lorasp_jax.base.files import as_value_error, check_regular, first_line, read_json
 from lorasp_jax.base.locks import locked
 from lorasp_jax.base.writing import atomic_folder, sync, write_text
 
-__all__ = ["METADATA", "ShardWriter", "Reader", "metadata", "read", "write"]
-
-_VERSION = "1.0.0"
+METADATA = "metadata.json"
+"""Metadata file in a dataset's folder; tfds reads it, too."""
+_THREADS = ThreadPoolExecutor(8)
+"""Shared by all open datasets: more threads would only wait for the GIL."""
+_TYPES: dict[str, Any] = {"options": {}, "parts": [int], "steps": int, "attempted": int}
+"""Schema of the metadata of every dataset, see `json_values.check`."""
+_SHARD_TYPES: dict[str, Any] = {
+    **{"task": str, "robot": str, "actions": str, "instructions": [str]},
+    **{"cameras": {str: (int, int)}, "control_dt": float, "physics_dt": float},
+}
+"""Schema of the fields that appear with the first shard."""
+_FORMAT, _SPLIT, _VERSION = "envs-rlds-1", "train", "1.0.0"
+_INFO = "dataset_info.json"
+"""File of tfds, written last, so that it marks a complete dataset."""
+_FILES = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_INDEX}"
+"""Template of shard names, as used by tfds.core.SequentialWriter."""
 _DESCRIPTIONS = {
     True: "Scripted expert episodes of {task} by {robot} in simulation.",
     False: "Recorded episodes of {task} by {robot}.",
@@ -47,6 +55,92 @@ _DESCRIPTIONS = {
 # 7x as fast as the default (measured), since episodes are read one by one and PNG data does not
 # compress further.
 _RECORDS = "group_size:1,uncompressed"
+
+
+def read(path: str | os.PathLike[str]) -> Episodes:
+    """Read a dataset written by `write` or `python -m envs collect` into host memory.
+
+    Episodes are padded with zeros to the longest one.
+
+    Raises:
+        ValueError: the folder is missing, damaged or not a dataset of this format.
+    """
+    reader = Reader(path)
+    parts = list(_THREADS.map(reader.episode, range(len(reader))))
+    with _reading(reader.path):
+        return replace(concatenate(parts), attempted=reader.metadata["attempted"])
+
+
+def metadata(path: Path) -> dict[str, Any]:
+    """Read the metadata of a dataset (see `ShardWriter`).
+
+    Raises:
+        ValueError: as in `read`.
+    """
+    with _reading(path):
+        content = read_json(path / METADATA, path)
+        if content["format"] != _FORMAT:
+            raise ValueError(f"its format is not {_FORMAT}")
+        json_values.check(content, _TYPES | (_SHARD_TYPES if content["parts"] else {}))
+    return content
+
+
+class Reader:
+    """A dataset written by `write` or `python -m envs collect`, read one episode at a time.
+
+    Attributes:
+        kind: name of the format.
+        path: folder of the dataset.
+        metadata: see `ShardWriter`.
+        cameras: camera -> feature of its images.
+        control_dt: time between two actions [s].
+        num_steps: total number of control steps.
+    """
+
+    kind = "RLDS"
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        """Open a dataset.
+
+        Raises:
+            ValueError: as in `read`.
+        """
+        self.path: Path = Path(path)
+        self.metadata: dict[str, Any] = metadata(self.path)
+        with _reading(self.path):
+            cameras = self.metadata["cameras"]
+            self.cameras: dict[str, str] = {n: rlds_schema.image_feature(n) for n in cameras}
+            self.control_dt: float = float(self.metadata["control_dt"])
+            self.num_steps: int = self.metadata["steps"]
+            self._shared: dict[str, Any] = {name: self.metadata[name] for name in SHARED}
+            self._shared |= {"instructions": tuple(self.metadata["instructions"]), "attempted": 1}
+            check_regular(self.path / _INFO, self.path)
+            shards = sorted(self.path.glob(f"*-{_SPLIT}.array_record-*"))
+            self._records = ArrayRecordDataSource([check_regular(f, self.path) for f in shards])
+            if len(self) != (expected := sum(self.metadata["parts"])):
+                raise ValueError(f"expected {expected} episodes, found {len(self)}")
+
+    def __len__(self) -> int:
+        """Number of episodes."""
+        return len(self._records)
+
+    def episode(self, number: int, cameras: Sequence[str] | None = None) -> Episodes:
+        """Load one episode into host memory.
+
+        Args:
+            number: index of the episode.
+            cameras: cameras to load; None: all.
+
+        Raises:
+            ValueError: it is damaged or incomplete.
+        """
+        with _reading(self.path):
+            names = self.cameras if cameras is None else cameras
+            selected = {name: self.cameras[name] for name in names}
+            sizes = self.metadata["cameras"]
+            episode = rlds_schema.episode(self._records[number], selected, sizes, self._shared)
+            episode.validate_numbers()
+            return episode
 
 
 def write(episodes: Episodes, path: str | os.PathLike[str]) -> None:
@@ -81,7 +175,8 @@ class ShardWriter:
             - `options`: how the episodes were made;
             - `parts`: number of episodes in each shard;
             - `steps`, `attempted`: total number of control steps and of attempts;
-            - `cameras`: height and width of each camera's images.
+            - `cameras`: height and width of each camera's images;
+            - `widths`: number of values in a state and in an action.
     """
 
     def __init__(self, folder: Path, options: Mapping[str, Any]):
@@ -95,7 +190,7 @@ class ShardWriter:
             ValueError: the options differ, or a shard is damaged.
         """
         self.folder = folder
-        self.metadata: dict[str, Any] = {"format": FORMAT, "options": dict(options), "parts": []}
+        self.metadata: dict[str, Any] = {"format": _FORMAT, "options": dict(options), "parts": []}
         self.metadata |= {"steps": 0, "attempted": 0}
         if (folder / METADATA).exists():
             self.metadata = metadata(folder)
@@ -129,15 +224,14 @@ class ShardWriter:
         shared: dict[str, Any] = {name: getattr(episodes, name) for name in SHARED}
         shared["instructions"] = list(episodes.instructions)
         shared["cameras"] = {name: list(x.shape[2:4]) for name, x in episodes.image.items()}
-        features = rlds_schema.features(episodes)
+        shared["widths"] = [episodes.state.shape[2], episodes.action.shape[2]]
         if not self.metadata["parts"]:
-            features.save_config(str(self.folder))
             self.metadata |= shared
-        _check_same(self.folder, {name: self.metadata[name] for name in shared}, shared)
-        serializer = rlds_schema.serializer(features)
+        _check_same(self.folder, {name: self.metadata.get(name) for name in shared}, shared)
+        serializer = rlds_schema.serializer(rlds_schema.features(self.metadata))
         record = functools.partial(rlds_schema.record, serializer, jax.device_get(episodes))
         first, numbers = self.num_episodes, range(episodes.num_episodes)
-        records = THREADS.map(record, numbers, range(first, first + len(numbers)))
+        records = _THREADS.map(record, numbers, range(first, first + len(numbers)))
         _write_records(self._file(len(self.metadata["parts"])), records)
         self.metadata["parts"].append(len(numbers))
         self.metadata["steps"] += episodes.num_steps
@@ -153,8 +247,8 @@ class ShardWriter:
             data_dir=str(self.folder),
             module_name="",
         )
-        with as_value_error(self.folder, ": delete it to start over"):
-            features = rlds_schema.stored(self.folder)
+        with _reading(self.folder, ": delete it to start over"):
+            features = rlds_schema.features(self.metadata)
         info = tfds.core.DatasetInfo(
             builder=identity,
             description=_DESCRIPTIONS[bool(self.metadata["physics_dt"])].format(**self.metadata),
@@ -162,13 +256,13 @@ class ShardWriter:
         )
         info.set_file_format(tfds.core.FileFormat.ARRAY_RECORD)
         split = tfds.core.SplitInfo(
-            name=SPLIT,
+            name=_SPLIT,
             shard_lengths=self.metadata["parts"],
             num_bytes=sum(file.stat().st_size for file in files),
             filename_template=self._template,
         )
         info.set_splits(tfds.core.SplitDict([split]))
-        (self.folder / rlds_schema.INFO).unlink(missing_ok=True)  # left by a killed process
+        (self.folder / _INFO).unlink(missing_ok=True)  # left by a killed process
         info.write_to_directory(self.folder)
 
     def _save(self) -> None:
@@ -184,9 +278,9 @@ class ShardWriter:
     def _template(self) -> tfds.core.ShardedFileTemplate:
         return tfds.core.ShardedFileTemplate(
             data_dir=tfds.core.Path(self.folder),
-            template=rlds_schema.FILES,
+            template=_FILES,
             dataset_name=self._name,
-            split=SPLIT,
+            split=_SPLIT,
             filetype_suffix=tfds.core.FileFormat.ARRAY_RECORD.file_suffix,
         )
 
@@ -215,7 +309,7 @@ def _write_records(file: Path, records: Iterable[bytes]) -> None:
 
 def _check_shard(file: Path, episodes: int) -> None:
     """Raise a ValueError if a shard is damaged; reading verifies each record's checksum."""
-    with as_value_error(file, f": delete {file.parent} to start over"):
+    with _reading(file, f": delete {file.parent} to start over"):
         reader = array_record_module.ArrayRecordReader(str(check_regular(file, file.parent)))
         if reader.num_records() != episodes or len(reader.read_all()) != episodes:
             raise ValueError(f"expected {episodes} episodes, found {reader.num_records()}")
@@ -229,3 +323,8 @@ def _as_os_error(file: Path) -> Iterator[None]:
     except RuntimeError as error:
         cause = first_line(error).partition("; ")[0]  # the rest is a position in the file
         raise OSError(f"cannot write {file} ({cause})") from error
+
+
+def _reading(path: Path, remedy: str = "") -> contextlib.AbstractContextManager[None]:
+    """Convert errors as `files.as_value_error` does, including protobuf's."""
+    return as_value_error(path, DecodeError, remedy=remedy)

@@ -6,23 +6,17 @@ Features have the names of Open X-Embodiment.
 import io
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import tensorflow_datasets as tfds
 from PIL import Image
 from tensorflow_datasets.core.example_serializer import ExampleSerializer
+from tensorflow_datasets.proto import tf_example_pb2
 
 from envs.datasets.episodes import Episodes
-from lorasp_jax.base.files import RefusedError, read_json
 
-FEATURES, INFO = "features.json", "dataset_info.json"
-"""Files of tfds that describe a dataset, in the dataset's folder."""
-FILES = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_INDEX}"
-"""Template of shard names, as used by tfds.core.SequentialWriter."""
-_TFDS_FILES = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"  # of a copy that tfds wrote
 _MAIN = {"side": "image"}  # feature of the main camera; the others are <name>_image
 _COMPRESSION = 1  # level of zlib, the fastest
 _ACTION = {
@@ -33,53 +27,26 @@ _ACTION = {
 }
 
 
-_CLASSES = [
-    f"{kind.__module__}.{kind.__name__}"
-    for kind in (
-        tfds.features.FeaturesDict,
-        tfds.features.Dataset,
-        tfds.features.Image,
-        tfds.features.Tensor,
-        tfds.features.Text,
-        tfds.features.Scalar,
-    )
-]
-_ALLOWED = {
-    "pythonClassName": _CLASSES,
-    "python_class_name": _CLASSES,
-    "filepathTemplate": [FILES, _TFDS_FILES],
-    "filepath_template": [FILES, _TFDS_FILES],
-    "dtype": ["float32", "int64", "bool", "uint8"],
-    "encoding": ["none"],
-    "encodingFormat": ["png"],
-    "encoding_format": ["png"],
-    "jsonFeature": [],
-    "json_feature": [],
-}
-"""Allowed values of each field that tfds interprets in a description. Fields are spelled as by tfds
-and as by protobuf. The last two fields, and "type" at the top level, are of older formats and are
-refused: they name classes, too."""
-
-
-def features(episodes: Episodes) -> tfds.features.FeaturesDict:
-    """Define the features of a dataset of these episodes, documenting joint names and units."""
+def features(metadata: Mapping[str, Any]) -> tfds.features.FeaturesDict:
+    """Define the features of a dataset from its metadata, documenting joint names and units."""
     types = tfds.features
-    joints = ", ".join(f"joint_{i + 1}" for i in range(episodes.state.shape[2] - 1))
+    state_width, action_width = metadata["widths"]
+    joints = ", ".join(f"joint_{i + 1}" for i in range(state_width - 1))
     images = {
         image_feature(camera): types.Image(
-            shape=array.shape[2:], encoding_format="png", doc=f"{camera} camera, before the action"
+            shape=(*size, 3), encoding_format="png", doc=f"{camera} camera, before the action"
         )
-        for camera, array in episodes.image.items()
+        for camera, size in metadata["cameras"].items()
     }
     state = types.Tensor(
-        shape=episodes.state.shape[2:],
+        shape=(state_width,),
         dtype=np.float32,
         doc=f"measured before the action: {joints} [rad], gripper opening [m]",
     )
     action = types.Tensor(
-        shape=episodes.action.shape[2:],
+        shape=(action_width,),
         dtype=np.float32,
-        doc=_ACTION[episodes.actions].format(joints=joints),
+        doc=_ACTION[metadata["actions"]].format(joints=joints),
     )
     step = {
         "observation": types.FeaturesDict(images | {"state": state}),
@@ -105,46 +72,6 @@ def _metadata() -> tfds.features.FeaturesDict:
         "physics_dt": types.Scalar(np.float32, doc="time step of the simulation [s]"),
     }
     return types.FeaturesDict(metadata)
-
-
-def stored(folder: Path) -> tfds.features.FeaturesDict:
-    """Read the features of a dataset in a folder.
-
-    Raises:
-        ValueError: they are damaged, or refused by `check_description`.
-    """
-    check_description(folder, FEATURES)
-    loaded: Any = tfds.features.FeaturesDict.from_config(str(folder))
-    return loaded
-
-
-def check_description(folder: Path, *names: str) -> None:
-    """Raise unless tfds, which imports the classes named in these files, can read them safely.
-
-    Raises:
-        RefusedError: a file names a class, data type or encoding that `features` does not use, or
-            shards other than `FILES` and those of tfds.
-        ValueError: a file is damaged.
-        OSError: a file is missing.
-    """
-    for path in (folder / name for name in names):
-        description = read_json(path, folder)
-        fields = _ALLOWED | (
-            {"type": ()} if path.name == FEATURES and "type" in description else {}
-        )
-        for field, value in _values(description, fields):
-            if value not in fields[field]:
-                allowed = " or ".join(fields[field]) or "absent"
-                raise RefusedError(f"{path} has {field} {str(value)[:80]!r}; it must be {allowed}")
-
-
-def _values(value: Any, fields: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield the values of these fields anywhere in a JSON value."""
-    if isinstance(value, dict):
-        yield from ((field, value[field]) for field in fields if field in value)
-        value = list(value.values())
-    for item in value if isinstance(value, list) else ():
-        yield from _values(item, fields)
 
 
 def serializer(features: tfds.features.FeaturesDict) -> ExampleSerializer:
@@ -189,30 +116,41 @@ def record(
 
 
 def episode(
-    example: Mapping[str, Any],
+    record: bytes,
     cameras: Mapping[str, str],
     sizes: Mapping[str, Any],
     metadata: Mapping[str, Any],
 ) -> Episodes:
-    """Convert an example from tfds to an episode in host memory.
+    """Parse a record to an episode in host memory.
+
+    tfds would import the classes that a dataset's description names. A record has no classes.
 
     Args:
-        example: the example, with encoded images.
+        record: from `record`.
         cameras: camera -> feature of its images.
         sizes: camera -> height and width of its images.
         metadata: the metadata fields of `Episodes`.
     """
-    steps = list(example["steps"])
-    observations = [step["observation"] for step in steps]
+    fields = tf_example_pb2.Example.FromString(record).features.feature
+    steps = len(fields["steps/is_first"].int64_list.value)
+    (instruction,) = fields["episode_metadata/instruction"].int64_list.value
+
+    def rows(name: str) -> np.ndarray:
+        values = np.array(fields[f"steps/{name}"].float_list.value, np.float32)
+        return values.reshape(1, steps, -1)
+
+    def images(camera: str, feature: str) -> np.ndarray:
+        files = fields[f"steps/observation/{feature}"].bytes_list.value
+        if len(files) != steps:
+            raise ValueError(f"{len(files)} images of {camera} in {steps} steps")
+        return np.stack([_decode(file, sizes[camera]) for file in files])[None]
+
     return Episodes(
-        image={
-            camera: np.stack([_decode(step[feature], sizes[camera]) for step in observations])[None]
-            for camera, feature in cameras.items()
-        },
-        state=np.stack([step["state"] for step in observations])[None],
-        action=np.stack([step["action"] for step in steps])[None],
-        length=np.array([len(steps)], np.int32),
-        instruction=np.array([int(example["episode_metadata"]["instruction"])], np.int32),
+        image={camera: images(camera, feature) for camera, feature in cameras.items()},
+        state=rows("observation/state"),
+        action=rows("action"),
+        length=np.array([steps], np.int32),
+        instruction=np.array([instruction], np.int32),
         **metadata,
     )
 

@@ -4,8 +4,7 @@ A call scans over the control steps of one episode in W worlds. It records robot
 the poses of all geoms and cameras, then renders images from those poses in bounded memory.
 """
 
-import dataclasses
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -17,9 +16,9 @@ from envs.datasets.episodes import Episodes, concatenate
 from envs.env import Env
 from envs.experts import expert
 from envs.making import AnyRobot, make
-from envs.scene.randomization import Draw, prepare
+from envs.scene.randomization import prepare
 from envs.scene.ranges import Randomization
-from envs.state import Poses
+from envs.state import Poses, State
 
 # Default number of worlds per call, our choice: enough to fill the device, within its memory.
 _NUM_ENVS = {"cpu": 32, "gpu": 256, "tpu": 256}
@@ -28,42 +27,13 @@ _NUM_ENVS = {"cpu": 32, "gpu": 256, "tpu": 256}
 _MIN_SUCCESS, _MIN_ATTEMPTS = 0.5, 16
 _MAX_EPISODES = 10**9  # our choice; catches typos
 
-Record = Callable[
-    [Env, jax.Array, float | jax.Array, Randomization | None], tuple[dict[str, Any], jax.Array]
-]
-"""Attempt an episode in every world; return the arrays of `Episodes`, and success `[W]`."""
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Demonstrations:
-    """One expert episode of T control steps in each of W worlds.
-
-    Attributes:
-        state: f32 [T, W, J + 1] measured joints [rad] and gripper opening [m] before each action.
-        action: f32 `[T, W, A]` the expert's actions, without noise.
-        poses: poses of geoms and cameras before each action, leading axes `[T, W]`.
-        length: int32 `[W]` control steps until the world was done.
-        success: bool `[W]`.
-        instruction: int32 `[W]` index into the task's instructions.
-        draw: randomized values of the worlds, or None.
-    """
-
-    state: jax.Array
-    action: jax.Array
-    poses: Poses
-    length: jax.Array
-    success: jax.Array
-    instruction: jax.Array
-    draw: Draw | None
-
 
 def rollout(
     env: Env,
     key: jax.Array,
     action_noise: float | jax.Array = 0.0,
     ranges: Randomization | None = None,
-) -> Demonstrations:
+) -> tuple[State, Poses, dict[str, jax.Array], jax.Array]:
     """Run the expert on fresh random layouts; call this function under jit.
 
     Args:
@@ -73,6 +43,10 @@ def rollout(
             [rad, or m for the tcp's translation]. The gripper opening gets no noise. Recorded
             actions are without noise, so they demonstrate recovery.
         ranges: domain randomization, see `envs.scene.randomization`.
+
+    Returns:
+        The worlds at reset; the poses before each of the T actions, leading axes `[W, T]`; the
+        arrays of `Episodes` except images; success, bool `[W]`.
     """
     reset_key, plan_key, noise_key = jax.random.split(key, 3)
     first = env.reset(reset_key, ranges)
@@ -86,15 +60,15 @@ def rollout(
 
     keys = jax.random.split(noise_key, env.expert_steps)
     last, (state, action, poses, alive) = jax.lax.scan(body, first, keys)
-    return Demonstrations(
-        state=state,
-        action=action,
-        poses=poses,
-        length=jnp.sum(alive, axis=0, dtype=jnp.int32),
-        success=last.info["success"],
-        instruction=last.info["instruction"],
-        draw=first.info["draw"],
-    )
+    # World-major order, so that the images of an episode are contiguous.
+    poses, state, action = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), (poses, state, action))
+    episodes = {
+        "state": state,
+        "action": action,
+        "length": jnp.sum(alive, axis=0, dtype=jnp.int32),
+        "instruction": last.info["instruction"],
+    }
+    return first, poses, episodes, last.info["success"]
 
 
 def collect(
@@ -107,7 +81,6 @@ def collect(
     action_noise: float = 0.0,
     ranges: Randomization | None = None,
     progress: Callable[[int, int], None] | None = None,
-    record: Record | None = None,
     **options: Any,
 ) -> Episodes:
     """Collect successful demonstrations of the scripted expert, in host memory.
@@ -123,7 +96,6 @@ def collect(
         action_noise: as in `rollout`.
         ranges: as in `rollout`.
         progress: called with (episodes so far, num_episodes), first with 0 before compilation.
-        record: function that attempts an episode in every world; default: the expert in simulation.
         **options: further options of `envs.make`; the backend defaults to jax.
 
     Raises:
@@ -131,32 +103,13 @@ def collect(
         ValueError: a name is unknown, a number is out of range, or the expert fails too often.
     """
     env = make_repeatable(task, robot, num_envs=worlds(num_episodes, num_envs), **options)
-    parts = gather(env, num_episodes, key, action_noise, ranges, record=record)
-    return concatenate(list(_with_progress(parts, num_episodes, progress)))
-
-
-def expert_success(
-    task: str,
-    robot: AnyRobot = "piper",
-    *,
-    num_episodes: int,
-    key: jax.Array,
-    num_envs: int | None = None,
-    ranges: Randomization | None = None,
-    attempt: Callable[[Env, jax.Array, Randomization | None], jax.Array] | None = None,
-    **options: Any,
-) -> jax.Array:
-    """Return whether the expert solves each of `num_episodes` random layouts, bool [num_episodes].
-
-    Arguments are as in `collect`, except `attempt`. It runs an episode in every world and returns
-    success, bool `[W]`; default: the expert in simulation.
-    """
-    env = make_repeatable(task, robot, num_envs=worlds(num_episodes, num_envs), **options)
-    ranges = prepare(ranges, env.control_dt)
-    calls = -(-num_episodes // env.num_envs)
-    attempt = attempt or attempt_expert
-    results = [attempt(env, chunk_key, ranges) for chunk_key in jax.random.split(key, calls)]
-    return jnp.concatenate(results)[:num_episodes]
+    report = progress or (lambda *_: None)
+    report(0, num_episodes)
+    parts = []
+    for part in gather(env, num_episodes, key, action_noise, ranges):
+        parts.append(part)
+        report(sum(each.num_episodes for each in parts), num_episodes)
+    return concatenate(parts)
 
 
 def make_repeatable(task: str, robot: AnyRobot, **options: Any) -> Env:
@@ -174,21 +127,18 @@ def gather(
     *,
     collected: int = 0,
     attempted: int = 0,
-    record: Record | None = None,
 ) -> Iterator[Episodes]:
-    """Yield the successful episodes of each call of `record`, `num_episodes` in total.
+    """Yield the successful episodes of each call of `record_expert`, `num_episodes` in total.
 
     Args:
         env: W worlds, one attempt each per call.
         num_episodes, key, action_noise, ranges: as in `collect`.
         collected, attempted: episodes yielded and attempts made before an interruption; resuming
             with them gives the same episodes as an uninterrupted run.
-        record: as in `collect`.
 
     Raises:
         ValueError: the expert fails too often.
     """
-    record = record or record_expert
     ranges = prepare(ranges, env.control_dt)
     if checks.number("action_noise", action_noise) < 0:
         raise ValueError(f"action_noise must be at least 0, got {action_noise}")
@@ -199,7 +149,7 @@ def gather(
         _check_success(env, collected, attempted)
         key, chunk_key = jax.random.split(key)
         # Wait here without holding the GIL, so that other threads can write their episodes.
-        chunk, success = jax.block_until_ready(record(env, chunk_key, action_noise, ranges))
+        chunk, success = jax.block_until_ready(record_expert(env, chunk_key, action_noise, ranges))
         wins = np.flatnonzero(success)[: num_episodes - collected]
         collected += len(wins)
         # Do not count attempts after the last one needed.
@@ -208,36 +158,17 @@ def gather(
         if len(wins):
             # To host memory: on the device, training needs the space.
             won = jax.tree.map(lambda x, wins=wins: np.asarray(x)[wins], chunk)
-            yield Episodes(**won, **_metadata(env), attempted=tried)
+            yield Episodes(
+                **won,
+                instructions=env.instructions,
+                task=env.task.name,
+                robot=env.robot.name,
+                control_dt=env.control_dt,
+                physics_dt=env.physics_dt,
+                attempted=tried,
+                actions=env.actions,
+            )
             tried = 0
-
-
-def _metadata(env: Env) -> dict[str, Any]:
-    return {
-        "instructions": env.instructions,
-        "task": env.task.name,
-        "robot": env.robot.name,
-        "control_dt": env.control_dt,
-        "physics_dt": env.physics_dt,
-        "actions": env.actions,
-    }
-
-
-def _with_progress(
-    parts: Iterable[Episodes], total: int, progress: Callable[[int, int], None] | None
-) -> Iterator[Episodes]:
-    """Pass the parts through, reporting progress before the first and after each."""
-    report = progress or _silent
-    report(0, total)
-    done = 0
-    for part in parts:
-        done += part.num_episodes
-        report(done, total)
-        yield part
-
-
-def _silent(done: int, total: int) -> None:
-    """Report no progress."""
 
 
 def _check_success(env: Env, collected: int, attempted: int) -> None:
@@ -253,27 +184,14 @@ def _check_success(env: Env, collected: int, attempted: int) -> None:
 def record_expert(
     env: Env, key: jax.Array, action_noise: float | jax.Array, ranges: Randomization | None
 ) -> tuple[dict[str, Any], jax.Array]:
-    """Attempt random layouts with the expert and render images; implements `Record`."""
-    tries = rollout(env, key, action_noise, ranges)
-    steps, worlds = tries.action.shape[:2]
-    # World-major order, so that the images of an episode are contiguous.
-    flat = [jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]) for x in tries.poses]
-    drawn = jax.tree.map(lambda x: jnp.repeat(x, steps, axis=0), tries.draw)
-    images = env.render(Poses(*flat), draw=drawn)
-    episodes = {
-        "image": {k: x.reshape(worlds, steps, *x.shape[1:]) for k, x in images.items()},
-        "state": jnp.swapaxes(tries.state, 0, 1),
-        "action": jnp.swapaxes(tries.action, 0, 1),
-        "length": tries.length,
-        "instruction": tries.instruction,
-    }
-    return episodes, tries.success
-
-
-@traced.cached
-def attempt_expert(env: Env, key: jax.Array, ranges: Randomization | None) -> jax.Array:
-    """Return whether the expert succeeds in each world, bool `[W]`."""
-    return rollout(env, key, ranges=ranges).success
+    """Attempt an episode in every world; return the arrays of `Episodes`, and success `[W]`."""
+    first, poses, episodes, success = rollout(env, key, action_noise, ranges)
+    worlds, steps = episodes["action"].shape[:2]
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), poses)
+    drawn = jax.tree.map(lambda x: jnp.repeat(x, steps, axis=0), first.info["draw"])
+    images = env.render(flat, draw=drawn)
+    image = {k: x.reshape(worlds, steps, *x.shape[1:]) for k, x in images.items()}
+    return {"image": image} | episodes, success
 
 
 def worlds(num_episodes: int, num_envs: int | None) -> int:

@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from brax.envs import base
 
 from envs import checks
 from envs.env import Env
@@ -19,11 +20,6 @@ from envs.scene.randomization import prepare
 from envs.scene.ranges import Randomization
 from envs.state import State
 from lorasp_jax.base import fast_cpu
-
-try:
-    from brax.envs import base
-except ImportError as error:
-    raise ImportError('envs.interop.brax needs Brax: pip install -e ".[brax]"') from error
 
 # Compile a single world: Brax adds its own batch axis, and nested batches would compile slower.
 _reset = fast_cpu.jit(Env._reset, static_argnums=0)

@@ -11,9 +11,13 @@ observation, reward, terminated, truncated, info = env.step(env.action_space.sam
 import dataclasses
 from typing import Any, ClassVar, Literal, get_args
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
 
 from envs import checks
 from envs.env import Env
@@ -21,15 +25,6 @@ from envs.making import make as make_env
 from envs.scene.randomization import prepare
 from envs.scene.ranges import Randomization
 from envs.state import State
-
-try:
-    import gymnasium
-    from gymnasium import spaces
-    from gymnasium.vector import AutoresetMode
-    from gymnasium.vector.utils import batch_space
-except ImportError as error:
-    raise ImportError('this needs Gymnasium: pip install -e ".[gymnasium]"') from error
-
 
 Observation = Literal["pictures", "state", "full_state"]
 OBSERVATIONS: tuple[str, ...] = get_args(Observation)
@@ -257,8 +252,7 @@ def make(
 
 def _space(env: Env, observation: str) -> spaces.Space[Any]:
     """Return one world's observation space; joints can exceed limits, so states are unbounded."""
-    if observation not in OBSERVATIONS:
-        raise ValueError(f"observation must be {' or '.join(OBSERVATIONS)}, got {observation!r}")
+    checks.choice("observation", observation, OBSERVATIONS)
     if observation == "full_state":
         length = max(part.stop for part in env.full_state_layout.values())
         return spaces.Box(-np.inf, np.inf, (length,))

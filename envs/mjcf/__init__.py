@@ -77,6 +77,8 @@ def _read(
     hand = hands.find(model, arm, tcp)
     lower, upper = reading.find_limits(model, arm)
     pull = reading.find_gripper(model, arm, hand.signs)
+    key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "home")
+    keyframe = model.key_qpos[key, model.jnt_qposadr[arm.joints]] if key >= 0 else None
     return Robot(
         name=str(path),
         chain=hand.chain,
@@ -84,7 +86,7 @@ def _read(
         lower=lower,
         upper=upper,
         speed=_positive("speed", speed, len(lower)),
-        home=_guess_home(model, arm, (lower + upper) / 2),
+        home=(lower + upper) / 2 if keyframe is None else keyframe,
         lean=0.0,
         tilt_side=1,
         stroke=hand.stroke,
@@ -99,11 +101,3 @@ def _positive(name: str, value: float | Sequence[float], count: int) -> np.ndarr
         several = f" or {count} of them" if count > 1 else ""
         raise ValueError(f"{name} must be a positive number{several}, got {value}")
     return np.broadcast_to(numbers, count).copy()
-
-
-def _guess_home(model: mujoco.MjModel, arm: reading.ArmIds, mid_range: np.ndarray) -> np.ndarray:
-    """Guess the start pose [J]: the keyframe "home" if it exists, else mid-range."""
-    for i in range(model.nkey):
-        if model.key(i).name == "home":
-            return model.key_qpos[i, model.jnt_qposadr[arm.joints]]
-    return mid_range

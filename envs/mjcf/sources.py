@@ -38,7 +38,8 @@ def check(path: Path, folder: Path) -> None:
     """
     descriptions = _all_descriptions(path, folder)
     for root in descriptions.values():
-        _check_sizes(root, 1)
+        for element in root.iter():
+            _check_sizes(element)
     _check_growth(descriptions, path.parent)
     for file in _referenced(descriptions, path.parent, ()):
         _check_image(check_regular(file, folder))
@@ -119,9 +120,8 @@ def _portable(name: str) -> str:
     return name.replace("\\", "/")
 
 
-def _check_sizes(element: ElementTree.Element, copies: float) -> None:
+def _check_sizes(element: ElementTree.Element) -> None:
     """Raise a ValueError if an element asks for something too large."""
-    copies *= _copies(element)
     grid = math.prod([*_numbers(element, "nrow"), *_numbers(element, "ncol")])
     image = math.prod([*_numbers(element, "width"), *_numbers(element, "height")])
     counted = element.attrib.keys() & _ENTRIES
@@ -134,13 +134,11 @@ def _check_sizes(element: ElementTree.Element, copies: float) -> None:
     for what, number, limit in (
         ("entries", entries, _MAX_ENTRIES),
         ("rings", rings, _MAX_RINGS),
-        ("copies", copies, _MAX_COPIES),
+        ("copies", _copies(element), _MAX_COPIES),
     ):
         if number > limit:
             raise ValueError(f"its {element.tag} has {number:g} {what}, more than {limit}")
     check_memory(int(min(_PIXEL_BYTES * max(grid, image), 1e30)), f"its {element.tag}")
-    for child in element:
-        _check_sizes(child, copies)
 
 
 def _copies(element: ElementTree.Element) -> float:

@@ -7,8 +7,6 @@ import contextlib
 import dataclasses
 import functools
 import importlib.util
-import io
-import sys
 import types
 from collections.abc import Sequence
 from typing import Any, Literal, get_args
@@ -18,6 +16,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from envs import checks
 from envs.physics.kinematics import Kinematics
 from envs.scene.ranges import MAX_GROWTH
 from envs.state import MOVING, Changes, Data
@@ -34,13 +33,8 @@ def _mjx() -> Any:
         import warp
 
         warp.config.log_level = warp.LOG_WARNING  # otherwise every loaded kernel prints a line
-    # MJX prints two lines if the optional warp-lang is missing. Drop only those.
-    printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):
+    with contextlib.redirect_stdout(None):  # MJX prints two lines if warp-lang is missing
         from mujoco import mjx
-    for line in printed.getvalue().splitlines():
-        if not line.startswith(("Failed to import warp:", "Failed to import mujoco_warp:")):
-            print(line, file=sys.stdout)
     # MJX sums over a body's children with scatters. Their order of addition is undefined on GPU: on
     # an H200, two calls with the same input differed in the last bits.
     ordered = types.SimpleNamespace(**vars(jax))
@@ -76,7 +70,9 @@ class Physics:
         Raises:
             ValueError: the backend is unknown or not installed.
         """
-        _check_backend(backend)
+        checks.choice("backend", backend, BACKENDS)
+        if backend == "warp":
+            require_warp("backend")
         self.model: mujoco.MjModel = model
         self.backend: str = backend
         mjx = _mjx()
@@ -141,13 +137,6 @@ class Physics:
         with _full_precision():
             data = mjx.camlight(model, mjx.com_pos(model, self._kinematics(model, data)))
         return Data(**{field.name: getattr(data, field.name) for field in dataclasses.fields(Data)})
-
-
-def _check_backend(backend: str) -> None:
-    if backend not in BACKENDS:
-        raise ValueError(f"unknown backend {backend!r}: choose from {', '.join(BACKENDS)}")
-    if backend == "warp":
-        require_warp("backend")
 
 
 def require_warp(option: str) -> None:

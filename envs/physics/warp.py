@@ -24,7 +24,7 @@ _FIXED = ("geom_xpos", "geom_xmat")
 
 
 class WarpSteps:
-    """Simulator of batches of worlds with one MuJoCo model.
+    """Simulator of batches of worlds with one MuJoCo model, on one device.
 
     Device memory is allocated when the first call with a number of worlds is traced, and is never
     freed. Not thread-safe: while one thread captures a graph, Warp operations of another thread
@@ -41,7 +41,12 @@ class WarpSteps:
         """
         self._mujoco = _with_larger_bounds(model, growth)
         self._sizes = {"nconmax": int(contacts), "njmax": int(rows)}
-        self._cache: dict[tuple[str, int], tuple[Any, Any]] = {}
+        with wp.ScopedDevice(warp_call.device()):
+            self._model = mujoco_warp.put_model(self._mujoco)
+        # Our scenes run the solver for a small, fixed number of iterations; do not warn about that.
+        overflow = mujoco_warp.OverflowType
+        self._model.opt.warn_overflow &= ~(overflow.ITERATIONS | overflow.LS_ITERATIONS)
+        self._data: dict[int, Any] = {}
         self._callables: dict[tuple[str, ...], Any] = {}
 
     def __call__(self, changes: Changes, start: Data, controls: jax.Array) -> Sequence[jax.Array]:
@@ -69,8 +74,8 @@ class WarpSteps:
 
             def simulate(*arrays: Any) -> None:
                 by_name = dict(zip(like, arrays, strict=True))
-                model, data = self._worlds(by_name["controls"].shape[1])
-                model = copy.copy(model)
+                model = copy.copy(self._model)
+                data = self._worlds(by_name["controls"].shape[1])
                 for name in names:
                     setattr(model, name, by_name[name])
                 for name in _FIXED:
@@ -82,33 +87,21 @@ class WarpSteps:
                     mujoco_warp.step(model, data)
 
             with wp.ScopedDevice(warp_call.device()):
-                model, data = self._worlds(1)
+                data = self._worlds(1)
             like = {"controls": wp.array(dtype=float, ndim=3)}
-            like |= {name: getattr(model, name) for name in names}
+            like |= {name: getattr(self._model, name) for name in names}
             like |= {name: getattr(data, name) for name in (*_FIXED, *MOVING)}
             self._callables[names] = warp_call.from_jax(
                 simulate, like, num_outputs=len(MOVING), in_out_argnames=MOVING
             )
         return self._callables[names]
 
-    def _worlds(self, num_worlds: int) -> tuple[Any, Any]:
-        """Return the model, and data for this many worlds, on Warp's current device."""
-        key = (str(wp.get_device()), num_worlds)
-        if key not in self._cache:
+    def _worlds(self, num_worlds: int) -> Any:
+        """Return data for this many worlds, on Warp's current device."""
+        if num_worlds not in self._data:
             data = mujoco_warp.make_data(self._mujoco, nworld=num_worlds, **self._sizes)
-            self._cache[key] = self._model(key[0]), data
-        return self._cache[key]
-
-    def _model(self, device: str) -> Any:
-        """Return the model on `device`, Warp's current device."""
-        for (other, _), (model, _) in self._cache.items():
-            if other == device:
-                return model
-        model = mujoco_warp.put_model(self._mujoco)
-        # Our scenes run the solver for a small, fixed number of iterations; do not warn about that.
-        iterations = mujoco_warp.OverflowType.ITERATIONS | mujoco_warp.OverflowType.LS_ITERATIONS
-        model.opt.warn_overflow &= ~iterations
-        return model
+            self._data[num_worlds] = data
+        return self._data[num_worlds]
 
 
 def _with_larger_bounds(model: mujoco.MjModel, growth: float) -> mujoco.MjModel:

@@ -21,22 +21,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.rendering import intersections, shading
+from envs.rendering import shading
 from envs.rendering.intersections import Geom, Geoms, Matrix, Vec, dot
-from envs.rendering.model import Appearance, RenderModel, build, unit_shapes
+from envs.rendering.model import Appearance, RenderModel, unit_shapes
 from envs.rendering.shading import Raster, RayCamera
 from envs.state import Poses
-
-__all__ = [
-    "Appearance",
-    "RayRenderer",
-    "RenderModel",
-    "Renderer",
-    "build",
-    "cast",
-    "render",
-    "render_batch",
-]
 
 # Pixels rendered at once. On CPU, the live arrays then fit a core's cache (fastest at 64 and
 # 128 px). On accelerators, they take about 1 GiB (120 bytes per pixel, measured).
@@ -67,7 +56,7 @@ def render(
     appearance = model.appearance if appearance is None else appearance
     size = model.size if size is None else size
     raster = Raster(height, width, samples)
-    geoms, views = in_camera_frames(model, appearance, size, poses, height)
+    geoms, views = _in_camera_frames(model, appearance, size, poses, height)
 
     def image(geoms: Geom, view: RayCamera) -> jax.Array:
         pixel = jnp.arange(height * width, dtype=jnp.int32)
@@ -75,33 +64,6 @@ def render(
         return jnp.stack(rgb, axis=-1).reshape(height, width, 3)
 
     return jax.vmap(image)(geoms, views)
-
-
-def render_batch(
-    model: RenderModel,
-    poses: Poses,
-    *,
-    height: int,
-    width: int,
-    samples: int = 1,
-    appearance: Appearance | None = None,
-    size: jax.Array | np.ndarray | None = None,
-) -> jax.Array:
-    """Render W worlds in bounded memory; `poses`, `appearance` and `size` have a leading axis W.
-
-    Returns:
-        uint8 `[W, K, height, width, 3]`.
-    """
-    pixels = _PIXELS_ON_CPU if jax.default_backend() == "cpu" else _PIXELS_ON_ACCELERATOR
-    chunk = max(1, min(len(poses.geom_xpos), pixels // (len(model.cameras) * height * width)))
-    worlds = (poses, {"appearance": appearance, "size": size})
-    return jax.lax.map(
-        lambda world: render(
-            model, world[0], height=height, width=width, samples=samples, **world[1]
-        ),
-        worlds,
-        batch_size=chunk,
-    )
 
 
 class Renderer(Protocol):
@@ -138,47 +100,20 @@ class RayRenderer:
     def __call__(
         self, poses: Poses, appearance: Appearance | None, size: jax.Array | None
     ) -> jax.Array:
-        """Render images, uint8 `[N, K, height, width, 3]`; arguments as for `render_batch`."""
-        side, samples = self.image_size, self.samples
-        return render_batch(
-            self.model,
-            poses,
-            height=side,
-            width=side,
-            samples=samples,
-            appearance=appearance,
-            size=size,
-        )
+        """Render images of N worlds, uint8 `[N, K, image_size, image_size, 3]`.
 
-
-@functools.partial(jax.jit, static_argnames=("height", "width"))
-def cast(
-    model: RenderModel,
-    poses: Poses,
-    *,
-    height: int,
-    width: int,
-    size: jax.Array | np.ndarray | None = None,
-) -> tuple[jax.Array, jax.Array]:
-    """Find the geom and depth that each pixel of one world sees; arguments as for `render`.
-
-    Returns:
-        Geom id in the MuJoCo model, int32 `[K, height, width]`, -1 for none. Depth along the
-        camera's axis [m], f32 `[K, height, width]`, +inf for none. With up to 127 visible geoms,
-        depth is rounded down by less than 2^-16 of its value: 15 micrometers at a meter. Single
-        precision costs more on a small, distant geom: 0.1 mm, measured, on a sphere of radius 4 mm
-        at a meter.
-    """
-    size = model.size if size is None else size
-    raster = Raster(height, width, samples=1)
-
-    def first_hit(geoms: Geom, view: RayCamera) -> tuple[jax.Array, jax.Array]:
-        x, y = shading.slopes(view, raster, jnp.arange(height * width, dtype=jnp.int32))
-        number, depth = intersections.nearest(_table(geoms), model.kinds, x, y)
-        geom = jnp.where(jnp.isfinite(depth), jnp.array(model.geoms, jnp.int32)[number], -1)
-        return geom.reshape(height, width), depth.reshape(height, width)
-
-    return jax.vmap(first_hit)(*in_camera_frames(model, model.appearance, size, poses, height))
+        Args:
+            poses: poses of all geoms and cameras, leading axis N.
+            appearance: appearance of each world, leading axis N; None for the model's own.
+            size: `[N, G, 3]` sizes of geoms [m]; None for the model's own.
+        """
+        side, model = self.image_size, self.model
+        # In chunks of worlds, to bound the memory.
+        pixels = _PIXELS_ON_CPU if jax.default_backend() == "cpu" else _PIXELS_ON_ACCELERATOR
+        chunk = max(1, min(len(poses.geom_xpos), pixels // (len(model.cameras) * side**2)))
+        draw = functools.partial(render, model, height=side, width=side, samples=self.samples)
+        worlds = (poses, {"appearance": appearance, "size": size})
+        return jax.lax.map(lambda world: draw(world[0], **world[1]), worlds, batch_size=chunk)
 
 
 def _table(geoms: Geom) -> Geoms:
@@ -189,7 +124,7 @@ def _table(geoms: Geom) -> Geoms:
     )
 
 
-def in_camera_frames(
+def _in_camera_frames(
     model: RenderModel,
     appearance: Appearance,
     size: jax.Array | np.ndarray,

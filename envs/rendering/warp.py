@@ -63,7 +63,7 @@ class WarpRenderer:
     def __call__(
         self, poses: Poses, appearance: Appearance | None, size: jax.Array | None
     ) -> jax.Array:
-        """Render images, uint8 `[N, K, height, width, 3]`, like `renderer.render_batch`.
+        """Render images, uint8 `[N, K, height, width, 3]`, like `RayRenderer`.
 
         Args:
             poses: poses of all geoms and cameras, leading axis N.

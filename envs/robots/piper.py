@@ -6,6 +6,7 @@ gravity is compensated and the dynamics are not realistic. Shapes are primitives
 """
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from envs import robots
@@ -27,18 +28,15 @@ SDK_OFFSET = np.deg2rad([0.0, 2.0, -2.0, 0.0, 0.0, 0.0])
 """Angles of this model minus those with the SDK's default zeros (dh_is_offset=1) [rad]."""
 
 
-def _chain(theta_shift: np.ndarray) -> np.ndarray:
-    steps = [
+_CHAIN = np.stack(
+    [
         robots.rotation("x", alpha)
         @ robots.translation(a, 0, 0)
-        @ robots.rotation("z", theta0 + shift)
+        @ robots.rotation("z", theta0)
         @ robots.translation(0, 0, d)
-        for (a, alpha, d, theta0), shift in zip(_DH, theta_shift, strict=True)
+        for a, alpha, d, theta0 in _DH
     ]
-    return np.stack(steps)
-
-
-_CHAIN, _SDK_CHAIN = _chain(np.zeros(6)), _chain(SDK_OFFSET)
+)
 
 
 def forward_kinematics(q: jax.Array, *, sdk_offset: bool = False) -> tuple[jax.Array, jax.Array]:
@@ -55,20 +53,10 @@ def forward_kinematics(q: jax.Array, *, sdk_offset: bool = False) -> tuple[jax.A
     Raises:
         ValueError: the last axis of q is not 6.
     """
-    q = jax.numpy.asarray(q)
+    q = jnp.asarray(q)
     if q.shape[-1:] != (6,):
         raise ValueError(f"q must be [..., 6] joint angles in rad, got shape {q.shape}")
-    return robots.forward_kinematics(_SDK_CHAIN if sdk_offset else _CHAIN, q)
-
-
-def from_sdk_zeros(q: jax.Array) -> jax.Array:
-    """Convert joint angles [..., 6] in rad from the SDK's default zeros to this model's zeros."""
-    return q + jax.numpy.asarray(SDK_OFFSET, q.dtype)
-
-
-def to_sdk_zeros(q: jax.Array) -> jax.Array:
-    """Convert joint angles [..., 6] in rad from this model's zeros to the SDK's default zeros."""
-    return q - jax.numpy.asarray(SDK_OFFSET, q.dtype)
+    return robots.forward_kinematics(_CHAIN, q + SDK_OFFSET.astype(q.dtype) if sdk_offset else q)
 
 
 # Shapes and colors are our choices; masses [kg] are Menagerie's. Link 6 and the hand weigh .45.

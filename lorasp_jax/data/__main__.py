@@ -73,7 +73,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     """Define the commands and their options."""
     parser = argparse.ArgumentParser(prog=program, description="Inspect or convert datasets.")
     subparsers = parser.add_subparsers(required=True, metavar="command")
-    where = "LeRobot dataset (folder or hf://owner/name), RLDS dataset, cache, or .npz file"
+    where = "LeRobot dataset (folder or hf://owner/name), RLDS dataset or cache"
 
     text = inspect.__doc__
     sub = subparsers.add_parser("inspect", help=text, description=text)

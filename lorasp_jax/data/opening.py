@@ -2,11 +2,9 @@
 
 import dataclasses
 import os
-from collections.abc import Sequence
 from pathlib import Path
 
 from envs.datasets import rlds
-from envs.datasets.episodes import Episodes
 from lorasp_jax.base import hub
 from lorasp_jax.data.cache import HEADER, Cache
 from lorasp_jax.data.lerobot import Keys, LeRobot
@@ -14,7 +12,7 @@ from lorasp_jax.data.source import Source
 
 
 def open_source(where: str | os.PathLike[str], keys: Keys | None = None) -> Source:
-    """Open a LeRobot or RLDS dataset, a cache, or an .npz file of episodes.
+    """Open a LeRobot or RLDS dataset, or a cache.
 
     Args:
         where: a path, or hf://owner/name of a LeRobot dataset on the Hub.
@@ -34,35 +32,7 @@ def open_source(where: str | os.PathLike[str], keys: Keys | None = None) -> Sour
         return Cache(path)
     if (path / rlds.METADATA).is_file():
         return rlds.Reader(path)
-    if path.suffix == ".npz":
-        return _File(path)
     raise ValueError(
         f"{where} is not a dataset: expected a folder with meta/info.json (LeRobot), "
-        f"{rlds.METADATA} (RLDS, from python -m envs collect) or {HEADER} (cache), or an .npz file"
+        f"{rlds.METADATA} (RLDS, from python -m envs collect) or {HEADER} (cache)"
     )
-
-
-class _File:
-    """An .npz file of episodes, see `Episodes.save`."""
-
-    kind = "npz"
-
-    def __init__(self, path: Path) -> None:
-        self._episodes = Episodes.load(path)
-        self.cameras = tuple(self._episodes.image)
-        self.control_dt, self.num_steps = self._episodes.control_dt, self._episodes.num_steps
-
-    def __len__(self) -> int:
-        return self._episodes.num_episodes
-
-    def episode(self, number: int, cameras: Sequence[str] | None = None) -> Episodes:
-        names = self.cameras if cameras is None else cameras
-        image = {name: self._episodes.image[name] for name in names}
-        episode = dataclasses.replace(self._episodes, image=image, attempted=1).select([number])
-        length = int(episode.length[0])  # without padding
-        return dataclasses.replace(
-            episode,
-            image={name: images[:, :length] for name, images in episode.image.items()},
-            state=episode.state[:, :length],
-            action=episode.action[:, :length],
-        )

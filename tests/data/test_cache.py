@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 
+from envs.datasets import rlds
 from envs.datasets.episodes import Episodes
 from lorasp_jax.base.errors import REFUSED
 from lorasp_jax.data import __main__ as command_line
@@ -34,8 +35,8 @@ def simulated(tmp_path_factory):
     folder, parts = tmp_path_factory.mktemp("simulated"), []
     for number, task in enumerate(("press", "pour")):
         parts.append(random_episodes(task, number))
-        parts[-1].save(folder / f"{task}.npz")
-    sources = [open_source(folder / f"{part.task}.npz") for part in parts]
+        rlds.write(parts[-1], folder / task)
+    sources = [open_source(folder / part.task) for part in parts]
     return parts, written(folder / "cache", *sources)
 
 

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from envs.datasets import rlds
 from lorasp_jax.config import DataConfig
 from lorasp_jax.data import cache
 from lorasp_jax.data.cache import Cache
@@ -30,8 +31,8 @@ def simulated(tmp_path_factory):
     """A cache of two tasks."""
     folder = tmp_path_factory.mktemp("simulated")
     for number, task in enumerate(("press", "pour")):
-        random_episodes(task, number).save(folder / f"{task}.npz")
-    sources = [open_source(folder / f"{task}.npz") for task in ("press", "pour")]
+        rlds.write(random_episodes(task, number), folder / task)
+    sources = [open_source(folder / task) for task in ("press", "pour")]
     cache.write(sources, folder / "cache", quietly)
     return Cache(folder / "cache")
 
@@ -81,8 +82,8 @@ def test_incompatible_datasets_are_refused_early(changes, model, sentence, tmp_p
     ],
 )
 def test_unsupported_dimensions_are_refused(changes, sentence, tmp_path):
-    path = tmp_path / "recorded.npz"
-    dataclasses.replace(random_episodes("press", 0), **changes).save(path)
+    path = tmp_path / "recorded"
+    rlds.write(dataclasses.replace(random_episodes("press", 0), **changes), path)
     with pytest.raises(ValueError, match=sentence):
         dataset.open_dataset(config(path), MODEL, tmp_path / "run")
 

@@ -7,6 +7,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from envs.datasets import rlds
 from lorasp_jax.data.keys import Keys
 from lorasp_jax.data.lerobot import LeRobot
 from lorasp_jax.data.lerobot_export import to_lerobot
@@ -51,8 +52,8 @@ def test_statistics_are_those_of_all_steps(tmp_path):
 
 def test_actions_other_than_joint_targets(tmp_path):
     episodes = make(actions="end_effector", robot="panda", control_dt=0.05)
-    episodes.save(tmp_path / "episodes.npz")
-    to_lerobot(open_source(tmp_path / "episodes.npz"), tmp_path / "dataset", silent)
+    rlds.write(episodes, tmp_path / "episodes")
+    to_lerobot(open_source(tmp_path / "episodes"), tmp_path / "dataset", silent)
     info = json.loads((tmp_path / "dataset" / "meta" / "info.json").read_text())
     assert (info["fps"], info["robot_type"]) == (20, "panda")
     assert info["features"]["action"]["names"] is None
@@ -66,8 +67,8 @@ def test_fewer_actions_than_states_are_read_by_repeating_one(tmp_path):
     """As for LIBERO, whose state has two fingers and whose actions have one gripper."""
     episodes = make(actions="end_effector", robot="panda", control_dt=0.05)
     state = np.concatenate([episodes.state, -episodes.state[..., -1:]], -1)
-    dataclasses.replace(episodes, state=state).save(tmp_path / "episodes.npz")
-    to_lerobot(open_source(tmp_path / "episodes.npz"), tmp_path / "dataset", silent)
+    rlds.write(dataclasses.replace(episodes, state=state), tmp_path / "episodes")
+    to_lerobot(open_source(tmp_path / "episodes"), tmp_path / "dataset", silent)
     with pytest.raises(ValueError, match="dimensions"):
         LeRobot(tmp_path / "dataset")
     numbers = tuple("01234566")

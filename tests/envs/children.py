@@ -1,25 +1,22 @@
-"""Code of the child processes of test_commands.py: collections that end abruptly."""
+"""Code of the child processes of test_commands.py: collections that are killed."""
 
 import itertools
 import os
 import signal
-import subprocess
-import sys
-import threading
 
 import jax
 import numpy as np
 
 from envs import __main__ as command_line
 from envs.datasets import rlds, rlds_schema
-from tests import ROOT
+from envs.experts import collection
 
 COLLECT = "collect --task press --robot piper --num-episodes 20 --num-envs 6 --image-size 16"
 # Where a process is killed: a function, and the number of the fatal call.
 MOMENTS = {
     "in the middle of a shard": (rlds_schema, "record", 9),
     "before the second shard is listed": (os, "replace", 3),
-    "before the next shard": (sys.modules[__name__], "fake_record", 4),
+    "before the next shard": (collection, "record_expert", 4),
     "when all shards are complete": (rlds.ShardWriter, "complete", 1),
     "before the dataset is in place": (os, "rename", 1),
 }
@@ -53,32 +50,8 @@ def die_at(owner, name, call):
     setattr(owner, name, deadly)
 
 
-def run_child(call):
-    """Run one of the functions below in a child process, and wait for it."""
-    code = f"from tests.envs import children; children.{call}"
-    root = ROOT
-    return subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, check=False)
-
-
 def collect_and_die(moment, out):
     """In a child process: collect until killed."""
+    collection.record_expert = fake_record
     die_at(*MOMENTS[moment])
-    command_line.main([*COLLECT.split(), "--out", out], record=fake_record)
-
-
-def collect_and_interrupt(out):
-    """In a child process: collect, with Ctrl-C during the second shard."""
-    calls, noticed = itertools.count(), threading.Event()
-
-    def notice(*_):
-        noticed.set()
-        raise KeyboardInterrupt
-
-    def record(*arguments):
-        if next(calls) == 1:
-            os.kill(os.getpid(), signal.SIGINT)
-            assert noticed.wait(60)  # the main thread may be slow on a busy machine
-        return fake_record(*arguments)
-
-    signal.signal(signal.SIGINT, notice)
-    sys.exit(command_line.main([*COLLECT.split(), "--out", out], record=record))
+    command_line.main([*COLLECT.split(), "--out", out])

@@ -1,6 +1,7 @@
 """Scenes and expert episodes shared by tests; each is compiled once per session."""
 
 import functools
+import itertools
 
 import jax
 import numpy as np
@@ -9,21 +10,25 @@ import pytest
 import envs
 from envs.names import names
 
-TASKS = names("task")
-ROBOTS = names("robot")
-EPISODES = 32
+NAMES = {"task_name": names("task"), "robot_name": names("robot")}
+EPISODES = 16
 SHORT = ("press", "piper")  # episodes of these are tested in every run
 
 
 def pytest_generate_tests(metafunc):
-    """Parametrize tests with a task or robot over all of them, unless they choose themselves."""
+    """Parametrize tests with a task or robot over all of them, unless they choose themselves.
+
+    Every scene compiles anew, so the fast tests have one episode, and each task and robot once.
+    """
     chosen = {mark.args[0] for mark in metafunc.definition.iter_markers("parametrize")}
-    for name, values in (("task_name", TASKS), ("robot_name", ROBOTS)):
-        if name in metafunc.fixturenames and name not in chosen:
-            # Compiling episodes takes a minute per scene, so most of these tests are slow.
-            long = values if "episodes" in metafunc.fixturenames else []
-            marks = {v: [] if v in SHORT else [pytest.mark.slow] for v in long}
-            metafunc.parametrize(name, [pytest.param(v, marks=marks.get(v, [])) for v in values])
+    free = [name for name in NAMES if name in metafunc.fixturenames and name not in chosen]
+    enough = all if "episodes" in metafunc.fixturenames else any
+    cases = []
+    for case in itertools.product(*(NAMES[name] for name in free)):
+        fast = len(case) < 2 or enough(map(SHORT.__contains__, case))
+        cases.append(pytest.param(*case, marks=() if fast else pytest.mark.slow))
+    if free:
+        metafunc.parametrize(free, cases)
 
 
 @functools.cache

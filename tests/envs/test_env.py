@@ -12,6 +12,7 @@ import pytest
 
 import envs
 from envs.experts import expert
+from tests.envs.demonstrations import demonstration
 
 W = 4
 
@@ -37,10 +38,6 @@ def take(state, worlds):
 def test_time(env):
     assert (env.physics_dt, env.control_dt, env.max_steps) == (0.005, 0.1, 80)
     assert env.expert_steps <= env.max_steps
-
-
-def test_repr_is_one_line(env):
-    assert repr(env) == f"<Env 'press' for 'piper', num_envs={env.num_envs}>"
 
 
 def test_reset_is_random_and_repeatable(env, start):
@@ -114,12 +111,7 @@ def test_time_limit_latches_and_freezes(env, start):
 
 
 def test_success_latches(env, start):
-    plan = expert.plan(env, start, jax.random.key(1))
-    act = jax.jit(lambda state: expert.act(env, plan, state))
-    state, history = start, []
-    for _ in range(env.expert_steps):
-        state = env.step(state, act(state))
-        history.append(state)
+    history = [after for _, _, after in demonstration(env, start)]
     success = np.stack([s.info["success"] for s in history])
     np.testing.assert_array_equal(success, np.stack([s.done for s in history]))
     np.testing.assert_array_equal(success, np.stack([s.reward for s in history]))

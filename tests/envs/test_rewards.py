@@ -8,23 +8,18 @@ import pytest
 
 import envs
 from envs import rewards
-from envs.experts import expert
 from envs.rewards import potential
 from envs.state import State
 from envs.tasks import View
 from tests.envs import expert_in_c
+from tests.envs.demonstrations import demonstration
 
 EPISODES = 4
 
 
-def stages(scene, data, size=1.0) -> np.ndarray:
-    found = scene.task.stages(View(scene.model, data, size))
-    return np.array([*map(float, found.values())])
-
-
 def potentials(scene, key) -> np.ndarray:
     """Return the potential [T + 1] along an expert's episode."""
-    every = [stages(scene, data) for data in expert_in_c.episode(scene, key)]
+    every = [expert_in_c.measure(scene, data)[1] for data in expert_in_c.episode(scene, key)]
     return np.asarray(potential(dict(enumerate(np.stack(every).T))))
 
 
@@ -54,7 +49,7 @@ def test_stages_have_names(scene):
 @pytest.mark.parametrize("robot_name", ["piper", pytest.param("panda", marks=pytest.mark.slow)])
 def test_potential_rises_along_expert_episodes(scene):
     """It rises from near 0 to 1; a slip may cost one stage, in a minority of episodes."""
-    count = len(stages(scene, expert_in_c.world(scene)))
+    count = len(expert_in_c.measure(scene, expert_in_c.world(scene))[1])
     falls = []
     for key in range(EPISODES):
         found = potentials(scene, key)
@@ -72,7 +67,7 @@ def test_stages_are_bounded_for_random_poses(scene):
     for _ in range(50):
         data.qpos[:] += rng.normal(0, 0.3, scene.model.nq)
         mujoco.mj_kinematics(scene.model, data)
-        found = stages(scene, data, rng.uniform(0.8, 1.25))
+        _, found = expert_in_c.measure(scene, data, rng.uniform(0.8, 1.25))
         assert np.all((found >= 0) & (found <= 1))
 
 
@@ -157,12 +152,9 @@ def test_an_environment_with_dense_rewards(task_name):
     """The expert's rewards in randomized worlds are finite, and telescope."""
     env = envs.make(task_name, num_envs=4, image_size=16, reward="dense", discount=0.95)
     ranges = envs.Randomization.typical()
-    state = env.reset(jax.random.key(0), ranges)
-    plan = expert.plan(env, state, jax.random.key(1))
-    act = jax.jit(lambda state: expert.act(env, plan, state))
-    start, returns = np.asarray(state.metrics["potential"]), np.zeros(4)
-    for step in range(env.expert_steps):
-        before, state = state, env.step(state, act(state))
+    first = env.reset(jax.random.key(0), ranges)
+    start, returns = np.asarray(first.metrics["potential"]), np.zeros(4)
+    for step, (before, _, state) in enumerate(demonstration(env, first)):
         returns += 0.95**step * np.asarray(state.reward)
         assert np.all(np.isfinite(state.reward))
         assert not np.any(np.asarray(state.reward)[before.done])

@@ -34,15 +34,6 @@ def test_instructions_are_short_and_several(scene):
     assert all(0 < len(text.split()) <= 8 for text in scene.instructions)
 
 
-def test_layouts_differ_and_are_within_reach(scene):
-    keys = jax.random.split(jax.random.key(0), 256)
-    for place in jax.vmap(scene.task.place)(keys).values():
-        radius = np.linalg.norm(place[:, :2], axis=1)
-        assert 0.25 < radius.min() < radius.max() < 0.48
-        assert np.ptp(place[:, 0]) > 0.05
-        assert np.ptp(place[:, 1]) > 0.05
-
-
 RANGES = {  # body -> lowest and highest x, y [m]
     "open_pot": {"pot": ((0.32, 0.06), (0.40, 0.14)), "lid": ((0.32, 0.06), (0.40, 0.14))},
     "pour": {
@@ -134,11 +125,6 @@ class TestPickPlace:
         data.joint("grape").qpos[:3] = data.body("basket").xpos + offset
         data.joint("grape").qvel[0] = speed
         return data
-
-    def test_never_starts_inside(self, scene):
-        layouts = jax.vmap(scene.task.place)(jax.random.split(jax.random.key(3), 1024))
-        gap = np.abs(layouts["grape"] - layouts["basket"])[:, 1]
-        assert gap.min() > 0.05 + 0.015  # basket's wall and grape's radius [m]
 
     def test_at_rest_inside(self, scene):
         assert succeeds(scene, self.drop(scene))

@@ -11,7 +11,7 @@ import pytest
 
 import envs
 from envs import mjcf, robots
-from envs.rendering import renderer
+from envs.rendering.model import build
 from envs.scene import scene
 from envs.tasks import press
 from tests.cases import mostly_slow
@@ -65,10 +65,6 @@ def test_limits_match_the_file(robot):
     np.testing.assert_allclose(robot.speed, [1, 1, 1, 2, 2, 2])
     assert robot.stroke == pytest.approx(0.08)
     assert robot.action_low.shape == (7,)
-
-
-def test_repr_is_one_line(robot):
-    assert repr(robot) == f"<Robot {robot.name!r}: 6 joints, opens {1000 * robot.stroke:.0f} mm>"
 
 
 def test_start_pose_is_the_common_one(robot, model):
@@ -190,7 +186,7 @@ def test_a_hinge_named_left_and_unnamed_parts(tmp_path):
 def test_small_meshes_are_not_drawn(tmp_path):
     model = built(tmp_path, ('name="shell"', 'name="shell" scale=".05 .05 .05"'))
     assert np.sum(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH) == 1
-    drawn = renderer.build(model, ["side"]).geoms
+    drawn = build(model, ["side"]).geoms
     assert not np.any(model.geom_type[list(drawn)] == mujoco.mjtGeom.mjGEOM_MESH)
 
 
@@ -226,7 +222,7 @@ def test_colors_move_to_the_geoms(tmp_path):
 
 def test_ray_caster_draws_primitives_in_place_of_a_mesh(robot, model):
     mesh = next(i for i in range(model.ngeom) if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_MESH)
-    drawn = renderer.build(model, ["side", "wrist"])
+    drawn = build(model, ["side", "wrist"])
     assert mesh not in drawn.geoms
     (stand_in,) = np.flatnonzero(model.geom_group == 5)
     assert stand_in in drawn.geoms

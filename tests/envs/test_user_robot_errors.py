@@ -16,11 +16,47 @@ _NO_BALL = (
 )
 _HINGE = '<joint axis="0 0 1" range="0 1"/>'
 _KEY = '<key name="home" qpos="1 1 1 1 0 0 0 0 .5 1.5 0 1 0 -.02 .02"/>'
-_MISSING = (
+_ONE_EDIT = (
     (
         "two slide joints; joints in the file: joint 0 (free), yaw (hinge)",
-        [('<joint name="b" type="slide" axis="0 -1 0"', '<joint name="b" axis="0 -1 0"')],
+        '<joint name="b" type="slide" axis="0 -1 0"',
+        '<joint name="b" axis="0 -1 0"',
     ),
+    (
+        "knob",
+        '<site name="aside"',
+        '<body><joint name="knob"/><geom size=".01"/></body><site name="aside"',
+    ),
+    ("joint elbow needs a position actuator", '<position name="elbow"', '<motor name="elbow"'),
+    (
+        "roll (position, on roll), pitch (position, on pitch)",
+        'joint="roll"/>',
+        'joint="roll" gear="2"/>',
+    ),
+    ("joint turn needs a position actuator", '<position name="turn" joint="turn"/>', ""),
+    (
+        "grip (another kind, on a",
+        '<position name="grip" tendon="grip" kp="400" kv="20"',
+        '<motor name="grip" tendon="grip"',
+    ),
+    (
+        "finger a needs a geom",
+        'pos="0 -0.001 .025"',
+        'pos="0 -0.001 .025" contype="0" conaffinity="0"',
+    ),
+    ("90 deg apart", 'name="b" type="slide" axis="0 -1 0"', 'name="b" type="slide" axis="1 0 0"'),
+    ("add a site tcp", 'name="turn" axis="0 0 -1"', 'name="turn" axis="0 1 0"'),
+    ("pitch: range and ctrlrange", 'joint="pitch"/>', 'joint="pitch" ctrlrange="-3 -2"/>'),
+    ("mocap body", 'childclass="robot"', 'childclass="robot" mocap="true"'),
+    (
+        "target body",
+        '<site name="aside"',
+        '<camera name="wrist" mode="targetbody" target="ball"/><site name="aside"',
+    ),
+    ("arm.xml is damaged", "</mujoco>", ""),
+    ("reach x 0.34 m", 'range="0 160"', 'range="0 5"'),
+)
+_SEVERAL_EDITS = (
     (
         "flange and wrist",
         [('<body name="b"', '</body><body name="b"'), ("      </body>\n    </frame>", "</frame>")],
@@ -30,59 +66,14 @@ _MISSING = (
         "18 hinges",
         [
             *(
-                (f'<joint name="{joint}"', 4 * _HINGE + f'<joint name="{joint}"')
-                for joint in ("shoulder", "elbow", "roll")
+                (f'<joint name="{n}"', 4 * _HINGE + f'<joint name="{n}"')
+                for n in ("shoulder", "elbow", "roll")
             ),
             (_KEY, ""),
         ],
     ),
-    (
-        "knob",
-        [
-            (
-                '<site name="aside"',
-                '<body><joint name="knob"/><geom size=".01"/></body><site name="aside"',
-            )
-        ],
-    ),
-    (
-        "pitch, b",
-        [(' range="-30 130"', ""), (' range=".005 .045"', "")],
-    ),
-    (
-        "joint elbow needs a position actuator",
-        [('<position name="elbow"', '<motor name="elbow"')],
-    ),
-    (
-        "roll (position, on roll), pitch (position, on pitch)",
-        [('joint="roll"/>', 'joint="roll" gear="2"/>')],
-    ),
-    ("joint turn needs a position actuator", [('<position name="turn" joint="turn"/>', "")]),
-    (
-        "grip (another kind, on a",
-        [
-            (
-                '<position name="grip" tendon="grip" kp="400" kv="20"',
-                '<motor name="grip" tendon="grip"',
-            )
-        ],
-    ),
-    (
-        "finger a needs a geom",
-        [('pos="0 -0.001 .025"', 'pos="0 -0.001 .025" contype="0" conaffinity="0"')],
-    ),
-    (
-        "90 deg apart",
-        [('name="b" type="slide" axis="0 -1 0"', 'name="b" type="slide" axis="1 0 0"')],
-    ),
-    (
-        "8 mm",
-        [("-.045 -.005", "-.009 -.005"), (".005 .045", ".005 .009")],
-    ),
-    (
-        "add a site tcp",
-        [('name="turn" axis="0 0 -1"', 'name="turn" axis="0 1 0"')],
-    ),
+    ("pitch, b", [(' range="-30 130"', ""), (' range=".005 .045"', "")]),
+    ("8 mm", [("-.045 -.005", "-.009 -.005"), (".005 .045", ".005 .009")]),
     (
         "joint yaw needs a position actuator of its own",
         [
@@ -95,10 +86,6 @@ _MISSING = (
         ],
     ),
     (
-        "pitch: range and ctrlrange",
-        [('joint="pitch"/>', 'joint="pitch" ctrlrange="-3 -2"/>')],
-    ),
-    (
         "add <compiler",
         [
             ('range="-150 150"', 'range="-2.6 2.6"'),
@@ -108,31 +95,25 @@ _MISSING = (
             ('range="-30 130"', 'range="-.5 2.3"'),
         ],
     ),
-    (
-        "mocap body",
-        [('childclass="robot"', 'childclass="robot" mocap="true"')],
-    ),
-    (
-        "target body",
-        [
-            (
-                '<site name="aside"',
-                '<camera name="wrist" mode="targetbody" target="ball"/><site name="aside"',
-            )
-        ],
-    ),
-    ("arm.xml is damaged", [("</mujoco>", "")]),
-    ("reach x 0.34 m", [('range="0 160"', 'range="0 5"')]),
 )
 
 
-@pytest.mark.parametrize(("message", "edits"), _MISSING)
-def test_what_is_missing_is_named(tmp_path, message, edits):
-    file = write(tmp_path, *edits)
+def assert_names(folder, message, edits):
+    file = write(folder, *edits)
     with pytest.raises(ValueError, match=re.escape(message)) as raised:
         mjcf.load(file)
     assert str(raised.value).startswith(f"robot {file}: ")
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(("message", "old", "new"), _ONE_EDIT)
+def test_what_is_missing_is_named(tmp_path, message, old, new):
+    assert_names(tmp_path, message, [(old, new)])
+
+
+@pytest.mark.parametrize(("message", "edits"), _SEVERAL_EDITS)
+def test_what_several_edits_remove_is_named(tmp_path, message, edits):
+    assert_names(tmp_path, message, edits)
 
 
 @pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")

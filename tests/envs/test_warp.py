@@ -1,15 +1,17 @@
 """MuJoCo Warp's physics and renderer against MJX-JAX and the ray caster; slow on CPU."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import envs
-from envs.experts import expert
 from envs.physics import physics
 from envs.scene.ranges import Randomization
 from envs.state import Poses
+from tests.envs.demonstrations import demonstration
 
 pytest.importorskip("warp")
 WORLDS, SIZE = 3, 48
@@ -34,11 +36,8 @@ def pair():
 
 def run(env, ranges, steps):
     """Run the expert for some control steps."""
-    state = env.reset(jax.random.key(2), ranges)
-    plan = expert.plan(env, state, jax.random.key(3))
-    for _ in range(steps):
-        state = env.step(state, expert.act(env, plan, state))
-    return state
+    walk = demonstration(env, env.reset(jax.random.key(2), ranges))
+    return next(itertools.islice(walk, steps - 1, None))[2]
 
 
 def test_default_backend_depends_on_the_device(pair, monkeypatch):

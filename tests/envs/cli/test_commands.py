@@ -3,6 +3,9 @@
 import itertools
 import os
 import signal
+import subprocess
+import sys
+import threading
 
 import jax
 import numpy as np
@@ -14,9 +17,10 @@ from envs import __main__ as command_line
 from envs.datasets import rlds
 from envs.experts import collection
 from lorasp_jax.base import locks, writing
+from tests import ROOT
 from tests.cases import mostly_slow
 from tests.envs import user_arm
-from tests.envs.children import COLLECT, MOMENTS, fake_record, run_child
+from tests.envs.children import COLLECT, MOMENTS, fake_record
 from tests.envs.datasets.test_episodes import assert_equal, make
 from tests.envs.datasets.test_rlds import trimmed
 
@@ -40,7 +44,8 @@ def run(capsys, monkeypatch):
     monkeypatch.setattr(command_line.cache, "enable", lambda: None)
 
     def run(text, *more, record=fake_record):
-        code = command_line.main([*text.split(), *map(str, more)], record=record)
+        monkeypatch.setattr(collection, "record_expert", record)
+        code = command_line.main([*text.split(), *map(str, more)])
         return code, " ".join(capsys.readouterr().err.split())
 
     return run
@@ -108,7 +113,6 @@ def test_collect_writes_the_episodes_of_the_library(tmp_path, run):
         num_envs=6,
         actions="delta_joint",
         key=jax.random.key(0),
-        record=fake_record,
     )
     assert expected.attempted > 20
     found = rlds.read(tmp_path / "press")
@@ -120,18 +124,12 @@ def test_collect_writes_the_episodes_of_the_library(tmp_path, run):
     )
 
 
-def test_collect_writes_several_datasets(tmp_path, run):
-    code, output = run(COLLECT.replace("press", "pour press"), "--out", tmp_path / "many")
-    assert code == 0, output
-    assert sorted(os.listdir(tmp_path / "many")) == ["pour", "press"]
-    assert rlds.read(tmp_path / "many" / "pour").task == "pour"
-
-
 @pytest.mark.parametrize("moment", mostly_slow(MOMENTS, [*MOMENTS][:1]))
 def test_killed_and_resumed(tmp_path, run, moment):
     run(COLLECT, "--out", tmp_path / "whole")
     out, unfinished = tmp_path / "killed", tmp_path / "killed.partial"
-    child = run_child(f"collect_and_die({moment!r}, {str(out)!r})")
+    code = f"from tests.envs import children; children.collect_and_die({moment!r}, {str(out)!r})"
+    child = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, check=False)
     assert child.returncode == -signal.SIGKILL, child.stderr
     assert not out.exists()
     before = {file: file.stat().st_mtime_ns for file in unfinished.glob("*array_record*")}
@@ -207,26 +205,27 @@ def test_one_bad_task_stops_the_others(tmp_path, run):
     assert "error: the expert solved only 0 of 18 layouts of 'pour'" in output
 
 
-def test_ctrl_c_keeps_the_current_shard(tmp_path):
-    out = tmp_path / "press"
-    child = run_child(f"collect_and_interrupt({str(out)!r})")
-    assert child.returncode == 130, child.stderr
+def test_ctrl_c_keeps_the_current_shard(tmp_path, run):
+    calls, noticed = itertools.count(), threading.Event()
+
+    def notice(*_):
+        noticed.set()
+        raise KeyboardInterrupt
+
+    def record(*arguments):
+        if next(calls) == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+            assert noticed.wait(60)  # the main thread may be slow on a busy machine
+        return fake_record(*arguments)
+
+    before = signal.signal(signal.SIGINT, notice)
+    try:
+        code, output = run(COLLECT, "--out", tmp_path / "press", record=record)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert code == 130
     assert len(rlds.metadata(tmp_path / "press.partial")["parts"]) == 2
-    assert b"episodes are in" in child.stderr
-    assert b"Traceback" not in child.stderr
-
-
-def test_a_damaged_shard_is_refused(tmp_path, run, monkeypatch):
-    out = tmp_path / "press"
-    with monkeypatch.context() as patch:
-        patch.setattr(rlds.ShardWriter, "complete", stopping(rlds.ShardWriter.complete, 0))
-        run(COLLECT, "--out", out)
-    file = sorted((tmp_path / "press.partial").glob("*array_record*"))[1]
-    file.write_bytes(file.read_bytes()[:-9])
-    code, output = run(COLLECT, "--out", out)
-    assert code == 2
-    assert f"{file} is damaged" in output
-    assert output.endswith(f"delete {file.parent} to start over")
+    assert "episodes are in" in output
 
 
 @pytest.mark.slow

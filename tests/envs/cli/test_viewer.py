@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import types
 
 import jax
 import numpy as np
@@ -83,9 +84,10 @@ def test_windows_that_need_another_interpreter(env, monkeypatch):
         viewer.show(env.model, np.zeros((1, env.model.nq)), 0.1)
 
 
-def test_an_expert_that_never_succeeds_is_an_error(env):
-    def act(env, plan, state):
-        return state.info["command"]  # does not move
-
-    with pytest.raises(ValueError, match="4 layouts"):
-        viewer.episode(env, jax.random.key(0), tries=1, plan=lambda *_: None, act=act)
+def test_an_expert_that_never_succeeds_is_an_error(monkeypatch):
+    monkeypatch.setattr(viewer, "_plan", lambda *_: None)
+    monkeypatch.setattr(viewer, "_act", lambda *_: None)
+    state = types.SimpleNamespace(info={"success": np.zeros(4, bool)})
+    rest = {"reset": lambda key: state, "step": lambda *_: state}
+    with pytest.raises(ValueError, match="32 layouts"):
+        viewer.episode(types.SimpleNamespace(num_envs=4, expert_steps=2, **rest), jax.random.key(0))

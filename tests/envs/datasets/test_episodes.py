@@ -1,17 +1,12 @@
 """Episodes on disk and in memory."""
 
 import dataclasses
-import io
-import os
-import zipfile
 
 import jax
 import numpy as np
 import pytest
 
 from envs.datasets.episodes import Episodes, concatenate
-
-HEADER = np.frombuffer(b"[]", np.uint8)
 
 
 def make(episodes=3, steps=4, **changes):
@@ -43,13 +38,6 @@ def assert_equal(a, b):
         np.testing.assert_array_equal(x, y)
 
 
-def rewritten(path, **changes):
-    """Rewrite an .npz file with some arrays replaced; None removes one."""
-    with np.load(path) as archive:
-        arrays = {name: archive[name] for name in archive.files} | changes
-    np.savez(path, **{name: x for name, x in arrays.items() if x is not None})
-
-
 def test_round_trip(tmp_path):
     episodes = make()
     path = tmp_path / "new folder" / "press.npz"
@@ -69,36 +57,29 @@ def test_repr_is_one_line():
     assert "state=0" in repr(jax.tree.map(lambda _: 0, make(3, 4)))
 
 
-def test_foreign_files(tmp_path):
-    np.savez(tmp_path / "other.npz", x=np.zeros(3))
-    np.save(tmp_path / "array.npy", np.zeros(3))
-    (tmp_path / "text.npz").write_text("hello")
-    for name in ("other.npz", "array.npy", "text.npz", "missing.npz"):
-        with pytest.raises(ValueError, match=name):
-            Episodes.load(tmp_path / name)
-
-
 @pytest.mark.parametrize(
     ("changes", "name"),
     [
-        ({"action": None}, "action"),
-        *[({"header": bad}, "header|Expecting|list") for bad in (None, HEADER[:0], HEADER)],
         ({"action": np.zeros((3, 4, 6), np.float32)}, r"action .*3, 4, 7"),
         ({"action": np.zeros((3, 4, 7))}, "action .* float64"),
-        ({"image/side": np.zeros((3, 4, 6, 8), np.uint8)}, "'side'"),
-        ({"image/wrist": np.zeros((3, 4, 6, 8, 3), np.float32)}, "'wrist'"),
-        ({"image/side": None, "image/wrist": None}, "camera"),
+        ({"image": {"side": np.zeros((3, 4, 6, 8), np.uint8)}}, "'side'"),
+        ({"image": {"wrist": np.zeros((3, 4, 6, 8, 3), np.float32)}}, "'wrist'"),
+        ({"image": {}}, "camera"),
         ({"length": np.array([1, 5, 2], np.int32)}, "length"),
         ({"instruction": np.array([0, 1, 2], np.int32)}, "instruction"),
         ({"length": np.array([1, 2, 3], np.float32)}, "length"),
     ],
 )
-def test_bad_contents(tmp_path, changes, name):
-    path = tmp_path / "episodes.npz"
-    make().save(path)
-    rewritten(path, **changes)
+def test_bad_contents(changes, name):
     with pytest.raises(ValueError, match=name):
-        Episodes.load(path)
+        make(**changes).validate()
+
+
+def test_foreign_files(tmp_path):
+    np.savez(tmp_path / "other.npz", x=np.zeros(3))
+    for name in ("other.npz", "missing.npz"):
+        with pytest.raises(ValueError, match=name):
+            Episodes.load(tmp_path / name)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -127,22 +108,13 @@ def test_other_control_period(tmp_path):
         Episodes.load(tmp_path / "e.npz", control_dt=0.1)
 
 
-def test_failed_save_keeps_the_old_file(tmp_path, monkeypatch):
+def test_failed_save_keeps_the_old_file(tmp_path):
     path = tmp_path / "episodes.npz"
     make().save(path)
     before = path.read_bytes()
     with pytest.raises(ValueError, match="length"):
         dataclasses.replace(make(), length=np.array([9, 9, 9])).save(path)
-
-    def full(file, **arrays):
-        file.write(b"half")
-        raise OSError("no space left")
-
-    monkeypatch.setattr(np, "savez", full)
-    with pytest.raises(OSError, match="no space"):
-        make(2).save(path)
     assert path.read_bytes() == before
-    assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_select_keeps_order():
@@ -175,45 +147,3 @@ def test_concatenate_refuses_mixed_metadata(changes):
         concatenate([make(), make(**changes)])
     with pytest.raises(ValueError, match="parts"):
         concatenate([])
-
-
-def _npy(shape: tuple, data: bytes) -> bytes:
-    file = io.BytesIO()
-    header = {"descr": "<f4", "fortran_order": False, "shape": shape}
-    np.lib.format.write_array_header_1_0(file, header)
-    return file.getvalue() + data
-
-
-@pytest.mark.parametrize(
-    "member",
-    [
-        _npy((10**6, 10**6), b"0" * 40),
-        _npy((-2, -5), b"0" * 40),
-        _npy((), b""),
-        b"\x93NUMPY\x09\x00",
-        b"\x93NUMPY\x01\x00\x20\x00{'descr': '<f4', 'shape': (((((",
-        b"\x93NUMPY\x01\x00\x04\x00\x00'''",
-        b"",
-    ],
-)
-def test_an_array_that_does_not_match_its_header(member, tmp_path):
-    """No memory is allocated for it."""
-    path = tmp_path / "x.npz"
-    make().save(path)
-    with zipfile.ZipFile(path, "a") as archive:
-        archive.writestr("image/other.npy", member)
-    with pytest.raises(ValueError, match=r"x.npz"):
-        Episodes.load(path)
-
-
-def test_more_than_the_memory(tmp_path, monkeypatch):
-    make().save(tmp_path / "x.npz")
-    monkeypatch.setattr(os, "sysconf", lambda name: 30)  # 900 bytes
-    with pytest.raises(ValueError, match=r"x.npz .* memory"):
-        Episodes.load(tmp_path / "x.npz")
-
-
-def test_a_pipe(tmp_path):
-    os.mkfifo(tmp_path / "x.npz")
-    with pytest.raises(ValueError, match=r"x.npz"):
-        Episodes.load(tmp_path / "x.npz")

@@ -9,9 +9,11 @@ import pytest
 
 import envs
 from envs import robots
-from envs.experts import expert
+from envs.experts import collection, expert
 from envs.physics import physics
 from envs.tasks import route
+from tests.envs.children import fake_record
+from tests.envs.demonstrations import expert_success
 
 LAYOUTS = 256 if jax.default_backend() == "cpu" else 1024
 """Random layouts; pouring in 1,024 takes more than ten minutes on CPU."""
@@ -30,13 +32,8 @@ def test_experts_succeed(episodes):
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("backend", sorted({"jax", physics.default_backend()}))
 def test_experts_succeed_on_many_layouts(task_name, robot_name, backend):
-    success = envs.expert_success(
-        task_name,
-        robot_name,
-        num_episodes=LAYOUTS,
-        num_envs=256,
-        key=jax.random.key(1),
-        backend=backend,
+    success = expert_success(
+        task_name, robot_name, num_episodes=LAYOUTS, num_envs=256, backend=backend
     )
     assert success.shape == (LAYOUTS,)
     assert success.dtype == bool
@@ -83,8 +80,8 @@ def test_images_show_the_episode(episodes):
         assert np.abs(start - start[:1]).max() > 30  # layouts differ
 
 
-def test_inverse_kinematics_reaches(scene):
-    robot = scene.robot
+def test_inverse_kinematics_reaches(robot_name):
+    robot = getattr(robots, robot_name).ROBOT
     rng = np.random.default_rng(0)
     goals = jnp.array(rng.uniform([0.30, -0.18, 0.01], [0.42, 0.18, 0.12], (64, 3)), jnp.float32)
     way = route(*((goal, (0.0, 0.0, 0.0), 0.0, 1.0, 0.0) for goal in goals))
@@ -105,11 +102,10 @@ def test_inverse_kinematics_reaches(scene):
 
 def test_path_rests_at_every_knot_and_holds_the_last():
     knots, times = jnp.array([[0.0, 0.0], [1.0, -1.0], [1.0, 2.0]]), jnp.array([0.0, 1.0, 3.0])
-    path = jax.vmap(lambda seconds: expert._interpolate(knots, times, seconds))
-    np.testing.assert_allclose(
-        path(jnp.array([0.0, 1.0, 3.0, 99.0])), knots[jnp.array([0, 1, 2, 2])]
-    )
-    speed = np.diff(path(jnp.linspace(0.0, 3.0, 301)), axis=0) / 0.01
+    path = jax.jit(jax.vmap(expert._interpolate, in_axes=(None, None, 0)))
+    found = np.asarray(path(knots, times, jnp.append(jnp.linspace(0.0, 3.0, 301), 99.0)))
+    np.testing.assert_allclose(found[[0, 100, 300, 301]], np.asarray(knots)[[0, 1, 2, 2]])
+    speed = np.diff(found[:-1], axis=0) / 0.01
     np.testing.assert_allclose(speed[[0, 99, 100, 299]], 0.0, atol=0.01)
     # The fastest moment of a minimum-jerk move is 1.875 times its mean speed.
     np.testing.assert_allclose(np.abs(speed).max(axis=0), [1.875, 1.875 * 3 / 2], rtol=1e-3)
@@ -130,25 +126,19 @@ def test_hurried_experts_slow_down_to_half_the_speed_limits(env):
     assert np.all(share[:, 0].max(axis=-1) > 0.49)  # no slower than necessary
 
 
-def fake_record(success):
-    """Replace `_record`: episodes of one step, numbered by world."""
+def numbered(success):
+    """Replace the simulation: states are the numbers of the worlds."""
 
-    def record(env, key, action_noise, ranges):
-        world = jnp.arange(env.num_envs)
-        numbers = jnp.broadcast_to(world[:, None, None].astype(jnp.float32), (env.num_envs, 1, 7))
-        chunk = {
-            "image": {"side": jnp.zeros((env.num_envs, 1, 2, 2, 3), jnp.uint8)},
-            "state": numbers,
-            "action": numbers,
-            "length": jnp.ones(env.num_envs, jnp.int32),
-            "instruction": jnp.zeros(env.num_envs, jnp.int32),
-        }
-        return chunk, jnp.array(success)
+    def record(env, *arguments):
+        episodes, _ = fake_record(env, *arguments)
+        episodes["state"][:] = np.arange(env.num_envs)[:, None, None]
+        return episodes, np.array(success)
 
     return record
 
 
-def test_collect_keeps_successes_in_order():
+def test_collect_keeps_successes_in_order(monkeypatch):
+    monkeypatch.setattr(collection, "record_expert", numbered([True, False, True, True]))
     calls = []
     found = envs.collect(
         "press",
@@ -156,37 +146,13 @@ def test_collect_keeps_successes_in_order():
         num_envs=4,
         key=jax.random.key(0),
         progress=lambda *numbers: calls.append(numbers),
-        record=fake_record([True, False, True, True]),
     )
     assert found.state[:, 0, 0].tolist() == [0, 2, 3, 0, 2]
     assert found.attempted == 7
     assert calls == [(0, 5), (3, 5), (5, 5)]
 
 
-def test_collect_gives_up_on_a_broken_expert():
-    record = fake_record([True, False, False, False])
+def test_collect_gives_up_on_a_broken_expert(monkeypatch):
+    monkeypatch.setattr(collection, "record_expert", numbered([True, False, False, False]))
     with pytest.raises(ValueError, match="4 of 16"):
-        envs.collect("press", num_episodes=50, num_envs=4, key=jax.random.key(0), record=record)
-
-
-def test_expert_success_counts_full_and_partial_batches():
-    seen = []
-
-    def attempt(env, key, ranges):
-        seen.append(key)
-        return jnp.array([True, True, False])
-
-    success = envs.expert_success(
-        "press", num_episodes=5, num_envs=3, key=jax.random.key(0), attempt=attempt
-    )
-    assert success.tolist() == [True, True, False, True, True]
-    assert len(seen) == 2
-    assert not np.array_equal(jax.random.key_data(seen[0]), jax.random.key_data(seen[1]))
-
-
-@pytest.mark.parametrize("number", [0, -1])
-def test_number_of_episodes_must_be_positive(number):
-    with pytest.raises(ValueError, match="num_episodes"):
-        envs.collect("press", num_episodes=number, key=jax.random.key(0))
-    with pytest.raises(ValueError, match="num_episodes"):
-        envs.expert_success("press", num_episodes=number, key=jax.random.key(0))
+        envs.collect("press", num_episodes=50, num_envs=4, key=jax.random.key(0))

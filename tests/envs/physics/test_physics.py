@@ -6,10 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
+import envs
 from envs import actions
-from envs.experts import expert
 from envs.physics import physics
 from envs.scene import placing
+from tests.envs.demonstrations import demonstration
 
 
 @pytest.mark.parametrize(
@@ -57,6 +58,13 @@ def test_a_step_sums_in_a_fixed_order(env):
     assert not unordered(env.step, state, state.info["command"])
 
 
+def test_models_are_on_a_device_of_this_process(monkeypatch):
+    """MJX's default is the first device of all processes."""
+    monkeypatch.setattr(jax, "local_devices", lambda: jax.devices()[3:])
+    env = envs.make("press", num_envs=2, image_size=16)
+    assert env.physics._model.opt.timestep.devices() == {jax.devices()[3]}
+
+
 def test_unordered_sums_are_detected(env):
     def loop(x):
         return jax.lax.scan(
@@ -69,13 +77,10 @@ def test_unordered_sums_are_detected(env):
 def test_a_control_step_matches_mujoco(env):
     """Everything in `mj_step` that our scenes use: forces, limits, contacts, the equality."""
     start = env.reset(jax.random.key(3))
-    plan = expert.plan(env, start, jax.random.key(1))
-    act = jax.jit(lambda state: expert.act(env, plan, state))
-    state = after = start
-    rest = start.metrics["button_depth"][0]
-    while after.metrics["button_depth"][0] < rest + 0.002:  # until the button is touched
-        assert not after.done[0]
-        state, after = after, env.step(after, act(after))
+    touched = start.metrics["button_depth"][0] + 0.002
+    walk = demonstration(env, start)
+    state, _, after = next(step for step in walk if step[2].metrics["button_depth"][0] > touched)
+    assert not after.done[0]
     model = placing.world_model(env.model, start.info["layout"], 0)
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = state.data.qpos[0], state.data.qvel[0]

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,8 @@ import numpy as np
 import pytest
 
 import envs
-from envs.rendering import renderer
+from envs.rendering import intersections, renderer, shading
+from envs.rendering.model import build
 from envs.state import Poses
 from tests.envs.test_tasks import world
 
@@ -37,7 +39,7 @@ SCENE = """
 </mujoco>
 """
 CAMERAS = ("front", "top")
-SIZE = {"height": 48, "width": 64}
+SIZE, EDGE = {"height": 48, "width": 64}, 48
 GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)  # drawn
 
 
@@ -60,7 +62,7 @@ def shapes():
 
 @pytest.fixture(scope="module")
 def built(shapes):
-    return renderer.build(shapes[0], CAMERAS)
+    return build(shapes[0], CAMERAS)
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +73,21 @@ def poses(shapes):
 @pytest.fixture(scope="module")
 def image(built, poses):
     return np.asarray(renderer.render(built, poses, appearance=built.appearance, **SIZE))
+
+
+@functools.partial(jax.jit, static_argnames=("height", "width"))
+def cast(model, poses, *, height, width):
+    """Return the geom's id, -1 for none, and the depth [m] of each pixel, `[K, height, width]`."""
+    raster = shading.Raster(height, width, samples=1)
+
+    def first_hit(geoms, view):
+        x, y = shading.slopes(view, raster, jnp.arange(height * width, dtype=jnp.int32))
+        number, depth = intersections.nearest(renderer._table(geoms), model.kinds, x, y)
+        geom = jnp.where(jnp.isfinite(depth), jnp.array(model.geoms, jnp.int32)[number], -1)
+        return geom.reshape(height, width), depth.reshape(height, width)
+
+    frames = renderer._in_camera_frames(model, model.appearance, model.size, poses, height)
+    return jax.vmap(first_hit)(*frames)
 
 
 def camera_rays(model, data, name, height, width):
@@ -112,7 +129,7 @@ def assert_agrees_with_mujoco(model, data, name, geom, depth):
 
 
 def test_rays_agree_with_mujoco(shapes, built, poses):
-    geom, depth = renderer.cast(built, poses, height=128, width=128)
+    geom, depth = cast(built, poses, height=128, width=128)
     assert geom.shape == depth.shape == (2, 128, 128)
     assert geom.dtype == jnp.int32
     assert depth.dtype == jnp.float32
@@ -124,7 +141,7 @@ def test_rays_agree_with_mujoco(shapes, built, poses):
 
 def test_rays_agree_with_mujoco_in_every_task(scene):
     data = world(scene)
-    geom, depth = renderer.cast(scene.render_model, poses_of(data), height=128, width=128)
+    geom, depth = cast(scene.render_model, poses_of(data), height=128, width=128)
     for i, name in enumerate(scene.cameras):
         seen = assert_agrees_with_mujoco(scene.model, data, name, geom[i], depth[i])
         assert len(seen) > 5  # the table, the gripper or the arm, and something to handle
@@ -157,7 +174,7 @@ def test_headlight_and_ambient_cast_no_shadow(built, poses):
         headlight=jnp.array(0.0),
         checker=jnp.array([0.1, 0.0]),
     )
-    geom, _ = renderer.cast(built, poses, **SIZE)
+    geom, _ = cast(built, poses, **SIZE)
     pixels = np.asarray(renderer.render(built, poses, appearance=dim, **SIZE))[
         np.asarray(geom) == 0
     ]
@@ -166,7 +183,7 @@ def test_headlight_and_ambient_cast_no_shadow(built, poses):
 
 
 def test_color_changes_only_its_geom(built, poses, image):
-    geom = np.asarray(renderer.cast(built, poses, **SIZE)[0])
+    geom = np.asarray(cast(built, poses, **SIZE)[0])
     green = built.appearance.rgba.copy()
     green[2] = (0, 1, 0, 1)
     appearance = dataclasses.replace(built.appearance, rgba=green)
@@ -191,16 +208,13 @@ def test_batch_equals_single_worlds(built, poses):
     moved = batch.geom_xpos.at[:, 2, 0].add(0.01 * jnp.arange(worlds))
     batch = batch._replace(geom_xpos=moved)
     looks = jax.tree.map(lambda x: jnp.stack([x * 0.8, *[x] * (worlds - 1)]), built.appearance)
-    images = jax.jit(
-        lambda poses, looks: renderer.render_batch(built, poses, appearance=looks, **SIZE)
-    )(batch, looks)
-    assert images.shape == (worlds, 2, 48, 64, 3)
+    images = jax.jit(renderer.RayRenderer(built, EDGE, 1))(batch, looks, None)
+    assert images.shape == (worlds, 2, EDGE, EDGE, 3)
     assert images.dtype == jnp.uint8
     for i in range(worlds):
         appearance = jax.tree.map(lambda x, i=i: x[i], looks)
-        single = renderer.render(
-            built, Poses(*(x[i] for x in batch)), appearance=appearance, **SIZE
-        )
+        own = Poses(*(x[i] for x in batch))
+        single = renderer.render(built, own, appearance=appearance, height=EDGE, width=EDGE)
         difference = np.abs(images[i].astype(int) - single.astype(int))
         assert np.mean(difference > 1) < 1e-3  # rounding may move an edge by a pixel
 
@@ -210,11 +224,11 @@ def test_sizes_differ_from_world_to_world(shapes, built, poses):
     size = np.stack([built.size, built.size * 1.5, built.size])
     size[2, :, 1] *= 0.5  # half the length of capsules and cylinders, other boxes and ellipsoids
     batch = Poses(*(jnp.tile(x, (len(size), *[1] * x.ndim)) for x in poses))
-    images = renderer.render_batch(built, batch, size=size, **SIZE)
+    images = renderer.RayRenderer(built, EDGE, 1)(batch, None, size)
     for own, found in zip(size, images, strict=True):
         model = copy.copy(shapes[0])
         model.geom_size[:] = own
-        expected = renderer.render(renderer.build(model, CAMERAS), poses, **SIZE)
+        expected = renderer.render(build(model, CAMERAS), poses, height=EDGE, width=EDGE)
         difference = np.abs(found.astype(int) - expected.astype(int))
         assert np.mean(difference > 1) < 1e-3  # rounding may move an edge by a pixel
     assert np.mean(images[0] != images[1]) > 0.05
@@ -234,12 +248,19 @@ def test_samples_equal_a_larger_image_scaled_down(built, poses, diffuse):
     assert np.mean(np.abs(smooth.astype(float) - expected) > 1) < 1e-3
 
 
-def test_memory_does_not_grow_with_the_samples(built, poses):
+def test_memory_does_not_grow_with_the_samples():
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><geom size=".1"/><camera name="c" pos="0 0 1"/></worldbody></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+
     def memory(samples):
-        lowered = renderer.render.lower(built, poses, height=64, width=64, samples=samples)
+        options = {"height": 64, "width": 64, "samples": samples}
+        lowered = renderer.render.lower(build(model, ["c"]), poses_of(data), **options)
         return lowered.compile().memory_analysis().temp_size_in_bytes
 
-    assert memory(8) < 1.5 * memory(1)
+    assert memory(8) < 1.5 * memory(2)
 
 
 @pytest.mark.slow
@@ -247,9 +268,7 @@ def test_environments_pass_antialias_on():
     plain, smooth = (envs.make("press", image_size=12, antialias=n) for n in (1, 3))
     batch = Poses(*(x[None] for x in poses_of(world(plain))))
     for env in (plain, smooth):
-        expected = renderer.render_batch(
-            env.render_model, batch, height=12, width=12, samples=env.antialias
-        )
+        expected = renderer.RayRenderer(env.render_model, 12, env.antialias)(batch, None, None)
         np.testing.assert_array_equal(env.render(batch)["wrist"], expected[:, 1])
     assert np.any(smooth.render(batch)["wrist"] != plain.render(batch)["wrist"])
     with pytest.raises(ValueError, match="antialias"):
@@ -279,6 +298,6 @@ def test_geoms_that_cannot_be_drawn():
     field = """<mujoco><asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset><worldbody>
       <geom name="hill" type="hfield" hfield="h"/></worldbody></mujoco>"""
     with pytest.raises(ValueError, match="geom hill"):
-        renderer.build(mujoco.MjModel.from_xml_string(field), ())
+        build(mujoco.MjModel.from_xml_string(field), ())
     with pytest.raises(ValueError, match="no visible geom"):
-        renderer.build(mujoco.MjModel.from_xml_string("<mujoco/>"), ())
+        build(mujoco.MjModel.from_xml_string("<mujoco/>"), ())

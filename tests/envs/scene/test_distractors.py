@@ -1,7 +1,6 @@
 """Distractors stay clear of the task, are solid and visible, and change nothing else."""
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -10,12 +9,15 @@ import envs
 from envs.scene import distractors
 
 
+@pytest.mark.parametrize("robot_name", ["piper"])
 def test_positions_are_clear_and_random(scene):
+    @jax.jit
+    @jax.vmap
     def draw(key):
         layout = scene.task.place(key)
         return layout, distractors.place(key, layout, 4)
 
-    layout, found = jax.vmap(draw)(jax.random.split(jax.random.key(0), 256))
+    layout, found = draw(jax.random.split(jax.random.key(0), 256))
     assert list(found) == [f"distractor{i}" for i in range(4)]
     everything = np.stack([*layout.values(), *found.values()], axis=1)[..., :2]
     for i in range(len(layout), len(layout) + 4):
@@ -34,12 +36,6 @@ def test_only_the_chosen_number_is_there(robot_name):
     assert plain.model.nu == full.model.nu
 
 
-@pytest.mark.parametrize("count", [-1, 5])
-def test_count_is_checked(count):
-    with pytest.raises(ValueError, match="distractors"):
-        envs.make("press", distractors=count)
-
-
 def test_a_grape_does_not_fall_through(monkeypatch):
     model = envs.make("pick_place", distractors=1).model
     data = mujoco.MjData(model)
@@ -50,9 +46,3 @@ def test_a_grape_does_not_fall_through(monkeypatch):
     for _ in range(200):
         mujoco.mj_step(model, data)
     assert data.body("grape").xpos[2] == pytest.approx(0.032 + 0.015, abs=2e-3)
-
-
-def test_zero_distractors_do_not_change_the_layout(env):
-    first = env.reset(jax.random.key(0)).info["layout"]
-    assert set(first) == {"button"}
-    assert jnp.isfinite(first["button"]).all()

@@ -12,8 +12,9 @@ from jax import monitoring
 import envs
 from envs import actions, robots
 from envs.experts import collection, expert
-from envs.scene import randomization
+from envs.scene import randomization, scene
 from envs.scene.ranges import Randomization
+from tests.envs.demonstrations import expert_success
 
 WORLDS, STEPS = 2, 50  # the expert lifts the grape at about step 35
 FIELDS = [field.name for field in dataclasses.fields(Randomization)]
@@ -122,12 +123,15 @@ def test_cameras_move_along_and_about_their_axes(env, episode, neutral):
 def test_a_higher_table_is_a_lower_robot(env):
     """Objects and the side camera stay; the robot moves with its wrist camera."""
     layout = env.task.place(jax.random.key(0))
-    poses = []
-    for height in (0.0, 0.03):
+
+    @jax.jit
+    def start(height):
         ranges = Randomization(table_height=(height, height))
         draw, placed = randomization.draw(jax.random.key(1), ranges, env.model, layout)
-        assert equal(placed, layout)
-        poses.append(env._start(draw, placed, jnp.append(jnp.asarray(env.robot.home), 0.04)))
+        return env._start(draw, placed, jnp.append(jnp.asarray(env.robot.home), 0.04)), placed
+
+    poses, placed = zip(start(0.0), start(0.03), strict=True)
+    assert all(equal(found, layout) for found in placed)
     moved = {name: np.asarray(getattr(poses[1], name) - getattr(poses[0], name)) for name in (
         "geom_xpos", "cam_xpos", "cam_xmat", "geom_xmat"
     )}  # fmt: skip
@@ -144,9 +148,7 @@ def test_a_higher_table_is_a_lower_robot(env):
 @pytest.mark.parametrize("height", [-0.04, 0.04])
 def test_experts_succeed_at_other_table_heights(task_name, robot_name, height):
     ranges = Randomization(table_height=(height, height))
-    success = envs.expert_success(
-        task_name, robot_name, num_episodes=32, key=jax.random.key(1), ranges=ranges
-    )
+    success = expert_success(task_name, robot_name, num_episodes=32, num_envs=32, ranges=ranges)
     assert success.mean() >= 0.95
 
 
@@ -201,7 +203,7 @@ def test_the_model_matches_one_compiled_by_mujoco(env):
         lambda x: x[0], env.reset(jax.random.key(0), Randomization(mass=(2, 2), size=(1.1, 1.1)))
     ).info["draw"]
     found = randomization.changes(draw, env.model, env._objects)
-    model = mujoco.MjModel.from_xml_string(mujoco_xml(env))
+    model = mujoco.MjModel.from_xml_string(scene.mjcf(env.task.scene, env.robot))
     for name in ("geom_size", "geom_pos", "body_pos", "body_ipos", "body_mass", "body_inertia"):
         getattr(model, name)[:] = np.asarray(found[name], np.float64)
     mujoco.mj_setConst(model, mujoco.MjData(model))
@@ -210,12 +212,6 @@ def test_the_model_matches_one_compiled_by_mujoco(env):
         found["body_invweight0"][grape], model.body_invweight0[grape], rtol=1e-4
     )
     assert model.body_mass[grape] == pytest.approx(2 * env.model.body_mass[grape])
-
-
-def mujoco_xml(env):
-    from envs.scene import scene
-
-    return scene.mjcf(env.task.scene, env.robot)
 
 
 def test_changed_ranges():
@@ -237,7 +233,7 @@ def test_invalid_ranges_raise(env, name, value):
     with pytest.raises(ValueError, match=name):
         env.reset(jax.random.key(0), ranges)
     with pytest.raises(ValueError, match=name):
-        envs.expert_success("press", num_episodes=1, key=jax.random.key(0), ranges=ranges)
+        envs.collect("press", num_episodes=1, key=jax.random.key(0), ranges=ranges)
 
 
 @pytest.mark.slow
