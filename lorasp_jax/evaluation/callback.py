@@ -39,7 +39,7 @@ class Evaluation(Callback):
 
     The first evaluation measures the base, since new adapters leave its outputs unchanged. The
     final evaluation uses other layouts than the earlier ones; both depend only on the seed and the
-    task. Compiled programs are shared, see `programs.split_rollout`. Videos are rendered in the
+    task. Compiled programs are shared, see `programs`. Videos are rendered in the
     background during training, in the foreground after it.
     """
 

@@ -12,8 +12,7 @@ from envs.scene.randomization import Draw
 from envs.state import Poses
 from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.evaluation import metrics
-from lorasp_jax.evaluation.programs import split_rollout
-from lorasp_jax.evaluation.rollout import RECORDED_WORLDS, Rollout
+from lorasp_jax.evaluation.programs import RECORDED_WORLDS, Rollout, make_rollout
 from lorasp_jax.policies.policy import Policy
 
 
@@ -62,8 +61,8 @@ def evaluate(
         env: environment; `num_envs` episodes run in parallel.
         key: PRNG key of the layouts and the sampled actions.
         num_episodes: a multiple of `env.num_envs`.
-        rollout: (policy, key) -> `Rollout`, such as a jitted `make_rollout(env)` with other
-            settings; None uses `programs.split_rollout`, which compiles less often.
+        rollout: (policy, key) -> `Rollout`, such as `make_rollout(env)` with other settings;
+            None: the default settings.
         progress: called with (completed, total) episodes.
 
     Raises:
@@ -75,7 +74,7 @@ def evaluate(
         raise ValueError(
             f"num_episodes must be a positive multiple of {env.num_envs}, got {num_episodes}"
         )
-    rollout = rollout or split_rollout(env)
+    rollout = rollout or make_rollout(env)
     runs: list[Rollout] = []
     for batch_key in jax.random.split(key, batches):
         runs.append(jax.block_until_ready(rollout(policy, batch_key)))

@@ -140,7 +140,7 @@ def test_the_robot_executes_some_actions_of_a_chunk(tmp_path):
     settings = {"execute_steps": 3, "denoise_steps": 2}
     config = {**to_json(CONFIG), "evaluation": settings}
     found = rank_episode.play(policy, env, config, key)
-    rollout = jax.jit(make_rollout(env, execute_steps=3, denoise_steps=2))(policy, key)
+    rollout = make_rollout(env, execute_steps=3, denoise_steps=2)(policy, key)
     steps = int(rollout.steps[0])
     assert len(found.poses.geom_xpos) == steps
     assert found.success == rollout.success[0]

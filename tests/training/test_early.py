@@ -11,7 +11,7 @@ from rich.console import Console
 
 from lorasp_jax.config import EvaluationConfig
 from lorasp_jax.evaluation.callback import Evaluation
-from lorasp_jax.evaluation.programs import split_rollout
+from lorasp_jax.evaluation.programs import make_rollout
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import LoRA
 from lorasp_jax.training import early, loop, program, setup
@@ -73,7 +73,7 @@ def test_the_run_compiles_nothing_else(prepare, monkeypatch):
 
     def compile_rollout(config, task):
         del config, task
-        return ROOM, split_rollout(ROOM, execute_steps=1, denoise_steps=2)
+        return ROOM, make_rollout(ROOM, execute_steps=1, denoise_steps=2)
 
     monkeypatch.setattr(program, "jit_steps", recorded)
     monkeypatch.setattr(loop, "jit_steps", recorded)
