@@ -10,13 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
+from PIL import Image
 from rich.console import Console
 
 from envs.datasets.episodes import Episodes
+from envs.rendering.video import write_video
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config, ModelConfig, OptimConfig
 from lorasp_jax.dense import Dense
-from lorasp_jax.evaluation import video
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.policies import tokenizer
@@ -148,6 +149,6 @@ def finish(folder: Path) -> Path:
         log.write(step, {"task": 1 / step, "spectral": 0.1, "active_rank/vision": 4.0})
     log.close()
     frames = np.random.default_rng(0).integers(0, 255, (4, 32, 64, 3), np.uint8)
-    video.write_image(folder / "cameras_press.png", frames[0])
-    video.write_video(folder / "rollout_press.mp4", frames, fps=10)
+    Image.fromarray(frames[0]).save(folder / "cameras_press.png")
+    write_video(folder / "rollout_press.mp4", frames, fps=10)
     return folder

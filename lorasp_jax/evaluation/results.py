@@ -87,7 +87,7 @@ def _result(runs: Sequence[Rollout]) -> Result:
     """Aggregate batches of episodes."""
     success = np.concatenate([run.success for run in runs])
     successes, episodes = int(success.sum()), len(success)
-    world = _recorded_world(runs[0])
+    world = int(np.argmax(runs[0].success[:RECORDED_WORLDS]))  # the first that succeeds, or 0
     histograms = [run.active_rank_histogram for run in runs]
     return Result(
         success=successes / episodes,
@@ -111,8 +111,3 @@ def _mean_ranks(run: Rollout) -> metrics.LayerRanks:
     """Average active ranks over the policy calls, weighted by the number of unfinished worlds."""
     weights = np.asarray(run.running) / max(np.sum(run.running), 1)
     return jax.tree.map(lambda ranks: np.tensordot(weights, ranks, axes=1), run.active_rank)
-
-
-def _recorded_world(run: Rollout) -> int:
-    """Return the first recorded world that succeeds, or else world 0."""
-    return int(np.argmax(run.success[:RECORDED_WORLDS]))

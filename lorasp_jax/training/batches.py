@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -25,31 +25,8 @@ CollectGeneration = Callable[[Config, int], dict[str, Episodes]]
 """Collects demonstrations per task for generation 1, 2, ... (see `fresh_demonstrations`)."""
 
 
-class Batches(Protocol):
-    """The batches that calls of the training program take, in order."""
-
-    def call_size(self, count: int) -> int:
-        """Return the number of steps per call, a divisor of `count`."""
-        ...
-
-    def shapes(self, size: int) -> Any:
-        """Return a `RawBatch` like those of `take`, or of their shapes and shardings."""
-        ...
-
-    def take(self, key: jax.Array, step: int, size: int) -> RawBatch:
-        """Return the batches of `size` steps from `step` on, with a leading axis over steps.
-
-        `key` is that of `RandomStream.TRAINING`.
-        """
-        ...
-
-    def prepare(self, running: Any) -> None:
-        """Prepare the next batches while the device computes the arrays `running`."""
-        ...
-
-
 class DrawnBatches:
-    """Random windows of a dataset on the device."""
+    """The batches that calls of the training program take: random windows of a dataset."""
 
     def __init__(
         self,
@@ -87,13 +64,16 @@ class DrawnBatches:
         )
 
     def take(self, key: jax.Array, step: int, size: int) -> RawBatch:
-        """Draw the batches; see `Batches`."""
+        """Return the batches of `size` steps from `step` on, with a leading axis over steps.
+
+        `key` is that of `RandomStream.TRAINING`.
+        """
         if self._refresh is not None:
             self._steps = self._refresh(self._steps, step, self._running)
         return self._draw(self._steps, key, jnp.int32(step), size=size)
 
     def prepare(self, running: Any) -> None:
-        """Remember what runs."""
+        """Remember the arrays that the device computes while the host prepares the next batches."""
         self._running = running
 
 
@@ -154,6 +134,9 @@ class StreamedBatches:
         """Read the next batch."""
         with self._speed.waiting(running):
             self._batch = next(self._batches)
+
+
+Batches: TypeAlias = DrawnBatches | StreamedBatches
 
 
 def make_batches(

@@ -129,17 +129,16 @@ def _begin(config: Config, folder: Path) -> None:
     """Create the folder of a new run and write its config."""
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file: remove it or use another --name")
-    names = (CONFIG_FILE, TIMES_FILE, DATASET_FILE)
-    allowed = {folder / name for name in names}
-    for name in names:
-        allowed |= {*folder.glob(f".{name}.*{TEMPORARY_SUFFIX}")}  # left by a killed process
-    if any(path not in allowed for path in folder.rglob("*") if not path.is_dir()):
+    left = [path for path in folder.rglob("*") if not path.is_dir()]
+    names = {CONFIG_FILE, TIMES_FILE, DATASET_FILE}
+    unfinished = {*folder.glob(f".*{TEMPORARY_SUFFIX}")}  # left by a killed process
+    if {*left} - unfinished - {folder / name for name in names}:
         raise ValueError(
             f"{folder} already contains a run: add --resume to continue it or use another --name"
         )
     folder.mkdir(exist_ok=True)
-    for path in allowed - {folder / CONFIG_FILE}:
-        path.unlink(missing_ok=True)
+    for path in left:
+        path.unlink()
     write_json(folder / CONFIG_FILE, to_json(config))
 
 
@@ -273,7 +272,6 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
         try:
             row = json.loads(line)
             check(row, records.ROW)
-            row.pop("digest", None)  # only in logs of an early version
             rows.append(row)
         except (ValueError, RecursionError) as error:
             raise ValueError(
