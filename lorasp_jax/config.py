@@ -75,7 +75,6 @@ class ModelConfig:
         return self.checkpoint.replace("{backbone}", self.backbone).replace("{size}", self.size)
 
     def __post_init__(self) -> None:
-        """Validate the fields."""
         fields.check_fields(self)
         _at_least(0, self, "max_tokens", "chunk")
 
@@ -100,7 +99,6 @@ class DataConfig:
     trains; a multiple of log_every. 0: never."""
 
     def __post_init__(self) -> None:
-        """Validate the fields."""
         fields.check_fields(self)
         _at_least(1, self, "episodes", "num_envs")
         _at_least(0, self, "action_noise", "fresh_every")
@@ -146,7 +144,6 @@ class OptimConfig:
     only non-finite steps."""
 
     def __post_init__(self) -> None:
-        """Validate the fields."""
         fields.check_fields(self)
         _at_least(1, self, "steps", "batch_size", "accumulate", "max_skipped")
         _at_least(0, self, "learning_rate", "final_learning_rate", "warmup_steps")
@@ -177,7 +174,6 @@ class AuxiliaryConfig:
     """Fraction of the steps over which the weights rise linearly from zero."""
 
     def __post_init__(self) -> None:
-        """Validate the fields."""
         fields.check_fields(self)
         _at_least(0, self, *AUXILIARY_WEIGHTS)
         if not 0 <= self.warmup <= 1:
@@ -208,7 +204,6 @@ class EvaluationConfig:
         return min(self.episodes, self.num_envs)
 
     def __post_init__(self) -> None:
-        """Validate the fields."""
         fields.check_fields(self)
         _at_least(1, self, "episodes", "num_envs", "execute_steps", "denoise_steps")
         if self.every < 0:
@@ -274,7 +269,6 @@ class Config:
         return bool(every) and step // every > previous // every and step < self.optim.steps
 
     def __post_init__(self) -> None:
-        """Validate the fields and their combinations."""
         fields.check_fields(self)
         fields.check_fields(self.peft, "peft.")
         fields.check_fields(self.scene, "scene.")

@@ -84,7 +84,6 @@ def evaluate(
 
 
 def _result(runs: Sequence[Rollout]) -> Result:
-    """Aggregate batches of episodes."""
     success = np.concatenate([run.success for run in runs])
     successes, episodes = int(success.sum()), len(success)
     world = int(np.argmax(runs[0].success[:RECORDED_WORLDS]))  # the first that succeeds, or 0

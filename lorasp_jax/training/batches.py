@@ -36,7 +36,7 @@ class DrawnBatches:
         chunk: int,
         refresh: "Refresh | None" = None,
     ) -> None:
-        """Store the arguments; `steps` is on the mesh, and `refresh` replaces it by others."""
+        """`steps` is on the mesh; `refresh` replaces it by others."""
         self._steps, self._refresh, self._running = steps, refresh, None
         self._sharding = meshes.batches_sharding(mesh)
 

@@ -126,7 +126,6 @@ class Checkpoints:
         return checkpoint["state"]
 
     def _rename_corrupt(self, corrupt: dict[int, str], resume_step: int) -> None:
-        """Rename corrupt checkpoints, with a warning for each."""
         for step, reason in corrupt.items():
             renamed = self._folder / f"{step}.damaged"
             if processes.is_first():

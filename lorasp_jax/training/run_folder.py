@@ -95,11 +95,8 @@ def read_json(path: Path, schema: Mapping[Any, Any] = MappingProxyType({})) -> d
 def open_run(config: Config, root: Path, *, resume: bool | Literal["auto"]) -> Iterator[Path]:
     """Open the run's folder under an exclusive lock.
 
-    Args:
-        config: configuration of the run.
-        root: parent of all run folders.
-        resume: False creates the folder; True requires a run with the same config; "auto" resumes
-            the run if it exists and creates it otherwise.
+    Without `resume`, the folder is created in `root`; with True, it must contain a run with the
+    same config; "auto" resumes the run if it exists and creates it otherwise.
 
     Raises:
         ValueError: the path contains a wildcard, or another process uses the folder. For a new
@@ -126,7 +123,6 @@ def open_run(config: Config, root: Path, *, resume: bool | Literal["auto"]) -> I
 
 
 def _begin(config: Config, folder: Path) -> None:
-    """Create the folder of a new run and write its config."""
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file: remove it or use another --name")
     left = [path for path in folder.rglob("*") if not path.is_dir()]
@@ -181,7 +177,6 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _recorded(folder: Path) -> dict[str, Any]:
-    """Return the config recorded in `folder`."""
     if not (folder / CONFIG_FILE).exists():
         raise ValueError(f"{folder} contains no run to resume: omit --resume to start one")
     return read_json(folder / CONFIG_FILE, records.CONFIG)

@@ -133,10 +133,7 @@ def prepare(
     """Build a run and load or collect its demonstrations.
 
     Args:
-        config, folder: the run's config and folder.
-        console: prints progress.
         started: `time.perf_counter()` when this process started.
-        collect: collects demonstrations, like `demonstrations`.
         meanwhile: functions that compile what the run needs next, in threads of their own until
             the demonstrations are there. Their errors are raised here.
 

@@ -1,12 +1,14 @@
 """Compiler options of training steps."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import pytest
 
 from lorasp_jax.base import fast_cpu
 from lorasp_jax.training import compilation, loop
-from tests.runs import make_run
+from tests.runs import CONFIG, Miniature, make_run
 
 
 @pytest.fixture
@@ -43,5 +45,5 @@ def test_a_training_program_is_compiled_with_its_options(monkeypatch, tmp_path):
     asked = []
     monkeypatch.setattr(compilation, "step_options", lambda n: asked.append(n) or {"no_such": 1})
     with pytest.raises(jax.errors.JaxRuntimeError, match="no_such"):
-        loop.train(make_run(tmp_path))
+        loop.train(make_run(tmp_path, dataclasses.replace(CONFIG, targets=("inp",)), Miniature()))
     assert asked == [1]

@@ -109,8 +109,8 @@ def prepare(folder, monkeypatch, source, available=2**40, model_config=None):
     data = DataConfig(source=str(source))
     config = dataclasses.replace(CONFIG, data=data, evaluation=evaluation)
     console = Console(file=io.StringIO(), width=200)
-    load_base = lambda *_, **__: (model, "")  # noqa: E731
-    return setup.prepare(config, folder, console, time.perf_counter(), load_base=load_base)
+    monkeypatch.setattr(setup, "base_model", lambda *_, **__: (model, ""))
+    return setup.prepare(config, folder, console, time.perf_counter())
 
 
 def test_prepare(tmp_path, monkeypatch):

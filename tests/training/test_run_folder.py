@@ -9,7 +9,6 @@ import sys
 
 import numpy as np
 import pytest
-from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from envs.scene.ranges import Randomization
@@ -17,7 +16,6 @@ from lorasp_jax.base.errors import DISK_FULL
 from lorasp_jax.config import Config, DataConfig
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.training import run_folder
-from lorasp_jax.training.run import Run
 from lorasp_jax.training.run_folder import (
     MetricsLog,
     read_metrics,
@@ -33,14 +31,6 @@ def open_run(*arguments, **options):
     """Open and close a run; return its folder."""
     with run_folder.open_run(*arguments, **options) as folder:
         return folder
-
-
-def test_a_second_run_in_the_same_folder_is_rejected(tmp_path):
-    folder = open_run(CONFIG, tmp_path, resume=False)
-    (folder / "metrics.jsonl").write_text("precious")
-    with pytest.raises(ValueError, match="already contains a run"):
-        open_run(CONFIG, tmp_path, resume=False)
-    assert (folder / "metrics.jsonl").read_text() == "precious"
 
 
 @pytest.mark.parametrize("character", "[*?\\")
@@ -240,12 +230,6 @@ def test_a_name_is_free_after_a_run_that_failed_without_results(tmp_path):
     files = [path.name for path in folder.iterdir() if path.is_file()]
     assert files == ["config.json"]  # times start from zero
     assert json.loads((folder / "config.json").read_text())["data"]["action_noise"] == 0.005
-
-
-def test_corrupt_times_are_reported(tmp_path):
-    (tmp_path / "seconds.json").write_text("")
-    with pytest.raises(ValueError, match=r"seconds\.json is damaged"):
-        Run(CONFIG, tmp_path, Console(), "hash")
 
 
 def test_a_run_keeps_its_dataset_and_whether_it_streams(tmp_path):

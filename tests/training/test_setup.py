@@ -42,24 +42,22 @@ def environment(*instructions):
     return SimpleNamespace(instructions=instructions, robot=SimpleNamespace(num_joints=6))
 
 
-def load_dummy(*_, **__):
-    return random_backbone(Pi0Config.dummy()), ""
-
-
 def collect(config, *_):
     return {task: random_episodes(task, 0) for task in config.tasks}
 
 
-def prepare(config, folder, load_base=load_dummy, collect=collect, file=None):
-    """Prepare a run on the dummy backbone and random episodes."""
+def prepare(config, folder, collect=collect, file=None):
+    """Prepare a run on random episodes."""
     console = Console(file=file or io.StringIO(), width=200)
     start = time.perf_counter()
-    return setup.prepare(config, folder, console, start, load_base=load_base, collect=collect)
+    return setup.prepare(config, folder, console, start, collect=collect)
 
 
 @pytest.fixture
 def config(monkeypatch):
-    """A config without simulation."""
+    """A config without simulation, on the dummy backbone."""
+    base = random_backbone(Pi0Config.dummy()), ""
+    monkeypatch.setattr(setup, "base_model", lambda *_, **__: base)
     env = environment(*random_episodes("", 0).instructions)
     monkeypatch.setattr(setup.envs, "make", lambda *_, **__: env)
     config = dataclasses.replace(CONFIG, peft=LoRA(rank=4), targets=TARGETS)
@@ -124,8 +122,9 @@ def test_lerobot_policies_are_preprocessed_as_their_config_says(config, tmp_path
     assert found.config.inputs == inputs.OPENPI
     two_arms = dataclasses.replace(inputs.OURS, delta=(True,) * 14)
     found = random_backbone(dataclasses.replace(Pi0Config.dummy(), inputs=two_arms))
+    monkeypatch.setattr(setup, "base_model", lambda *_, **__: (found, ""))
     with pytest.raises(ValueError, match="14 entries"):
-        prepare(config, tmp_path, load_base=lambda *_, **__: (found, ""))
+        prepare(config, tmp_path)
 
 
 def test_the_chunk_length_on_the_command_line(config, tmp_path):
@@ -150,11 +149,12 @@ def test_unrolling_on_the_command_line(monkeypatch):
 
 
 @pytest.mark.slow
-def test_pi05_on_the_command_line_trains_and_acts(config, tmp_path):
+def test_pi05_on_the_command_line_trains_and_acts(config, tmp_path, monkeypatch):
     """Its fully fine-tuned base loads again, and its prompts depend on the state."""
     config = dataclasses.replace(config, peft=FullFineTuning(), model=ModelConfig(checkpoint=""))
     config = override(config, ["--model.size", "nano_pi05", "--optim.steps", "2"])
-    run = prepare(config, tmp_path, load_base=base.base_model)
+    monkeypatch.setattr(setup, "base_model", base.base_model)
+    run = prepare(config, tmp_path)
     run.devices = jax.devices()[:1]
     before = leaves(nnx.state(run.policy.model))
     train(run)
@@ -177,7 +177,7 @@ def test_pi05_on_the_command_line_trains_and_acts(config, tmp_path):
     np.testing.assert_allclose(again, actions, atol=0.05)  # the file is bf16
 
 
-def test_a_quantized_base_on_the_command_line_trains_and_acts(config, tmp_path):
+def test_a_quantized_base_on_the_command_line_trains_and_acts(config, tmp_path, monkeypatch):
     """Only adapters change; the estimate of memory counts its bytes; the policy loads again."""
     models.save(tmp_path / "base", random_backbone(Pi0Config.dummy()))
     config = dataclasses.replace(config, peft=LoRA(rank=4), model=ModelConfig())
@@ -185,7 +185,8 @@ def test_a_quantized_base_on_the_command_line_trains_and_acts(config, tmp_path):
     config = override(config, [*options, "--model.checkpoint", str(tmp_path / "base")])
     base_model = models.load(tmp_path / "base"), models.weights_hash(tmp_path / "base")
     (tmp_path / "run").mkdir()
-    run = prepare(config, tmp_path / "run", load_base=lambda *_, **__: base_model)
+    monkeypatch.setattr(setup, "base_model", lambda *_, **__: base_model)
+    run = prepare(config, tmp_path / "run")
     run.devices = jax.devices()[:1]
     _, adapters, frozen = adaptation.split(run.policy.model)
     codes = [leaf for leaf in jax.tree.leaves(frozen) if leaf.dtype == jnp.float8_e4m3fn]

@@ -47,8 +47,8 @@ def batches_sharding(mesh: Mesh) -> NamedSharding:
 def shardings(tree: Any, mesh: Mesh, minimum: int = MINIMUM_SHARDED_BYTES) -> Any:
     """Return a sharding for each array of a tree: large arrays over "fsdp", the others replicated.
 
-    The longest axis divisible by the number of devices is sharded; arrays under `minimum` bytes are
-    replicated. A sharding depends only on shape and dtype, so optimizer moments and averages of parameters are
+    The longest axis that `fsdp` divides is sharded; arrays under `minimum` bytes are replicated.
+    A sharding depends only on shape and dtype, so optimizer moments and averages of parameters are
     sharded like the parameters.
     """
 
