@@ -18,6 +18,7 @@ from envs.rendering.video import write_video
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config, ModelConfig, OptimConfig
 from lorasp_jax.dense import Dense
+from lorasp_jax.models import flow_matching
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.policies import tokenizer
@@ -69,11 +70,13 @@ class Miniature(nnx.Module):
         rngs, size = nnx.Rngs(0), self.config.action_dim
         self.inp, self.out = Dense(size, 64, rngs=rngs), Dense(64, size, rngs=rngs)
 
-    def loss(self, key, observation, actions, **_):
-        noise = jax.random.normal(key, actions.shape)
-        hidden, first = self.inp(noise + observation.state[:, None], return_aux=True)
+    def loss(self, key, observation, actions, *, noise=None, flow_time=None, **_):
+        if noise is None:
+            noise, flow_time = flow_matching.draw(key, actions)
+        noisy, velocity = flow_matching.interpolate(noise, actions, flow_time)
+        hidden, first = self.inp(noisy + observation.state[:, None], return_aux=True)
         predicted, second = self.out(jnp.tanh(hidden), return_aux=True)
-        return (predicted - actions) ** 2, {"action": {"inp": first, "out": second}}
+        return (predicted - velocity) ** 2, {"action": {"inp": first, "out": second}}
 
 
 class Terminate(Callback):

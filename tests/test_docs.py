@@ -68,20 +68,12 @@ def test_page_uses_the_method(name):
 
 
 @pytest.mark.parametrize("page", [*PAGES, *OTHERS], ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_resolve(page):
-    for link, source in LINK.findall(BLOCK.sub("", page.read_text())):
-        target = link or source
-        assert (page.parent / target).exists(), f"{page} links to {target}"
-
-
-@pytest.mark.parametrize("page", [*PAGES, *OTHERS], ids=lambda page: str(page.relative_to(ROOT)))
-def test_named_files_exist(page):
-    assert [file for file in FILE.findall(page.read_text()) if not (ROOT / file).is_file()] == []
-
-
-@pytest.mark.parametrize("page", [*PAGES, *OTHERS], ids=lambda page: str(page.relative_to(ROOT)))
-def test_named_functions_exist(page):
-    for file, name in FUNCTION.findall(page.read_text()):
+def test_what_a_page_names_exists(page):
+    text = page.read_text()
+    for link, source in LINK.findall(BLOCK.sub("", text)):
+        assert (page.parent / (link or source)).exists(), f"{page} links to {link or source}"
+    assert [file for file in FILE.findall(text) if not (ROOT / file).is_file()] == []
+    for file, name in FUNCTION.findall(text):
         tree = ast.parse((ROOT / file).read_text())
         kinds = (ast.FunctionDef, ast.ClassDef)
         defined = {node.name for node in tree.body if isinstance(node, kinds)}

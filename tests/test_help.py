@@ -22,6 +22,7 @@ SLOW = (
     "trimesh",
     "warp",
 )
+MULTITASK = ["--config", "configs/multitask.py", "--scale", "smoke"]
 COMMANDS = [
     (["train.py", "--help"], "--optim.learning-rate"),
     (["train.py", "--config", "configs/multitask.py", "--help"], "--peft.rank"),
@@ -31,8 +32,8 @@ COMMANDS = [
     (["-m", "lorasp_jax.report", "--help"], "rank-map"),
     (["-m", "lorasp_jax.extras.serving.export", "--help"], "--max-batch"),
     (["-m", "lorasp_jax.report", "rank-map", "--help"], "--task"),
-    (["train.py", "--config", "configs/multitask.py", "--tasks", "juggle"], "unknown task"),
-    (["train.py", "--config", "configs/multitask.py", "--robot", "juggle"], "unknown robot"),
+    (["train.py", *MULTITASK, "--tasks", "juggle"], "unknown task 'juggle': choose from"),
+    (["train.py", *MULTITASK, "--robot", "juggle"], "unknown robot 'juggle': choose from"),
 ]
 PROGRAM = """
 import contextlib, os, runpy, sys

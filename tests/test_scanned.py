@@ -117,10 +117,9 @@ def test_documented_training_loop(remat, scanned, tmp_path):
         ("balance", "spectral", "z"), ()
     )
     graphdef, _, frozen = lorasp_jax.split(model)
-    trained = nnx.merge(graphdef, adapters, frozen, copy=True)
-    save_adapters(tmp_path, trained)
-    loaded = load_adapters(tmp_path, base, einsums=EINSUMS)
-    np.testing.assert_array_equal(loaded(IDS), trained(IDS))
+    save_adapters(tmp_path, nnx.merge(graphdef, adapters, frozen, copy=True))
+    _, loaded, _ = lorasp_jax.split(load_adapters(tmp_path, base, einsums=EINSUMS))
+    jax.tree.map(np.testing.assert_array_equal, loaded, adapters)
     with pytest.raises(ValueError, match=r"unsupported classes: .*layers(/0)?/[qo] \(Einsum\)"):
         load_adapters(tmp_path, base)
 

@@ -142,7 +142,7 @@ def step_by_step(room, policy, key, ranges=None):
             call_key, observation, jnp.asarray(rows), num_steps=2, return_aux=True
         )
         running.append(int((~state.done).sum()))
-        ranks.append(aux["vision"]["fc1"].active_rank[0, ~state.done].mean(keepdims=True))
+        ranks.append(aux["vision"]["fc1"].active_rank[0, ~state.done].mean(0))
         for action in actions[:, :3].swapaxes(0, 1):
             state = room.step(state, action)
     return state, running, ranks

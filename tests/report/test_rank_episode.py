@@ -54,8 +54,9 @@ def policy(request, tmp_path_factory):
     return nano_policy(tmp_path_factory.mktemp("nano") / "run", NANO[request.param])
 
 
-@pytest.mark.parametrize("camera", ["side", "wrist"])
-@pytest.mark.parametrize(("row", "column"), [(0, 0), (0, 3), (2, 1), (3, 0)])
+@pytest.mark.parametrize(
+    ("camera", "row", "column"), [("side", 0, 3), ("side", 2, 1), ("wrist", 0, 0), ("wrist", 3, 0)]
+)
 def test_a_painted_patch_changes_only_its_own_rank(policy, camera, row, column):
     """Painted inside its patch, because resizing blurs the border."""
     config = policy.model.config

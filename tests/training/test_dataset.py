@@ -105,6 +105,8 @@ def test_a_streamed_run_on_eight_devices(tmp_path):
 def prepare(folder, monkeypatch, source, available=2**40, model_config=None):
     model = random_backbone(model_config or Pi0Config.dummy())
     monkeypatch.setattr(preflight, "available_bytes", lambda: available)
+    remat = "none", preflight.Memory(*6 * [0.0])
+    monkeypatch.setattr(preflight, "choose_remat", lambda *_: remat)
     evaluation = dataclasses.replace(CONFIG.evaluation, execute_steps=1)
     data = DataConfig(source=str(source))
     config = dataclasses.replace(CONFIG, data=data, evaluation=evaluation)
@@ -129,9 +131,6 @@ def test_prepare(tmp_path, monkeypatch):
     slots = np.array(run.policy.processor.robot_slots)
     np.testing.assert_allclose(known["mean"][slots], expected.action.mean(0), atol=1e-6)
     small = 2**21
-    monkeypatch.setattr(
-        preflight, "choose_remat", lambda *_: ("none", preflight.Memory(*6 * [0.0]))
-    )
     assert not prepare(tmp_path, monkeypatch, "removed, but cached", small).streams
     (tmp_path / "dataset.json").unlink()
     assert prepare(tmp_path, monkeypatch, "removed, but cached", small // 64).streams

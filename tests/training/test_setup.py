@@ -60,6 +60,8 @@ def config(monkeypatch):
     monkeypatch.setattr(setup, "base_model", lambda *_, **__: base)
     env = environment(*random_episodes("", 0).instructions)
     monkeypatch.setattr(setup.envs, "make", lambda *_, **__: env)
+    remat = "none", preflight.Memory(*6 * [0.0])
+    monkeypatch.setattr(preflight, "choose_remat", lambda *_: remat)
     config = dataclasses.replace(CONFIG, peft=LoRA(rank=4), targets=TARGETS)
     config = dataclasses.replace(
         config, evaluation=dataclasses.replace(config.evaluation, execute_steps=1)
@@ -231,7 +233,7 @@ def test_eva_on_the_command_line_uses_the_demonstrations(config, tmp_path):
 
 
 def test_eva_uses_a_streamed_dataset(config, tmp_path):
-    run = prepare(config, tmp_path)
+    run = prepare(override(config, ["--peft.initialization", "kaiming"]), tmp_path)
     table = run.policy.processor
     on_device = setup._batch_sampler(run, table, 4)(jax.random.key(0))
     run.dataset, run.streams = jax.tree.map(np.asarray, run.steps), True
