@@ -70,10 +70,7 @@ def write_report(folder: Path) -> Path:
         *(() if finished else _progress(folder, config, rows)),
         *_success(results),
         "<h2>Training</h2>",
-        _image(figures.losses(rows)) if rows else "<p>No metrics logged yet.</p>",
-        *_skipped(rows),
-        *_success_over_steps(rows),
-        *_speed(rows),
+        *_training(rows),
         *_active_rank(results, rows, config["peft"].get("rank")),
         *_media(folder, [t for t in results["tasks"] if finished or _video(folder, t).exists()]),
         "<h2>Time</h2>",
@@ -122,15 +119,20 @@ def _progress(folder: Path, config: dict[str, Any], rows: figures.Rows) -> Itera
     yield _REFRESH
 
 
-def _skipped(rows: figures.Rows) -> Iterable[str]:
-    skipped = [(row["step"], row["skipped"]) for row in rows if row.get("skipped")]
-    if skipped:
+def _training(rows: figures.Rows) -> Iterable[str]:
+    """Show losses, skipped steps and, if measured, success over the steps and speed."""
+    yield _image(figures.losses(rows)) if rows else "<p>No metrics logged yet.</p>"
+    if skipped := [(row["step"], row["skipped"]) for row in rows if row.get("skipped")]:
         total = sum(count for _, count in skipped)
         yield (
             f"<p>{total:.0f} steps were skipped because the loss or the gradient was not finite "
             f"or spiked, first logged at step {skipped[0][0]:.0f}, last at step "
             f"{skipped[-1][0]:.0f}.</p>"
         )
+    if any(name.startswith("success/") for row in rows for name in row):
+        yield _image(figures.success_over_steps(rows))
+    if summary := speed(rows):
+        yield _table(("run statistics", ""), summary.items())
 
 
 def _subtitle(config: dict[str, Any], results: dict[str, Any]) -> str:
@@ -156,22 +158,11 @@ def _success(results: dict[str, Any]) -> Iterable[str]:
         yield _table(header, ((k, *map(success_cell, v.values())) for k, v in tasks.items()))
 
 
-def _success_over_steps(rows: figures.Rows) -> Iterable[str]:
-    """Show success over steps if it was measured during training."""
-    if any(name.startswith("success/") for row in rows for name in row):
-        yield _image(figures.success_over_steps(rows))
-
-
 def success_cell(value: dict[str, Any]) -> str:
     """Format a success rate with its interval."""
     low, high = value["ci95"]
     rate = f"{100 * value['success']:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
     return f"{rate} of {value['episodes']}"
-
-
-def _speed(rows: figures.Rows) -> Iterable[str]:
-    if summary := speed(rows):
-        yield _table(("run statistics", ""), summary.items())
 
 
 def speed(rows: figures.Rows) -> dict[str, str]:

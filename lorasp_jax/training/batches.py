@@ -1,7 +1,7 @@
 """The batches of training steps: drawn from a dataset on the device, or streamed from disk."""
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import jax
@@ -113,10 +113,22 @@ class Refresh:
 class StreamedBatches:
     """Batches that are read from disk, one per call; the next one is already on the device."""
 
-    def __init__(self, batches: Iterator[RawBatch], speed: Speed) -> None:
-        """Read the first batch; batches have a leading axis of length 1."""
-        self._batches, self._speed = batches, speed
-        self._batch = next(batches)
+    def __init__(self, run: Run, mesh: jax.sharding.Mesh, start: int, speed: Speed) -> None:
+        """Read the batch of step `start`, sharded over the mesh; its leading axis has length 1."""
+        self._stream = Stream(
+            run.steps,
+            batch_size=run.config.optim.batch_size,
+            chunk=run.policy.model.config.chunk,
+            seed=run.config.seed,
+            start=start,
+            process=(jax.process_index(), jax.process_count()),
+        )
+        self._sharding, self._speed = meshes.batches_sharding(mesh), speed
+        self._batch = self._next()
+
+    def _next(self) -> RawBatch:
+        put = functools.partial(jax.make_array_from_process_local_data, self._sharding)
+        return jax.tree.map(lambda x: put(x[None]), next(self._stream))
 
     def call_size(self, count: int) -> int:  # noqa: ARG002
         """Return 1."""
@@ -133,7 +145,7 @@ class StreamedBatches:
     def prepare(self, running: Any) -> None:
         """Read the next batch."""
         with self._speed.waiting(running):
-            self._batch = next(self._batches)
+            self._batch = self._next()
 
 
 Batches: TypeAlias = DrawnBatches | StreamedBatches
@@ -147,7 +159,7 @@ def make_batches(
     `collect` is called only if `data.fresh_every` is set.
     """
     if run.streams:
-        return StreamedBatches(streamed(run, mesh, start), speed)
+        return StreamedBatches(run, mesh, start, speed)
 
     def generation(number: int) -> Steps:
         steps = run.steps
@@ -162,21 +174,3 @@ def make_batches(
     steps, last = generation(first), optim.steps - 1
     refresh = Refresh(generation, every, min(start, last), last, speed) if every else None
     return DrawnBatches(steps, mesh, optim.batch_size, run.policy.model.config.chunk, refresh)
-
-
-def streamed(run: Run, mesh: jax.sharding.Mesh, start: int) -> Iterator[RawBatch]:
-    """Return the dataset's batches from step `start` on, sharded over the devices.
-
-    They have a leading axis of length 1, see `StreamedBatches`.
-    """
-    stream = Stream(
-        run.steps,
-        batch_size=run.config.optim.batch_size,
-        chunk=run.policy.model.config.chunk,
-        seed=run.config.seed,
-        start=start,
-        process=(jax.process_index(), jax.process_count()),
-    )
-    sharding = meshes.batches_sharding(mesh)
-    put = lambda x: jax.make_array_from_process_local_data(sharding, x[None])  # noqa: E731
-    return (jax.tree.map(put, raw) for raw in stream)

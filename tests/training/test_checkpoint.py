@@ -111,18 +111,6 @@ def test_a_corrupt_file_is_never_restored_with_other_values(master, tmp_path):
     assert steps[2] >= 10  # Orbax does not need every file
 
 
-@pytest.mark.slow
-def test_corruption_at_many_positions(master, tmp_path):
-    def damages(content):
-        size, every = len(content), max(len(content) // 25, 1)
-        yield from (flipped(content, position) for position in range(0, size, every))
-        yield from (content[:cut] for cut in (0, 1, size // 3, size - 1))
-
-    steps = sweep(master, tmp_path, damages)
-    assert sum(steps.values()) > 400
-    assert min(steps.values()) > 100
-
-
 def test_nothing_changes_if_all_checkpoints_are_corrupt(folder):
     for step in (1, 2):
         (folder / f"checkpoints/{step}/meta/metadata").write_text("{}")

@@ -27,12 +27,6 @@ from tests.runs import CONFIG, leaves, make_run
 BASES = sorted(path.parent for path in Path("assets").glob("*/config.json"))
 
 
-def perturbed(run):
-    """Change every trainable parameter, as training would."""
-    run.policy = with_random_adapters(run.policy)
-    return run
-
-
 def with_random_adapters(policy):
     """Return the policy with random adapters, whose values bf16 represents exactly."""
     graphdef, adapters, frozen = adaptation.split(policy.model)
@@ -41,14 +35,20 @@ def with_random_adapters(policy):
     return Policy(nnx.merge(graphdef, jax.tree.map(randomize, adapters), frozen), policy.processor)
 
 
+def run_on_a_base(folder, method=CONFIG.peft):
+    """Make a run in `folder`/run on a base in `folder`/base."""
+    models.save(folder / "base", random_backbone(Pi0Config.dummy()))
+    model_config = dataclasses.replace(CONFIG.model, checkpoint=str(folder / "base"))
+    config = dataclasses.replace(CONFIG, model=model_config, peft=method)
+    run = make_run(folder / "run", config, models.load(folder / "base"))
+    run.base_hash = models.weights_hash(folder / "base")
+    return run
+
+
 @pytest.mark.parametrize("method", [CONFIG.peft, FullFineTuning()], ids=["adapters", "base"])
 def test_a_policy_loads(tmp_path, method):
-    models.save(tmp_path / "base", random_backbone(Pi0Config.dummy()))
-    model_config = dataclasses.replace(CONFIG.model, checkpoint=str(tmp_path / "base"))
-    config = dataclasses.replace(CONFIG, model=model_config, peft=method)
-    run = make_run(tmp_path / "run", config, models.load(tmp_path / "base"))
+    run = run_on_a_base(tmp_path, method)
     run.policy = with_random_adapters(run.policy)
-    run.base_hash = models.weights_hash(tmp_path / "base")
     with pytest.raises(ValueError, match="contains no policy: no run has finished there"):
         export.load_policy(run.folder)
     export.write(run)
@@ -88,14 +88,8 @@ def test_a_policy_loads_from_another_working_directory(tmp_path, monkeypatch, ki
 
 
 def test_the_error_for_a_missing_base_suggests_a_remedy(tmp_path, monkeypatch):
+    export.write(run_on_a_base(tmp_path))
     monkeypatch.chdir(tmp_path)
-    models.save("base", random_backbone(Pi0Config.dummy()))
-    model_config = dataclasses.replace(CONFIG.model, checkpoint="base")
-    run = make_run(
-        tmp_path / "run", dataclasses.replace(CONFIG, model=model_config), models.load("base")
-    )
-    run.base_hash = models.weights_hash("base")
-    export.write(run)
     (tmp_path / "base").rename("moved")
     message = rf"^{tmp_path / 'base'} does not exist.*; pass base= if the base of .*run has moved$"
     with pytest.raises(ValueError, match=message):
@@ -108,10 +102,7 @@ def test_the_error_for_a_missing_base_suggests_a_remedy(tmp_path, monkeypatch):
 
 
 def test_another_tokenizer_is_rejected(tmp_path, monkeypatch):
-    models.save(tmp_path / "base", random_backbone(Pi0Config.dummy()))
-    model_config = dataclasses.replace(CONFIG.model, checkpoint=str(tmp_path / "base"))
-    config = dataclasses.replace(CONFIG, model=model_config)
-    run = make_run(tmp_path / "run", config, models.load(tmp_path / "base"))
+    run = run_on_a_base(tmp_path)
     export.write(run)
     encode = tokenizer.Offline.encode
 

@@ -128,18 +128,6 @@ def test_a_run_resumes_on_another_number_of_devices(whole, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_run_resumes_in_processes_with_other_devices(tmp_path):
-    """4 -> 1 -> 8 devices, all devices of each process."""
-    moved = tmp_path / "moved"
-    for count, until, end in ((4, 4, "stopped"), (1, 8, "stopped"), (8, 99, "finished")):
-        with start_worker(moved, devices=count, until=until) as process:
-            wait_for(process, end)
-            assert process.wait(60) == 0
-    assert (moved / "checkpoints/12").exists()
-    assert_same(adapters(work(moved, 12)), adapters(work(tmp_path / "whole", 12)))
-
-
-@pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_a_signal_to_one_of_two_processes_saves_on_both(whole, tmp_path):
     """Two processes with 2 devices each; then one process with 8 resumes."""

@@ -41,8 +41,6 @@ OPTIONS = {
     "seed": ["-1", "99999999999", "x"],
     "image-size": ["0"],
     "name": ["", ".", "..", "/tmp/x", "a/b", "a/", "a\nb", "a\udcff", "n" * 201, "ä" * 101],
-    "tasks": ["juggle"],
-    "robot": ["pipper"],
     "checkpoint-every": ["0"],
     "scale": ["gpu", None],
     "method": ["lorra", None],

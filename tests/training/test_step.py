@@ -13,10 +13,9 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.data.batches import Batch, flatten, sample_batch
 from lorasp_jax.models import flow_matching
 from lorasp_jax.peft import Aux, LoRA
-from lorasp_jax.training.loop import train
 from lorasp_jax.training.step import active_ranks, gradients, init_state, train_step
 from tests.models.random_models import with_noise
-from tests.runs import CONFIG, Miniature, Terminate, leaves, make_run
+from tests.runs import CONFIG, Miniature, leaves, make_run
 
 
 def test_active_ranks_by_tower_and_by_layer():
@@ -140,22 +139,3 @@ def test_the_moving_average_is_updated_and_evaluated(small):
         assert (updated[name] != old).any()
     assert after.eval_adapters is after.average
     assert init_state(adapters, optimizer).eval_adapters is not None
-
-
-@pytest.mark.slow
-def test_a_run_with_accumulation_and_average_resumes_exactly(tmp_path):
-    optim = dataclasses.replace(CONFIG.optim, accumulate=2, ema=0.5)
-    config = dataclasses.replace(CONFIG, optim=optim, targets=("action_out_proj",))
-    whole, plain = make_run(tmp_path / "whole", config), make_run(tmp_path / "plain", config)
-    plain.config = dataclasses.replace(config, optim=dataclasses.replace(optim, ema=0.0))
-    train(whole)
-    train(plain)
-    halved = tmp_path / "halved"
-    with pytest.raises(KeyboardInterrupt):
-        train(make_run(halved, config), [Terminate()])
-    resumed = make_run(halved, config)
-    train(resumed, resume=True)
-    ends = [leaves(adaptation.split(run.policy.model)[1]) for run in (whole, resumed, plain)]
-    for name, value in ends[0].items():
-        np.testing.assert_array_equal(ends[1][name], value, err_msg=name)
-        assert (ends[2][name] != value).any()
