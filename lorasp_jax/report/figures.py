@@ -100,7 +100,7 @@ def _curves(
 ) -> Figure:
     """Plot metrics over steps; `curves` maps a label to a metric and a color."""
     figure = Figure(figsize=(9, 3), layout="constrained")
-    axes = figure.subplots()
+    axes: Any = figure.subplots()
     for label, (name, color) in curves.items():
         _line(axes, rows, name, color, label)
     axes.set_ylim(0, top)

@@ -18,6 +18,7 @@ OPTIONS = {
     "optim.accumulate": ["0"],
     "optim.ema": ["1", "-1", "nan"],
     "optim.spike": ["0.5", "inf"],
+    "optim.max-skipped": ["0"],
     "optim.rtc-max-delay": ["-1", "1.5"],
     "optim.stepz": ["3"],
     "auxiliary.spectral": ["-1", "nan"],
