@@ -15,6 +15,8 @@ OTHERS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("studi
 """Pages whose links and files are checked, but not their examples."""
 WITHOUT_EXAMPLES = {"runs", "launch", "benchmarks", "architecture", "libero"}
 """Reference pages, and one about another package."""
+SLOW = {"serving", "latency", "reinforcement_learning"}
+"""Pages about extras, which have tests of their own."""
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 OPTION = re.compile(r"^\| `(\w+)` \| `([^`]+)` \| \S", re.MULTILINE)
 LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)|src(?:set)?=\"([^\":]+)\"")
@@ -40,6 +42,17 @@ def examples(page):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_examples_import_what_exists(page):
+    nodes = ast.walk(ast.parse(examples(page)))
+    imports = [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
+    exec(compile(ast.Module(imports, []), str(page), "exec"), {})
+
+
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, marks=[pytest.mark.slow] * (page.stem in SLOW)) for page in PAGES],
+    ids=lambda page: page.stem,
+)
 def test_examples_run(page, tmp_path, monkeypatch):
     code = examples(page)
     assert bool(code.strip()) != (page.stem in WITHOUT_EXAMPLES), f"{page} has no example"
