@@ -14,6 +14,7 @@ The paper does not say how it counts. These rules reproduce its percentages to t
   instead of 9.2 and 17.1.
 """
 
+import functools
 import math
 
 import jax
@@ -74,6 +75,7 @@ def parameter_column(table: str) -> dict[tuple[str, str], str]:
     return column
 
 
+@functools.cache
 def linear_layers(config: BackboneConfig) -> tuple[Shapes, int]:
     """Return the layers that the paper adapts, and the parameter count without adapters."""
     model = nnx.eval_shape(lambda: config.create(nnx.Rngs(0)))
@@ -90,6 +92,7 @@ def linear_layers(config: BackboneConfig) -> tuple[Shapes, int]:
     return shapes, total
 
 
+@functools.cache
 def _size(method: Method, d_in: int, d_out: int) -> int:
     kernel = jax.ShapeDtypeStruct((d_in, d_out), jnp.float32)
     params = jax.eval_shape(lambda key: method.init(key, kernel)[0], jax.random.key(0))

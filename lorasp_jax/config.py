@@ -1,6 +1,5 @@
 """Experiment config as frozen dataclasses; files in `configs/` return a `Config` per scale."""
 
-import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -18,6 +17,12 @@ def _at_least(low: int, owner: object, *names: str) -> None:
     for name in names:
         if getattr(owner, name) < low:
             raise ValueError(f"{name} must be at least {low}, got {getattr(owner, name)}")
+
+
+def _require(holds: bool, rule: str, value: object) -> None:
+    """Raise ValueError unless the rule holds."""
+    if not holds:
+        raise ValueError(f"{rule}, got {value}")
 
 
 def _check_name(name: str) -> None:
@@ -75,7 +80,6 @@ class ModelConfig:
         return self.checkpoint.replace("{backbone}", self.backbone).replace("{size}", self.size)
 
     def __post_init__(self) -> None:
-        """Validate the fields."""
         fields.check_fields(self)
         _at_least(0, self, "max_tokens", "chunk")
 
@@ -100,7 +104,6 @@ class DataConfig:
     trains; a multiple of log_every. 0: never."""
 
     def __post_init__(self) -> None:
-        """Validate the fields."""
         fields.check_fields(self)
         _at_least(1, self, "episodes", "num_envs")
         _at_least(0, self, "action_noise", "fresh_every")
@@ -146,19 +149,14 @@ class OptimConfig:
     only non-finite steps."""
 
     def __post_init__(self) -> None:
-        """Validate the fields."""
         fields.check_fields(self)
         _at_least(1, self, "steps", "batch_size", "accumulate", "max_skipped")
         _at_least(0, self, "learning_rate", "final_learning_rate", "warmup_steps")
         _at_least(0, self, "weight_decay", "state_noise", "rtc_max_delay")
-        if self.clip_norm <= 0:
-            raise ValueError(f"clip_norm must be above 0, got {self.clip_norm}")
-        if not 0 <= self.b2 < 1:
-            raise ValueError(f"b2 must lie in [0, 1), got {self.b2}")
-        if self.spike and not 1 < self.spike < math.inf:
-            raise ValueError(f"spike must be 0 or more than 1, got {self.spike}")
-        if not 0 <= self.ema < 1:
-            raise ValueError(f"ema must lie in [0, 1), got {self.ema}")
+        _require(self.clip_norm > 0, "clip_norm must be above 0", self.clip_norm)
+        _require(0 <= self.b2 < 1, "b2 must lie in [0, 1)", self.b2)
+        _require(not self.spike or self.spike > 1, "spike must be 0 or more than 1", self.spike)
+        _require(0 <= self.ema < 1, "ema must lie in [0, 1)", self.ema)
 
 
 @dataclass(frozen=True)
@@ -177,11 +175,9 @@ class AuxiliaryConfig:
     """Fraction of the steps over which the weights rise linearly from zero."""
 
     def __post_init__(self) -> None:
-        """Validate the fields."""
         fields.check_fields(self)
         _at_least(0, self, *AUXILIARY_WEIGHTS)
-        if not 0 <= self.warmup <= 1:
-            raise ValueError(f"warmup must lie in [0, 1], got {self.warmup}")
+        _require(0 <= self.warmup <= 1, "warmup must lie in [0, 1]", self.warmup)
 
 
 @dataclass(frozen=True)
@@ -208,15 +204,12 @@ class EvaluationConfig:
         return min(self.episodes, self.num_envs)
 
     def __post_init__(self) -> None:
-        """Validate the fields."""
         fields.check_fields(self)
         _at_least(1, self, "episodes", "num_envs", "execute_steps", "denoise_steps")
-        if self.every < 0:
-            raise ValueError(f"evaluation.every must be at least 0, got {self.every}")
-        if self.episodes % self.worlds:
-            raise ValueError(
-                f"episodes must be a multiple of num_envs, got {self.episodes} and {self.num_envs}"
-            )
+        _at_least(0, self, "every")
+        counts = f"{self.episodes} and {self.num_envs}"
+        rule = "episodes must be a multiple of num_envs"
+        _require(self.episodes % self.worlds == 0, rule, counts)
 
 
 @dataclass(frozen=True)
@@ -274,24 +267,17 @@ class Config:
         return bool(every) and step // every > previous // every and step < self.optim.steps
 
     def __post_init__(self) -> None:
-        """Validate the fields and their combinations."""
         fields.check_fields(self)
         fields.check_fields(self.peft, "peft.")
         fields.check_fields(self.scene, "scene.")
         _check_name(self.name)
         _at_least(1, self, "fsdp", "log_every", "checkpoint_every", "image_size")
-        if self.control_dt <= 0 or not 0 <= self.seed < 2**32:
-            raise ValueError(
-                "control_dt must be above 0 and seed must lie in [0, 2**32), "
-                f"got {self.control_dt} and {self.seed}"
-            )
+        _require(self.control_dt > 0, "control_dt must be above 0", self.control_dt)
+        _require(0 <= self.seed < 2**32, "seed must lie in [0, 2**32)", self.seed)
         if self.model.base_dtype and self.peft.trains_base:
             raise ValueError("model.base_dtype must be empty for full, which trains the base")
         self.scene.check(self.control_dt)
-        if self.data.fresh_every % self.log_every:
-            raise ValueError(
-                f"data.fresh_every must be a multiple of log_every, got {self.data.fresh_every} "
-                f"and {self.log_every}"
-            )
-        if not self.tasks or len(set(self.tasks)) < len(self.tasks):
-            raise ValueError(f"tasks must be non-empty and unique, got {self.tasks}")
+        every, rule = self.data.fresh_every, "data.fresh_every must be a multiple of log_every"
+        _require(every % self.log_every == 0, rule, f"{every} and {self.log_every}")
+        unique = 0 < len(self.tasks) == len(set(self.tasks))
+        _require(unique, "tasks must be non-empty and unique", self.tasks)

@@ -10,13 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
+from PIL import Image
 from rich.console import Console
 
 from envs.datasets.episodes import Episodes
+from envs.rendering.video import write_video
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config, ModelConfig, OptimConfig
 from lorasp_jax.dense import Dense
-from lorasp_jax.evaluation import video
+from lorasp_jax.models import flow_matching
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.policies import tokenizer
@@ -68,11 +70,13 @@ class Miniature(nnx.Module):
         rngs, size = nnx.Rngs(0), self.config.action_dim
         self.inp, self.out = Dense(size, 64, rngs=rngs), Dense(64, size, rngs=rngs)
 
-    def loss(self, key, observation, actions, **_):
-        noise = jax.random.normal(key, actions.shape)
-        hidden, first = self.inp(noise + observation.state[:, None], return_aux=True)
+    def loss(self, key, observation, actions, *, noise=None, flow_time=None, **_):
+        if noise is None:
+            noise, flow_time = flow_matching.draw(key, actions)
+        noisy, velocity = flow_matching.interpolate(noise, actions, flow_time)
+        hidden, first = self.inp(noisy + observation.state[:, None], return_aux=True)
         predicted, second = self.out(jnp.tanh(hidden), return_aux=True)
-        return (predicted - actions) ** 2, {"action": {"inp": first, "out": second}}
+        return (predicted - velocity) ** 2, {"action": {"inp": first, "out": second}}
 
 
 class Terminate(Callback):
@@ -148,6 +152,6 @@ def finish(folder: Path) -> Path:
         log.write(step, {"task": 1 / step, "spectral": 0.1, "active_rank/vision": 4.0})
     log.close()
     frames = np.random.default_rng(0).integers(0, 255, (4, 32, 64, 3), np.uint8)
-    video.write_image(folder / "cameras_press.png", frames[0])
-    video.write_video(folder / "rollout_press.mp4", frames, fps=10)
+    Image.fromarray(frames[0]).save(folder / "cameras_press.png")
+    write_video(folder / "rollout_press.mp4", frames, fps=10)
     return folder

@@ -2,14 +2,12 @@
 
 import argparse
 import functools
-import io
 import json
 
 import jax
 import pytest
-from rich.console import Console
 
-from benchmarks import compile_time, data, deployment, long_run, measuring, scaling, serving
+from benchmarks import compile_time, data, deployment, long_run, scaling
 from benchmarks.deployment import Case
 from lorasp_jax import peft
 from lorasp_jax.data.cache import Cache
@@ -58,42 +56,12 @@ def test_long_run(capsys):
     assert "5 episodes" in capsys.readouterr().out
 
 
-def test_tables_fit_a_terminal():
-    row = {
-        "task": "pick_place",
-        "backend": "jax",
-        "batch": 8192,
-        "compile s": 123.4,
-        "physics/s": 13_880_000.0,
-        "control/s": 694_131.0,
-        "seeing/s": 337_390.0,
-        "MiB": 12_345.0,
-        "over C": 0.0123,
-    }
-    console = Console(width=80, record=True, file=io.StringIO())
-    measuring.print_table(console, [row])
-    text = console.export_text()
-    assert "…" not in text
-    assert "pick_place jax 8192 123 13.9 M 694 k 337 k 12.3 k 0.0123" in " ".join(text.split())
-
-
 def test_data_reading(tmp_path):
     row = data.read_cache(tmp_path, 500, (4, 6), batch=8, batches=3)
     assert (row["images"], row["batch"]) == ("6x4", 8)
     assert row["windows/s"] > 0
     cache = Cache(tmp_path / "4x6")
     assert (len(cache), cache.num_steps, cache.cameras["wrist"]) == (2, 500, [4, 6])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("codec", "size"), [("AV1", 13), ("H.264", 5)])
-def test_data_import(tmp_path, codec, size, capfd):
-    data.record(tmp_path / codec, 2, codec)
-    assert not capfd.readouterr().err
-    row = data.import_dataset(tmp_path, codec, 64)
-    assert row["stored as"] == "64x48"
-    assert row["images/s"] == 2 * row["steps/s"]
-    assert data.decode(tmp_path, codec)["kB/image"] == pytest.approx(size, rel=0.3)
 
 
 @pytest.mark.slow
@@ -118,24 +86,16 @@ def test_scaling(monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # qwix uses deprecated Flax APIs
-def test_compile_time(tmp_path, capsys):
-    sizes = ["--depth", "2", "--width", "16", "--tokens", "8", "--rank", "4", "--repeats", "1"]
+def test_compile_time(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(peft, "names", lambda: ("lora", "lora_sp"))
+    monkeypatch.setattr(jax, "clear_caches", lambda: None)  # other tests go on in this process
+    monkeypatch.setattr(jax.config, "update", lambda *_: None)
+    sizes = ["--depth", "1", "--width", "16", "--tokens", "8", "--rank", "4", "--repeats", "1"]
     compile_time.main([*sizes, "--json", str(tmp_path / "results.json")])
     rows = json.loads((tmp_path / "results.json").read_text())["rows"]
     assert {"bare", *peft.names()} <= {row["model"] for row in rows}
     assert rows[0]["ratio"] == 1
     assert "lora_sp" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_serving():
-    # A batch takes so long that this holds on a machine busy with other tests, too.
-    command = serving.waiting_command(image_size=16, cameras=1, seconds=0.1)
-    (one, times), (eight, times_of_eight) = serving.measure(command, calls=10)
-    assert (times.shape, times_of_eight.shape) == ((10, 3), (80, 3))
-    assert (times[:, 0] > times[:, 1]).all()
-    assert (times[:, 1] >= 100).all()
-    assert eight > 2 * one
 
 
 DUMMY = argparse.Namespace(
@@ -153,10 +113,9 @@ def test_merged_adapters_run_the_program_of_the_base():
     config = deployment.sized("pi0", DUMMY)
     text = {
         adapters: deployment.lowered(Case("pi0", adapters, 1), config, 16)[2].as_text()
-        for adapters in ("none", "merged", "whole", "half")
+        for adapters in ("none", "merged", "whole")
     }
-    assert text["none"] == text["merged"]
-    assert len({*text.values()}) == 3
+    assert text["none"] == text["merged"] != text["whole"]
 
 
 def test_half_of_the_bank_is_smaller():

@@ -15,6 +15,8 @@ OTHERS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("studi
 """Pages whose links and files are checked, but not their examples."""
 WITHOUT_EXAMPLES = {"runs", "launch", "benchmarks", "architecture", "libero"}
 """Reference pages, and one about another package."""
+SLOW = {"serving", "latency", "reinforcement_learning"}
+"""Pages about extras, which have tests of their own."""
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 OPTION = re.compile(r"^\| `(\w+)` \| `([^`]+)` \| \S", re.MULTILINE)
 LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)|src(?:set)?=\"([^\":]+)\"")
@@ -40,6 +42,17 @@ def examples(page):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_examples_import_what_exists(page):
+    nodes = ast.walk(ast.parse(examples(page)))
+    imports = [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
+    exec(compile(ast.Module(imports, []), str(page), "exec"), {})
+
+
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, marks=[pytest.mark.slow] * (page.stem in SLOW)) for page in PAGES],
+    ids=lambda page: page.stem,
+)
 def test_examples_run(page, tmp_path, monkeypatch):
     code = examples(page)
     assert bool(code.strip()) != (page.stem in WITHOUT_EXAMPLES), f"{page} has no example"
@@ -68,20 +81,12 @@ def test_page_uses_the_method(name):
 
 
 @pytest.mark.parametrize("page", [*PAGES, *OTHERS], ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_resolve(page):
-    for link, source in LINK.findall(BLOCK.sub("", page.read_text())):
-        target = link or source
-        assert (page.parent / target).exists(), f"{page} links to {target}"
-
-
-@pytest.mark.parametrize("page", [*PAGES, *OTHERS], ids=lambda page: str(page.relative_to(ROOT)))
-def test_named_files_exist(page):
-    assert [file for file in FILE.findall(page.read_text()) if not (ROOT / file).is_file()] == []
-
-
-@pytest.mark.parametrize("page", [*PAGES, *OTHERS], ids=lambda page: str(page.relative_to(ROOT)))
-def test_named_functions_exist(page):
-    for file, name in FUNCTION.findall(page.read_text()):
+def test_what_a_page_names_exists(page):
+    text = page.read_text()
+    for link, source in LINK.findall(BLOCK.sub("", text)):
+        assert (page.parent / (link or source)).exists(), f"{page} links to {link or source}"
+    assert [file for file in FILE.findall(text) if not (ROOT / file).is_file()] == []
+    for file, name in FUNCTION.findall(text):
         tree = ast.parse((ROOT / file).read_text())
         kinds = (ast.FunctionDef, ast.ClassDef)
         defined = {node.name for node in tree.body if isinstance(node, kinds)}

@@ -33,21 +33,6 @@ def test_figure_is_redrawn_from_saved_measurements(script, tmp_path):
     assert min(sizes) > 50_000
 
 
-@pytest.mark.parametrize("size", [16, 128])
-def test_figure_supports_any_bank_and_image_size(script, tmp_path, size):
-    figure, rng = script("lora_sp"), np.random.default_rng(0)
-    scores = rng.random((2, size))
-    measurements = {
-        "image": np.zeros((64, 64, 3), np.uint8),
-        "active_rank": rng.integers(1, size, (8, 8)),
-        "token": np.array([0, 63]),
-        "scores": scores,
-        "mask": scores > 0.5,
-        "energy_target": np.array(0.9),
-    }
-    figure.draw(measurements, figure.SCHEMES["light"], tmp_path / "figure.svg")
-
-
 def test_short_videos_hold_their_last_image_and_success_gets_a_border(script):
     films = script("films")
 

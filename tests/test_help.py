@@ -4,8 +4,6 @@ import re
 import subprocess
 import sys
 
-import pytest
-
 from tests import ROOT
 
 SLOW = (
@@ -21,65 +19,54 @@ SLOW = (
     "trimesh",
     "warp",
 )
-COMMANDS = {
-    "train": (["train.py", "--help"], "--optim.learning-rate"),
-    "train a config": (["train.py", "--config", "configs/multitask.py", "--help"], "--peft.rank"),
-    "data": (["-m", "lorasp_jax.data", "--help"], "inspect"),
-    "data inspect": (["-m", "lorasp_jax.data", "inspect", "--help"], "--state-numbers"),
-    "deploy": (["-m", "lorasp_jax.extras.deployment", "--help"], "--save"),
-    "report": (["-m", "lorasp_jax.report", "--help"], "rank-map"),
-    "export": (["-m", "lorasp_jax.extras.serving.export", "--help"], "--max-batch"),
-    "rank maps": (["-m", "lorasp_jax.report", "rank-map", "--help"], "--task"),
-}
+MULTITASK = ["--config", "configs/multitask.py", "--scale", "smoke"]
+COMMANDS = [
+    (["train.py", "--help"], "--optim.learning-rate"),
+    (["train.py", "--config", "configs/multitask.py", "--help"], "--peft.rank"),
+    (["-m", "lorasp_jax.data", "--help"], "inspect"),
+    (["-m", "lorasp_jax.data", "inspect", "--help"], "--state-numbers"),
+    (["-m", "lorasp_jax.extras.deployment", "--help"], "--save"),
+    (["-m", "lorasp_jax.report", "--help"], "rank-map"),
+    (["-m", "lorasp_jax.extras.serving.export", "--help"], "--max-batch"),
+    (["-m", "lorasp_jax.report", "rank-map", "--help"], "--task"),
+    (["train.py", *MULTITASK, "--tasks", "juggle"], "unknown task 'juggle': choose from"),
+    (["train.py", *MULTITASK, "--robot", "juggle"], "unknown robot 'juggle': choose from"),
+]
 PROGRAM = """
-import atexit, runpy, sys
+import contextlib, os, runpy, sys
+from jax._src import xla_bridge
+from lorasp_jax.cli import train
 
-def report():
-    from jax._src import xla_bridge
+def leave(code):
+    raise SystemExit(code)
+
+os._exit = leave
+for arguments in {commands}:
+    print("command:", *arguments)
+    sys.argv = arguments[arguments[0] == "-m" :]
+    with contextlib.suppress(SystemExit):
+        if arguments[0] == "-m":
+            runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
+        else:
+            runpy.run_path(sys.argv[0], run_name="__main__")
     started = ["a JAX backend"] if xla_bridge.backends_are_initialized() else []
     print("slow:", *[name for name in {slow} if name in sys.modules], *started)
-
-atexit.register(report)
-sys.argv = {arguments}
-if sys.argv[0] == "-m":
-    del sys.argv[0]
-    runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
-else:
-    runpy.run_path(sys.argv[0], run_name="__main__")
 """
 
 
-def assert_nothing_slow(process):
-    assert re.search(r"^slow:$", process.stdout, re.MULTILINE), process.stdout.splitlines()[-1]
-
-
-def run(arguments):
-    program = PROGRAM.format(slow=SLOW, arguments=arguments)
-    return subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_help_is_fast(name):
-    arguments, option = COMMANDS[name]
-    process = run(arguments)
-    assert process.returncode == 0, process.stderr
-    assert option in process.stdout
-    assert_nothing_slow(process)
-
-
-@pytest.mark.parametrize("option", ["--tasks", "--robot"])
-def test_unknown_name_fails_before_slow_imports(option):
-    parse = "from lorasp_jax.training.overrides import parse; parse"
-    arguments = f"['--config', 'configs/multitask.py', '--scale', 'smoke', '{option}', 'juggle']"
-    program = PROGRAM.partition("sys.argv")[0].format(slow=SLOW)
-    process = subprocess.run(
-        [sys.executable, "-c", f"{program}\n{parse}({arguments})"],
+def test_help_and_unknown_names_are_fast():
+    """In one process, whose modules add up."""
+    program = PROGRAM.format(slow=SLOW, commands=[arguments for arguments, _ in COMMANDS])
+    done = subprocess.run(
+        [sys.executable, "-c", program],
         cwd=ROOT,
-        capture_output=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
         text=True,
         check=False,
     )
-    assert "'juggle': choose from" in process.stderr
-    assert_nothing_slow(process)
+    _, *parts = re.split("^command: ", done.stdout, flags=re.MULTILINE)
+    assert len(parts) == len(COMMANDS), done.stdout
+    for part, (arguments, expected) in zip(parts, COMMANDS, strict=True):
+        assert expected in part, arguments
+        assert re.search(r"^slow:$", part, re.MULTILINE), part.splitlines()[-1]

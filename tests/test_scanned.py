@@ -11,7 +11,6 @@ from flax import nnx
 import lorasp_jax
 from lorasp_jax.adapters.io.native import load_adapters, save_adapters
 from lorasp_jax.peft import LoRASP
-from tests.nets import call
 
 WIDTH, HEADS, DEPTH, VOCABULARY = 4, 2, 3, 7
 SP = LoRASP(rank=4, hidden_width=2)
@@ -118,10 +117,9 @@ def test_documented_training_loop(remat, scanned, tmp_path):
         ("balance", "spectral", "z"), ()
     )
     graphdef, _, frozen = lorasp_jax.split(model)
-    trained = nnx.merge(graphdef, adapters, frozen, copy=True)
-    save_adapters(tmp_path, trained)
-    loaded = load_adapters(tmp_path, base, einsums=EINSUMS)
-    np.testing.assert_array_equal(call(loaded, IDS), call(trained, IDS))
+    save_adapters(tmp_path, nnx.merge(graphdef, adapters, frozen, copy=True))
+    _, loaded, _ = lorasp_jax.split(load_adapters(tmp_path, base, einsums=EINSUMS))
+    jax.tree.map(np.testing.assert_array_equal, loaded, adapters)
     with pytest.raises(ValueError, match=r"unsupported classes: .*layers(/0)?/[qo] \(Einsum\)"):
         load_adapters(tmp_path, base)
 

@@ -23,7 +23,7 @@ from lorasp_jax import models
 from lorasp_jax.base import compilation_cache as cache
 from lorasp_jax.base import hub
 from lorasp_jax.evaluation import make_rollout
-from lorasp_jax.evaluation.rollout import Rollout
+from lorasp_jax.evaluation.programs import Rollout
 from lorasp_jax.policies import Policy
 from lorasp_jax.training import load_policy
 from lorasp_jax.training.run_folder import read_json
@@ -105,7 +105,7 @@ def record_task(policies: list[Policy], metadata: dict, task: str, key: jax.Arra
         image_size=policies[0].processor.image_size,
         control_dt=metadata["control_dt"],
     )
-    rollout = jax.jit(make_rollout(env))
+    rollout = make_rollout(env)
     before, after = (rollout(with_prompts(policy, env), key) for policy in policies)
     improved = np.asarray(after.success & ~before.success)
     world = int(np.argmax(improved))

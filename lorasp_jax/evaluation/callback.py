@@ -4,17 +4,16 @@ import contextlib
 import functools
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+from PIL import Image
 from rich.progress import Progress
 
 from envs.env import Env
 from envs.physics import physics
-from envs.scene.randomization import Draw
-from envs.state import Poses
+from envs.rendering.video import side_by_side
 from lorasp_jax.base import messages
 from lorasp_jax.base.bars import bars
 from lorasp_jax.base.writing import atomic_file
@@ -37,27 +36,13 @@ class Evaluation(Callback):
 
     The first evaluation measures the base, since new adapters leave its outputs unchanged. The
     final evaluation uses other layouts than the earlier ones; both depend only on the seed and the
-    task. Compiled programs are shared, see `programs.split_rollout`. Videos are rendered in the
+    task. Compiled programs are shared, see `programs`. Videos are rendered in the
     background during training, in the foreground after it.
     """
 
-    def __init__(
-        self,
-        compile_rollout: Callable[[Run, str], tuple[Env, Callable]] = compiled_rollout,
-        evaluate: Callable[..., Result] = evaluate,
-        write_video: Callable[[Env, Poses, Path, Draw | None], None] | None = video.write_episode,
-    ) -> None:
-        """Create the callback; nothing compiles until the first evaluation.
-
-        Args:
-            compile_rollout: (run, task) -> the task's environment and its rollout, whose first
-                call compiles.
-            evaluate: evaluates a policy, like `results.evaluate`.
-            write_video: renders an episode and writes the video to a file, like
-                `video.write_episode`; None: no videos and images.
-        """
-        self._compile_rollout, self._evaluate = compile_rollout, evaluate
-        self._write_video = write_video
+    def __init__(self, *, media: bool = True) -> None:
+        """Create the callback; `media`: whether to write videos and images."""
+        self._media = media
         self._rollouts: dict[str, tuple[Env, Callable]] = {}
         self._video_thread = ThreadPoolExecutor(1)
         self._pending_videos: Future | None = None
@@ -74,7 +59,7 @@ class Evaluation(Callback):
 
         def compile_task(task: str) -> None:
             with messages.announce(f"the evaluation of {task}"):
-                env, rollout = self._compile_rollout(run, task)
+                env, rollout = compiled_rollout(run, task)
                 rollout.compile(policy)
                 jax.block_until_ready(rollout(policy, jax.random.key(0), calls=1))
             self._rollouts[task] = env, rollout
@@ -114,14 +99,14 @@ class Evaluation(Callback):
 
     def _write_media(self, run: Run, results: dict[str, Result]) -> None:
         """Write each task's video and the initial camera images of its first demonstration."""
-        if self._write_video is None:
+        if not self._media:
             return
         for task, result in results.items():
             images = {name: np.asarray(i[0, 0]) for name, i in run.episodes[task].image.items()}
-            video.write_image(run.folder / f"cameras_{task}.png", video.side_by_side(images))
+            Image.fromarray(side_by_side(images)).save(run.folder / f"cameras_{task}.png")
             with atomic_file(run.folder / f"rollout_{task}.mp4") as unfinished:
                 env = self._rollouts[task][0]
-                self._write_video(env, result.poses, unfinished, result.draw)
+                video.write_episode(env, result.poses, unfinished, result.draw)
 
     def _evaluate_tasks(self, run: Run, when: str, episodes: int = 0) -> dict[str, Result]:
         """Evaluate all tasks, concurrently unless the physics runs in Warp.
@@ -166,9 +151,9 @@ class Evaluation(Callback):
                 progress.update(bar, completed=done, description=f"evaluating {task} {when}")
 
             if task not in self._rollouts:
-                self._rollouts[task] = self._compile_rollout(run, task)
+                self._rollouts[task] = compiled_rollout(run, task)
             env, rollout = self._rollouts[task]
-            return self._evaluate(policy, env, key, episodes, rollout=rollout, progress=report)
+            return evaluate(policy, env, key, episodes, rollout=rollout, progress=report)
 
 
 class NoEvaluation(Callback):

@@ -1,7 +1,7 @@
-"""Rollouts from separate programs: tasks share those of a policy, policies those of a task.
+"""Closed-loop rollouts: observe, predict a chunk, execute part of it, repeat.
 
-Compiling a rollout takes longer than running it, and a jitted `make_rollout` compiles the policy
-again for each task, and the physics again for each method.
+Compiling takes longer than running, so policy and world have separate programs: tasks share those
+of a policy, policies those of a task.
 """
 
 import dataclasses
@@ -17,20 +17,47 @@ import numpy as np
 import envs
 from envs import traced
 from envs.env import Env
+from envs.scene.randomization import Draw
 from envs.scene.ranges import Randomization
 from envs.state import Poses, State
 from lorasp_jax.base import fast_cpu
-from lorasp_jax.evaluation import rollout
-from lorasp_jax.evaluation.rollout import Rollout, act, as_rollout, num_calls, predict
+from lorasp_jax.evaluation import metrics
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import RawObservation
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.run import Run
 
+RECORDED_WORLDS = 8
+"""Number of worlds whose poses are recorded; one of them becomes the video."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Rollout:
+    """One batch of episodes.
+
+    Attributes:
+        success: `[W]` bool.
+        steps: `[W]` int32, control steps up to success or the time limit.
+        running: `[calls]` int32, number of unfinished worlds.
+        active_rank: `[calls, L]` per linear layer, mean over tokens and unfinished worlds.
+        active_rank_histogram: `[calls, R + 1]` int32 per tower; see `metrics.rank_histogram`. R is
+            the largest adapter rank.
+        poses: poses of the first worlds at every control step, leading axes `[time, worlds]`.
+        draw: randomized values of these worlds, leading axis `[worlds]`; None without ranges.
+    """
+
+    success: jax.Array
+    steps: jax.Array
+    running: jax.Array
+    active_rank: metrics.LayerRanks
+    active_rank_histogram: dict[str, jax.Array]
+    poses: Poses
+    draw: Draw | None
+
 
 @dataclasses.dataclass(frozen=True)
 class SplitRollout:
-    """A function like a jitted `make_rollout`, with equal results up to rounding.
+    """A function (policy, key) that runs a batch of episodes; see `make_rollout`.
 
     One program samples a policy's chunk; it is shared by all environments with as many worlds and
     equal cameras. Three programs reset, render and step the environment; they are shared by all
@@ -43,15 +70,35 @@ class SplitRollout:
     ranges: Randomization | None
 
     def __call__(self, policy: Policy, key: jax.Array, calls: int | None = None) -> Rollout:
-        """Run `env.num_envs` episodes of `calls` policy calls, by default of the most they need."""
-        most = num_calls(self.env, policy, self.execute_steps)
+        """Run `env.num_envs` episodes of `calls` policy calls, by default of the most they need.
+
+        Raises:
+            ValueError: chunks have fewer than `execute_steps` actions, or the policy has no prompt
+                for one of the instructions.
+        """
+        chunk = policy.model.config.chunk
+        if not 1 <= self.execute_steps <= chunk:
+            raise ValueError(
+                f"execute_steps must be from 1 to the chunk length ({chunk}), "
+                f"got {self.execute_steps}"
+            )
+        most = -(-self.env.max_steps // self.execute_steps)
         worlds = Worlds(self.env, policy, key, self.ranges)
         records = []
         for call in range(calls or most):
             actions, ranks = worlds.predict(call, denoise_steps=self.denoise_steps)
             records.append((worlds.act(actions, self.execute_steps), *ranks))
-        state, records = jax.device_get((worlds.state, records))
-        return as_rollout(state, *jax.tree.map(lambda *values: np.stack(values), *records))
+        info, records = jax.device_get((worlds.state.info, records))
+        poses, ranks, histogram, running = jax.tree.map(lambda *x: np.stack(x), *records)
+        return Rollout(
+            success=info["success"],
+            steps=info["steps"],
+            running=running,
+            active_rank=ranks,
+            active_rank_histogram=histogram,
+            poses=jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), poses),
+            draw=jax.tree.map(lambda x: x[:RECORDED_WORLDS], info["draw"]),
+        )
 
     def compile(self, policy: Policy) -> None:
         """Compile all programs at once, whereas the first call compiles one after the other."""
@@ -79,14 +126,18 @@ class SplitRollout:
                 compiled.result()
 
 
-def split_rollout(
+def make_rollout(
     env: Env,
     *,
     execute_steps: int = 5,
     denoise_steps: int = 10,
     ranges: Randomization | None = None,
 ) -> SplitRollout:
-    """Create a rollout from separate programs; see `SplitRollout` and `make_rollout`."""
+    """Create a function (policy, key) that runs `env.num_envs` episodes.
+
+    Every `execute_steps` control steps, the policy observes and samples a new chunk in
+    `denoise_steps` Euler steps. `ranges` is passed to `env.reset`.
+    """
     return SplitRollout(env, execute_steps, denoise_steps, ranges)
 
 
@@ -116,20 +167,55 @@ class Worlds:
         self._prompts = jax.device_put(prompts, self._place)
 
     def predict(self, call: int, *, denoise_steps: int, **previous: Any) -> tuple[jax.Array, Any]:
-        """Observe the worlds and sample a chunk in each; see `rollout.predict`."""
+        """Observe the worlds and sample a chunk in each; see `predict`."""
         observation, done = _observe(self._env, self.state), self.state.done
         inputs = (self._sample_key, np.int32(call), observation, self._prompts, done)
         actions, ranks = _predict()(self._policy, *inputs, denoise_steps=denoise_steps, **previous)
         return jax.device_put(actions, self._place), ranks
 
     def act(self, actions: jax.Array, execute_steps: int) -> Poses:
-        """Execute the first actions of chunks `[W, C, J+1]`; see `rollout.act`."""
+        """Execute the first actions of chunks `[W, C, J+1]`; return poses, see `_act`."""
         self.state, poses = _act(self._env, self.state, actions[:, :execute_steps])
         return poses
 
     def hold(self, action: jax.Array, steps: int) -> None:
         """Execute the same action `[W, J+1]` for a number of control steps."""
         self.state = _hold(self._env, self.state, action, np.int32(steps))
+
+
+def predict(
+    policy: Policy,
+    key: jax.Array,
+    call: jax.Array,
+    observation: RawObservation,
+    prompts: jax.Array,
+    done: jax.Array,
+    *,
+    denoise_steps: int,
+    **previous: Any,
+) -> tuple[jax.Array, tuple[metrics.LayerRanks, dict[str, jax.Array], jax.Array]]:
+    """Sample a chunk in every world, with a new key for each call.
+
+    Args:
+        policy: the policy, with a sampler.
+        key: key of the rollout.
+        call: `[]` int32, index of the policy call.
+        observation: from `env.observe`.
+        prompts: `[W]` int32, rows of the policy's prompt table.
+        done: `[W]` bool.
+        denoise_steps: Euler steps.
+        previous: `previous`, `prefix_length` and `guidance` of `Policy.sample`, if any.
+
+    Returns:
+        `[W, C, J+1]` actions, and (active ranks, their histogram, number of unfinished worlds).
+    """
+    call_key = jax.random.fold_in(key, call)
+    actions, aux = policy.sample(
+        call_key, observation, prompts, num_steps=denoise_steps, return_aux=True, **previous
+    )
+    ranks = metrics.layer_ranks(aux, ~done)
+    histogram = metrics.rank_histogram(aux, ~done, _max_rank(policy))
+    return actions, (ranks, histogram, jnp.sum(~done))
 
 
 def _shareable(policy: Policy) -> Policy:
@@ -143,7 +229,7 @@ def compiled_rollout(run: Run, task: str) -> tuple[Env, Callable[..., Rollout]]:
     sizes = settings.worlds, config.image_size, config.control_dt
     env = _environment(task, config.robot, *sizes)
     steps = {"execute_steps": settings.execute_steps, "denoise_steps": settings.denoise_steps}
-    return env, split_rollout(env, ranges=config.ranges, **steps)
+    return env, make_rollout(env, ranges=config.ranges, **steps)
 
 
 @functools.cache
@@ -153,7 +239,7 @@ def _environment(task: str, robot: str, worlds: int, image_size: int, control_dt
     )
 
 
-_cached = functools.partial(traced.cached, files=(__file__, rollout.__file__))
+_cached = functools.partial(traced.cached, files=(__file__,))
 
 
 @_cached
@@ -168,7 +254,13 @@ def _observe(env: Env, state: State) -> RawObservation:
 
 @_cached
 def _act(env: Env, state: State, actions: jax.Array) -> tuple[State, Poses]:
-    return act(env, state, actions, execute_steps=actions.shape[1])
+    """Execute `[W, S, J+1]`; poses of the recorded worlds have leading axes `[S, worlds]`."""
+
+    def step(state: State, action: jax.Array) -> tuple[State, Poses]:
+        state = env.step(state, action)
+        return state, jax.tree.map(lambda x: x[:RECORDED_WORLDS], Poses.of(state.data))
+
+    return jax.lax.scan(step, state, jnp.moveaxis(actions, 1, 0))
 
 
 @_cached
@@ -189,3 +281,8 @@ def _placement(policy: Policy) -> Any:
     if len(sharding.device_set) == 1:
         return jax.sharding.SingleDeviceSharding(*sharding.device_set)
     return meshes.replicated(sharding.mesh)
+
+
+def _max_rank(policy: Policy) -> int:
+    """Return the largest adapter rank; 0 if no method has a rank."""
+    return max((getattr(method, "rank", 0) for method in policy.model.methods), default=0)

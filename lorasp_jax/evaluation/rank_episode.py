@@ -16,7 +16,7 @@ from envs.scene.randomization import Draw
 from envs.state import Poses
 from lorasp_jax.base import fast_cpu, messages
 from lorasp_jax.evaluation import metrics
-from lorasp_jax.evaluation.rollout import RECORDED_WORLDS
+from lorasp_jax.evaluation.programs import RECORDED_WORLDS
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import RawObservation
 from lorasp_jax.training.random_streams import RandomStream

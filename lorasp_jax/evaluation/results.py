@@ -12,8 +12,7 @@ from envs.scene.randomization import Draw
 from envs.state import Poses
 from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.evaluation import metrics
-from lorasp_jax.evaluation.programs import split_rollout
-from lorasp_jax.evaluation.rollout import RECORDED_WORLDS, Rollout
+from lorasp_jax.evaluation.programs import RECORDED_WORLDS, Rollout, make_rollout
 from lorasp_jax.policies.policy import Policy
 
 
@@ -62,8 +61,8 @@ def evaluate(
         env: environment; `num_envs` episodes run in parallel.
         key: PRNG key of the layouts and the sampled actions.
         num_episodes: a multiple of `env.num_envs`.
-        rollout: (policy, key) -> `Rollout`, such as a jitted `make_rollout(env)` with other
-            settings; None uses `programs.split_rollout`, which compiles less often.
+        rollout: (policy, key) -> `Rollout`, such as `make_rollout(env)` with other settings;
+            None: the default settings.
         progress: called with (completed, total) episodes.
 
     Raises:
@@ -75,7 +74,7 @@ def evaluate(
         raise ValueError(
             f"num_episodes must be a positive multiple of {env.num_envs}, got {num_episodes}"
         )
-    rollout = rollout or split_rollout(env)
+    rollout = rollout or make_rollout(env)
     runs: list[Rollout] = []
     for batch_key in jax.random.split(key, batches):
         runs.append(jax.block_until_ready(rollout(policy, batch_key)))
@@ -85,10 +84,9 @@ def evaluate(
 
 
 def _result(runs: Sequence[Rollout]) -> Result:
-    """Aggregate batches of episodes."""
     success = np.concatenate([run.success for run in runs])
     successes, episodes = int(success.sum()), len(success)
-    world = _recorded_world(runs[0])
+    world = int(np.argmax(runs[0].success[:RECORDED_WORLDS]))  # the first that succeeds, or 0
     histograms = [run.active_rank_histogram for run in runs]
     return Result(
         success=successes / episodes,
@@ -112,8 +110,3 @@ def _mean_ranks(run: Rollout) -> metrics.LayerRanks:
     """Average active ranks over the policy calls, weighted by the number of unfinished worlds."""
     weights = np.asarray(run.running) / max(np.sum(run.running), 1)
     return jax.tree.map(lambda ranks: np.tensordot(weights, ranks, axes=1), run.active_rank)
-
-
-def _recorded_world(run: Rollout) -> int:
-    """Return the first recorded world that succeeds, or else world 0."""
-    return int(np.argmax(run.success[:RECORDED_WORLDS]))

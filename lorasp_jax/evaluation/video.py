@@ -6,7 +6,6 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from PIL import Image
 
 from envs.env import Env
 from envs.rendering.renderer import RayRenderer
@@ -14,22 +13,8 @@ from envs.rendering.video import side_by_side, write_video
 from envs.scene.randomization import Draw
 from envs.state import Poses
 
-__all__ = [
-    "VIDEO_SIZE",
-    "render_episode",
-    "side_by_side",
-    "write_episode",
-    "write_image",
-    "write_video",
-]
-
 VIDEO_SIZE = 192
 """Height and width of each camera in a video [pixels]."""
-
-
-def write_image(path: Path, image: np.ndarray) -> None:
-    """Write an image, `[H, W, 3]` uint8."""
-    Image.fromarray(image).save(path)
 
 
 def write_episode(env: Env, poses: Poses, path: Path, draw: Draw | None = None) -> None:

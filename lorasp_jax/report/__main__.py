@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -14,32 +14,32 @@ RANK_MAP = "rank-map"
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.report") -> int:
     """Write a run's report.html or rank maps; return an exit code of `base.errors`."""
-    maps = [*arguments[:1]] == [RANK_MAP]
-    if maps:
+    if [*arguments[:1]] == [RANK_MAP]:  # parsed before slow imports
         options = rank_map_parser(f"{program} {RANK_MAP}").parse_args(arguments[1:])
+        write, what = _rank_maps, "rank map"
     else:
-        options = parser(program).parse_args(arguments)  # before slow imports
-    write = _write_rank_maps if maps else _write_report
-    return run_command(lambda: write(options, Console()), Console(stderr=True))
+        options = parser(program).parse_args(arguments)
+        write, what = _report, "report"
+
+    def show() -> None:
+        for path in write(options):
+            Console().print(f"{what}: {path}", soft_wrap=True, highlight=False, markup=False)
+
+    return run_command(show, Console(stderr=True))
 
 
-def _write_report(options: argparse.Namespace, console: Console) -> None:
+def _report(options: argparse.Namespace) -> Iterable[Path]:
     from lorasp_jax.report.html import write_report
 
-    _print(console, "report", write_report(options.run))
+    return [write_report(options.run)]
 
 
-def _write_rank_maps(options: argparse.Namespace, console: Console) -> None:
+def _rank_maps(options: argparse.Namespace) -> Iterable[Path]:
     from lorasp_jax.base import compilation_cache as cache
     from lorasp_jax.evaluation import rank_map
 
     cache.enable()
-    for path in rank_map.write(options.run, options.task):
-        _print(console, "rank map", path)
-
-
-def _print(console: Console, what: str, path: Path) -> None:
-    console.print(f"{what}: {path}", soft_wrap=True, highlight=False, markup=False)
+    return rank_map.write(options.run, options.task)
 
 
 def parser(program: str) -> argparse.ArgumentParser:

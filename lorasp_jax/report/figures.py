@@ -76,29 +76,34 @@ def losses(rows: Rows) -> Figure:
 def success_over_steps(rows: Rows) -> Figure:
     """Plot the success of each task during training."""
     names = sorted({name for row in rows for name in row if name.startswith("success/")})
-    figure = Figure(figsize=(9, 3), layout="constrained")
-    axes = figure.subplots()
-    for number, name in enumerate(names):
-        _line(axes, rows, name, f"C{number}", name.removeprefix("success/"))
-    axes.set_ylim(0, 1.03)
-    axes.set_xlabel("step")
-    axes.set_title("success during training (fewer episodes than at the end)", loc="left")
-    axes.legend(frameon=False, loc="lower right")
-    return figure
+    curves = {name.removeprefix("success/"): (name, f"C{i}") for i, name in enumerate(names)}
+    title = "success during training (fewer episodes than at the end)"
+    return _curves(rows, curves, title, top=1.03, legend="lower right")
 
 
 @mpl.rc_context(_STYLE)
 def active_rank(rows: Rows, rank: int) -> Figure:
     """Plot the active rank of each tower over steps."""
+    towers = ("vision", "language", "action")
+    curves = {tower: (f"active_rank/{tower}", COLORS[tower]) for tower in towers}
+    title = f"mean active rank by tower (dotted: bank size {rank})"
+    figure = _curves(rows, curves, title, top=1.06 * rank, legend="lower left")
+    figure.axes[0].axhline(rank, color="black", lw=1, ls=":")
+    return figure
+
+
+def _curves(
+    rows: Rows, curves: dict[str, tuple[str, str]], title: str, top: float, legend: str
+) -> Figure:
+    """Plot metrics over steps; `curves` maps a label to a metric and a color."""
     figure = Figure(figsize=(9, 3), layout="constrained")
-    axes = figure.subplots()
-    for tower in ("vision", "language", "action"):
-        _line(axes, rows, f"active_rank/{tower}", COLORS[tower], tower)
-    axes.axhline(rank, color="black", lw=1, ls=":")
-    axes.set_ylim(0, 1.06 * rank)
+    axes: Any = figure.subplots()
+    for label, (name, color) in curves.items():
+        _line(axes, rows, name, color, label)
+    axes.set_ylim(0, top)
     axes.set_xlabel("step")
-    axes.set_title(f"mean active rank by tower (dotted: bank size {rank})", loc="left")
-    axes.legend(frameon=False, loc="lower left")
+    axes.set_title(title, loc="left")
+    axes.legend(frameon=False, loc=legend)
     return figure
 
 

@@ -70,10 +70,7 @@ def write_report(folder: Path) -> Path:
         *(() if finished else _progress(folder, config, rows)),
         *_success(results),
         "<h2>Training</h2>",
-        _image(figures.losses(rows)) if rows else "<p>No metrics logged yet.</p>",
-        *_skipped(rows),
-        *_success_over_steps(rows),
-        *_speed(rows),
+        *_training(rows),
         *_active_rank(results, rows, config["peft"].get("rank")),
         *_media(folder, [t for t in results["tasks"] if finished or _video(folder, t).exists()]),
         "<h2>Time</h2>",
@@ -114,8 +111,7 @@ def _unfinished(folder: Path) -> dict[str, Any]:
 
 def _progress(folder: Path, config: dict[str, Any], rows: figures.Rows) -> Iterable[str]:
     """Show the progress of an unfinished run, or why it stopped."""
-    stopped = read_json(folder / STOPPED, records.STOPPED)
-    if stopped:
+    if stopped := read_json(folder / STOPPED, records.STOPPED):
         yield f"<p><b>The run stopped:</b> {html.escape(stopped['reason'])}.</p>"
         return
     step, steps = rows[-1]["step"] if rows else 0, config["optim"]["steps"]
@@ -123,15 +119,20 @@ def _progress(folder: Path, config: dict[str, Any], rows: figures.Rows) -> Itera
     yield _REFRESH
 
 
-def _skipped(rows: figures.Rows) -> Iterable[str]:
-    skipped = [(row["step"], row["skipped"]) for row in rows if row.get("skipped")]
-    if skipped:
+def _training(rows: figures.Rows) -> Iterable[str]:
+    """Show losses, skipped steps and, if measured, success over the steps and speed."""
+    yield _image(figures.losses(rows)) if rows else "<p>No metrics logged yet.</p>"
+    if skipped := [(row["step"], row["skipped"]) for row in rows if row.get("skipped")]:
         total = sum(count for _, count in skipped)
         yield (
             f"<p>{total:.0f} steps were skipped because the loss or the gradient was not finite "
             f"or spiked, first logged at step {skipped[0][0]:.0f}, last at step "
             f"{skipped[-1][0]:.0f}.</p>"
         )
+    if any(name.startswith("success/") for row in rows for name in row):
+        yield _image(figures.success_over_steps(rows))
+    if summary := speed(rows):
+        yield _table(("run statistics", ""), summary.items())
 
 
 def _subtitle(config: dict[str, Any], results: dict[str, Any]) -> str:
@@ -152,19 +153,9 @@ def _success(results: dict[str, Any]) -> Iterable[str]:
     if results["tasks"]:
         yield "<h2>Success</h2>"
         yield _image(figures.success(results))
-        yield _success_table(results)
-
-
-def _success_over_steps(rows: figures.Rows) -> Iterable[str]:
-    """Show success over steps if it was measured during training."""
-    if any(name.startswith("success/") for row in rows for name in row):
-        yield _image(figures.success_over_steps(rows))
-
-
-def _success_table(results: dict[str, Any]) -> str:
-    tasks = results["tasks"].items()
-    rows = ((task, *map(success_cell, value.values())) for task, value in tasks)
-    return _table(("task", *next(iter(results["tasks"].values()))), rows)
+        tasks = results["tasks"]
+        header = ("task", *next(iter(tasks.values())))
+        yield _table(header, ((k, *map(success_cell, v.values())) for k, v in tasks.items()))
 
 
 def success_cell(value: dict[str, Any]) -> str:
@@ -174,41 +165,30 @@ def success_cell(value: dict[str, Any]) -> str:
     return f"{rate} of {value['episodes']}"
 
 
-def _speed(rows: figures.Rows) -> Iterable[str]:
-    summary = speed(rows)
-    if summary:
-        yield _table(("run statistics", ""), summary.items())
-
-
 def speed(rows: figures.Rows) -> dict[str, str]:
     """Summarize throughput and memory as label -> value with unit.
 
     Throughput and utilization are medians; "data wait" is a fraction of the whole training time.
     """
+    rate, wait = "speed/samples_per_second", "speed/data_wait"
     entries = {
-        "samples/s": ("speed/samples_per_second", median, "{:,.4g}".format),
+        "samples/s": (rate, median, "{:,.4g}".format),
         "FLOP utilization": ("speed/flop_utilisation", median, "{:.1%}".format),
-        "data wait": ("waited", sum, "{:.1%}".format),
         "peak memory": ("memory/peak_gib", max, _memory),
     }
-    labeled, rows = {}, [*_with_wait(rows)]
+    labeled = {}
     for label, (name, reduce, form) in entries.items():
-        values = [row[name] for row in rows if name in row]
-        if values:
+        if values := [row[name] for row in rows if name in row]:
             labeled[label] = form(reduce(values))
+    if waits := [row[wait] / row[rate] for row in rows if wait in row]:
+        labeled["data wait"] = (
+            f"{sum(waits) / sum(1 / row[rate] for row in rows if rate in row):.1%}"
+        )
     return labeled
 
 
 def _memory(gib: float) -> str:
     return f"{gib:.2f} GiB" if gib >= 1 else f"{1024 * gib:.1f} MiB"
-
-
-def _with_wait(rows: figures.Rows) -> Iterable[dict[str, float]]:
-    """Add "waited" to rows: the wait for data as a fraction of the whole training time."""
-    rate, wait = "speed/samples_per_second", "speed/data_wait"
-    total = sum(1 / row[rate] for row in rows if rate in row)
-    for row in rows:
-        yield row | {"waited": row[wait] / row[rate] / total} if wait in row else row
 
 
 def _has_rank(rows: figures.Rows) -> bool:

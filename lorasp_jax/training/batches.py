@@ -1,8 +1,8 @@
 """The batches of training steps: drawn from a dataset on the device, or streamed from disk."""
 
 import functools
-from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -25,31 +25,8 @@ CollectGeneration = Callable[[Config, int], dict[str, Episodes]]
 """Collects demonstrations per task for generation 1, 2, ... (see `fresh_demonstrations`)."""
 
 
-class Batches(Protocol):
-    """The batches that calls of the training program take, in order."""
-
-    def call_size(self, count: int) -> int:
-        """Return the number of steps per call, a divisor of `count`."""
-        ...
-
-    def shapes(self, size: int) -> Any:
-        """Return a `RawBatch` like those of `take`, or of their shapes and shardings."""
-        ...
-
-    def take(self, key: jax.Array, step: int, size: int) -> RawBatch:
-        """Return the batches of `size` steps from `step` on, with a leading axis over steps.
-
-        `key` is that of `RandomStream.TRAINING`.
-        """
-        ...
-
-    def prepare(self, running: Any) -> None:
-        """Prepare the next batches while the device computes the arrays `running`."""
-        ...
-
-
 class DrawnBatches:
-    """Random windows of a dataset on the device."""
+    """The batches that calls of the training program take: random windows of a dataset."""
 
     def __init__(
         self,
@@ -59,7 +36,7 @@ class DrawnBatches:
         chunk: int,
         refresh: "Refresh | None" = None,
     ) -> None:
-        """Store the arguments; `steps` is on the mesh, and `refresh` replaces it by others."""
+        """`steps` is on the mesh; `refresh` replaces it by others."""
         self._steps, self._refresh, self._running = steps, refresh, None
         self._sharding = meshes.batches_sharding(mesh)
 
@@ -87,13 +64,16 @@ class DrawnBatches:
         )
 
     def take(self, key: jax.Array, step: int, size: int) -> RawBatch:
-        """Draw the batches; see `Batches`."""
+        """Return the batches of `size` steps from `step` on, with a leading axis over steps.
+
+        `key` is that of `RandomStream.TRAINING`.
+        """
         if self._refresh is not None:
             self._steps = self._refresh(self._steps, step, self._running)
         return self._draw(self._steps, key, jnp.int32(step), size=size)
 
     def prepare(self, running: Any) -> None:
-        """Remember what runs."""
+        """Remember the arrays that the device computes while the host prepares the next batches."""
         self._running = running
 
 
@@ -133,10 +113,22 @@ class Refresh:
 class StreamedBatches:
     """Batches that are read from disk, one per call; the next one is already on the device."""
 
-    def __init__(self, batches: Iterator[RawBatch], speed: Speed) -> None:
-        """Read the first batch; batches have a leading axis of length 1."""
-        self._batches, self._speed = batches, speed
-        self._batch = next(batches)
+    def __init__(self, run: Run, mesh: jax.sharding.Mesh, start: int, speed: Speed) -> None:
+        """Read the batch of step `start`, sharded over the mesh; its leading axis has length 1."""
+        self._stream = Stream(
+            run.steps,
+            batch_size=run.config.optim.batch_size,
+            chunk=run.policy.model.config.chunk,
+            seed=run.config.seed,
+            start=start,
+            process=(jax.process_index(), jax.process_count()),
+        )
+        self._sharding, self._speed = meshes.batches_sharding(mesh), speed
+        self._batch = self._next()
+
+    def _next(self) -> RawBatch:
+        put = functools.partial(jax.make_array_from_process_local_data, self._sharding)
+        return jax.tree.map(lambda x: put(x[None]), next(self._stream))
 
     def call_size(self, count: int) -> int:  # noqa: ARG002
         """Return 1."""
@@ -153,7 +145,10 @@ class StreamedBatches:
     def prepare(self, running: Any) -> None:
         """Read the next batch."""
         with self._speed.waiting(running):
-            self._batch = next(self._batches)
+            self._batch = self._next()
+
+
+Batches: TypeAlias = DrawnBatches | StreamedBatches
 
 
 def make_batches(
@@ -164,7 +159,7 @@ def make_batches(
     `collect` is called only if `data.fresh_every` is set.
     """
     if run.streams:
-        return StreamedBatches(streamed(run, mesh, start), speed)
+        return StreamedBatches(run, mesh, start, speed)
 
     def generation(number: int) -> Steps:
         steps = run.steps
@@ -179,21 +174,3 @@ def make_batches(
     steps, last = generation(first), optim.steps - 1
     refresh = Refresh(generation, every, min(start, last), last, speed) if every else None
     return DrawnBatches(steps, mesh, optim.batch_size, run.policy.model.config.chunk, refresh)
-
-
-def streamed(run: Run, mesh: jax.sharding.Mesh, start: int) -> Iterator[RawBatch]:
-    """Return the dataset's batches from step `start` on, sharded over the devices.
-
-    They have a leading axis of length 1, see `StreamedBatches`.
-    """
-    stream = Stream(
-        run.steps,
-        batch_size=run.config.optim.batch_size,
-        chunk=run.policy.model.config.chunk,
-        seed=run.config.seed,
-        start=start,
-        process=(jax.process_index(), jax.process_count()),
-    )
-    sharding = meshes.batches_sharding(mesh)
-    put = lambda x: jax.make_array_from_process_local_data(sharding, x[None])  # noqa: E731
-    return (jax.tree.map(put, raw) for raw in stream)

@@ -7,7 +7,6 @@ stored as well.
 
 import contextlib
 import errno
-import itertools
 import os
 import shutil
 from collections.abc import Iterator
@@ -127,11 +126,10 @@ class Checkpoints:
         return checkpoint["state"]
 
     def _rename_corrupt(self, corrupt: dict[int, str], resume_step: int) -> None:
-        """Rename corrupt checkpoints, with a warning for each."""
         for step, reason in corrupt.items():
-            paths = (self._folder / f"{step}.damaged{suffix}" for suffix in _suffixes())
-            renamed = next(path for path in paths if not path.exists())
+            renamed = self._folder / f"{step}.damaged"
             if processes.is_first():
+                shutil.rmtree(renamed, ignore_errors=True)  # of an earlier resume
                 rename(self._folder / str(step), renamed)
             self._warn(
                 f"the checkpoint at step {step} is corrupt ({reason}): renamed to {renamed}, "
@@ -181,10 +179,6 @@ class Checkpoints:
 
 class _CorruptError(Exception):
     """A checkpoint is corrupt; the message states the symptom."""
-
-
-def _suffixes() -> Iterator[str]:
-    return itertools.chain([""], (f".{number}" for number in itertools.count(1)))
 
 
 def _by_path(tree: Any) -> dict[str, jax.Array]:

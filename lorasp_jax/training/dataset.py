@@ -1,10 +1,11 @@
 """Open the dataset of a run, convert it to a cache once, and group its episodes by task."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 
-from envs.datasets.episodes import Episodes
+from envs.datasets.episodes import Episodes, concatenate
 from envs.names import names
 from lorasp_jax.config import Config
 from lorasp_jax.data import cache
@@ -41,12 +42,7 @@ def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
             f"{path} has cameras {', '.join(source.cameras)}, but the backbone accepts at most "
             f"{len(model.cameras)}: select cameras with python -m lorasp_jax.data convert --cameras"
         )
-    _check_state_and_actions(source.episode(0, ()), model, path)
-    return source
-
-
-def _check_state_and_actions(first: Episodes, model: BackboneConfig, path: object) -> None:
-    """Raise ValueError unless a policy can learn from the states and actions of an episode."""
+    first = source.episode(0, ())
     if first.actions != "joint":
         raise ValueError(
             f"{path} has {first.actions} actions, but policies learn joint targets: "
@@ -59,6 +55,7 @@ def _check_state_and_actions(first: Episodes, model: BackboneConfig, path: objec
             f"{path} does not fit the backbone: {error}; select entries with "
             "python -m lorasp_jax.data convert --state-numbers and --action-numbers"
         ) from error
+    return source
 
 
 def as_cache(source: Source, folder: Path, progress: Progress) -> Cache:
@@ -76,36 +73,13 @@ def outline(dataset: Cache) -> dict[str, Episodes]:
     groups: dict[str, Episodes] = {}
     for task in dataset.metadata["tasks"]:
         indices = [index for index, episode in enumerate(episodes) if episode.task == task]
-        groups[task] = _pad(dataset, [episodes[index] for index in indices], indices[0])
+        group = concatenate([episodes[index] for index in indices])
+        image = {
+            name: np.broadcast_to(x[0, 0], (*group.state.shape[:2], *x.shape[2:]))
+            for name, x in dataset.episode(indices[0]).image.items()
+        }
+        groups[task] = dataclasses.replace(group, image=image)
     return groups
-
-
-def _pad(dataset: Cache, episodes: list[Episodes], first: int) -> Episodes:
-    """Stack the episodes of one task, padded with zeros to the length of the longest."""
-    length = np.array([episode.num_steps for episode in episodes], np.int32)
-    shape = (len(episodes), int(length.max()))
-    images = dataset.episode(first).image
-
-    def pad(name: str) -> np.ndarray:
-        rows = [np.asarray(getattr(episode, name))[0] for episode in episodes]
-        padded = np.zeros((*shape, rows[0].shape[1]), np.float32)
-        for target, row in zip(padded, rows, strict=True):
-            target[: len(row)] = row
-        return padded
-
-    return Episodes(
-        image={
-            name: np.broadcast_to(x[0, 0], (*shape, *x.shape[2:])) for name, x in images.items()
-        },
-        state=pad("state"),
-        action=pad("action"),
-        length=length,
-        instruction=np.concatenate([episode.instruction for episode in episodes]),
-        instructions=dataset.instructions,
-        task=episodes[0].task,
-        attempted=len(episodes),
-        **{name: dataset.metadata[name] for name in cache.METADATA},
-    )
 
 
 def is_simulated(dataset: Cache) -> bool:

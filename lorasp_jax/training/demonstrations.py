@@ -33,7 +33,6 @@ def fresh_demonstrations(config: Config, generation: int) -> dict[str, Episodes]
 
 
 def _keys(config: Config) -> jax.Array:
-    """Return one random key per task."""
     return jax.random.split(RandomStream.DEMONSTRATIONS.key(config.seed), len(config.tasks))
 
 
@@ -69,7 +68,6 @@ def _load_or_collect(
 def _collect(
     config: Config, task: str, key: jax.Array, progress: Callable[[int, int], None] | None = None
 ) -> Episodes:
-    """Collect episodes with the scripted expert."""
     return envs.collect(
         task,
         robot=config.robot,

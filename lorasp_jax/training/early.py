@@ -110,6 +110,5 @@ def _lower(run: Run, built: setup.RunSetup, batches: Any) -> Any:
 
 
 def _with_sharding(tree: Any, sharding: jax.sharding.Sharding) -> Any:
-    """Attach a sharding to the shapes of a tree."""
     shape = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)  # noqa: E731
     return jax.tree.map(shape, tree)

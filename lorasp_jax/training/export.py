@@ -44,11 +44,7 @@ def write(run: Run) -> None:
     """Write adapter.safetensors and adapter.json, or the folder `base` after full fine-tuning."""
     config, metadata = run.config, _metadata(run)
     if config.peft.trains_base:
-        folder = run.folder / BASE
-        models.save(folder, adaptation.merge(run.policy.model))
-        statistics = run.policy.processor.statistics.to_json()
-        (folder / "statistics.json").write_text(statistics + "\n")
-        write_json(folder / TRAINING, metadata)
+        _write_base(run.folder, run.policy, metadata)
         return
     metadata = {"base": hub.portable_path(config.model.source), **metadata}
     if config.model.base_dtype:
@@ -73,8 +69,12 @@ def write_variant(
     if adaptation.methods(policy.model):
         base = native.read_description(source)["base"]
         native.save_adapters(folder, policy.model, base=base, metadata=metadata)
-        return
-    models.save(folder / BASE, policy.model)
+    else:
+        _write_base(folder, policy, metadata)
+
+
+def _write_base(folder: Path, policy: Policy, metadata: Mapping[str, Any]) -> None:
+    models.save(folder / BASE, adaptation.merge(policy.model))
     statistics = policy.processor.statistics.to_json()
     (folder / BASE / "statistics.json").write_text(statistics + "\n")
     write_json(folder / BASE / TRAINING, metadata)

@@ -38,11 +38,7 @@ def deferred() -> Iterator[Stop]:
 @contextlib.contextmanager
 def sigterm_as_interrupt() -> Iterator[None]:
     """Inside this block SIGTERM raises KeyboardInterrupt, like Ctrl-C."""
-
-    def handle(_number: int, _frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    with _handlers(handle):
+    with _handlers(signal.default_int_handler):
         yield
 
 

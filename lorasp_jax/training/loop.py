@@ -41,11 +41,8 @@ def train(
 ) -> None:
     """Train the adapters of `run.policy`, then set `run.policy` to the trained policy.
 
-    Args:
-        run: the run to train.
-        callbacks: called in order.
-        resume: continue from the newest checkpoint, if there is one.
-        collect: collects new demonstrations if `data.fresh_every` is set.
+    With `resume`, it continues from the newest checkpoint, if there is one. `collect` collects new
+    demonstrations if `data.fresh_every` is set.
 
     Raises:
         RunError: too many consecutive steps were skipped, or an update was non-finite.
@@ -105,7 +102,6 @@ def _split(
 
 
 def _call(callbacks: Sequence[Callback], run: Run, hook: str) -> None:
-    """Call one hook of every callback."""
     with _local_policy(run, hook):
         for callback in callbacks:
             getattr(callback, hook)(run)

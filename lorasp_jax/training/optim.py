@@ -9,26 +9,24 @@ from lorasp_jax.peft import AdaLoRA, Method
 from lorasp_jax.peft.auxiliary import AUXILIARY_WEIGHTS
 
 
-def learning_rate(config: OptimConfig) -> optax.Schedule:
-    """Return a schedule with linear warm-up from zero and cosine decay to `final_learning_rate`."""
-    return optax.warmup_cosine_decay_schedule(
+def make_optimizer(
+    config: OptimConfig, methods: Collection[Method] = ()
+) -> optax.GradientTransformation:
+    """Create AdamW with gradient clipping and the transformations of the adapter methods.
+
+    The learning rate rises linearly from zero and decays by a cosine to `final_learning_rate`.
+
+    Raises:
+        ValueError: AdaLoRA layers, which share one rank budget, have different settings.
+    """
+    schedule = optax.warmup_cosine_decay_schedule(
         init_value=0.0,
         peak_value=config.learning_rate,
         warmup_steps=config.warmup_steps,
         decay_steps=max(config.steps, config.warmup_steps + 1),
         end_value=config.final_learning_rate,
     )
-
-
-def make_optimizer(
-    config: OptimConfig, methods: Collection[Method] = ()
-) -> optax.GradientTransformation:
-    """Create AdamW with gradient clipping and the transformations of the adapter methods.
-
-    Raises:
-        ValueError: AdaLoRA layers, which share one rank budget, have different settings.
-    """
-    optimizer = optax.adamw(learning_rate(config), b2=config.b2, weight_decay=config.weight_decay)
+    optimizer = optax.adamw(schedule, b2=config.b2, weight_decay=config.weight_decay)
     budgets = {method for method in methods if isinstance(method, AdaLoRA)}
     if len(budgets) > 1:
         raise ValueError(

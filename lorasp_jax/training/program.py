@@ -82,7 +82,7 @@ class Program:
     """
 
     def __init__(self, jitted: Callable, frozen: Frozen, batches: Batches, speed: Speed) -> None:
-        """Store the arguments, `jitted` from `jit_steps`; nothing is compiled yet."""
+        """`jitted` is from `jit_steps`; nothing is compiled yet."""
         self._jitted, self._frozen, self._batches = jitted, frozen, batches
         self.speed: Speed = speed
         self._compiled: dict[int, Future[Any]] = {}

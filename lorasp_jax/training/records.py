@@ -19,7 +19,7 @@ RESULTS: Schema = {
     "trainable_parameters": int,
     "total_parameters": int,
 }
-ROW: Schema = {"step": float, "digest?": str, str: float}
+ROW: Schema = {"step": float, str: float}
 DATASET: Schema = {"facts": {}, "streams": bool}
 STOPPED: Schema = {"reason": str}
 CONFIG: Schema = {

@@ -95,11 +95,8 @@ def read_json(path: Path, schema: Mapping[Any, Any] = MappingProxyType({})) -> d
 def open_run(config: Config, root: Path, *, resume: bool | Literal["auto"]) -> Iterator[Path]:
     """Open the run's folder under an exclusive lock.
 
-    Args:
-        config: configuration of the run.
-        root: parent of all run folders.
-        resume: False creates the folder; True requires a run with the same config; "auto" resumes
-            the run if it exists and creates it otherwise.
+    Without `resume`, the folder is created in `root`; with True, it must contain a run with the
+    same config; "auto" resumes the run if it exists and creates it otherwise.
 
     Raises:
         ValueError: the path contains a wildcard, or another process uses the folder. For a new
@@ -126,20 +123,18 @@ def open_run(config: Config, root: Path, *, resume: bool | Literal["auto"]) -> I
 
 
 def _begin(config: Config, folder: Path) -> None:
-    """Create the folder of a new run and write its config."""
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file: remove it or use another --name")
-    names = (CONFIG_FILE, TIMES_FILE, DATASET_FILE)
-    allowed = {folder / name for name in names}
-    for name in names:
-        allowed |= {*folder.glob(f".{name}.*{TEMPORARY_SUFFIX}")}  # left by a killed process
-    if any(path not in allowed for path in folder.rglob("*") if not path.is_dir()):
+    left = [path for path in folder.rglob("*") if not path.is_dir()]
+    names = {CONFIG_FILE, TIMES_FILE, DATASET_FILE}
+    unfinished = {*folder.glob(f".*{TEMPORARY_SUFFIX}")}  # left by a killed process
+    if {*left} - unfinished - {folder / name for name in names}:
         raise ValueError(
             f"{folder} already contains a run: add --resume to continue it or use another --name"
         )
     folder.mkdir(exist_ok=True)
-    for path in allowed - {folder / CONFIG_FILE}:
-        path.unlink(missing_ok=True)
+    for path in left:
+        path.unlink()
     write_json(folder / CONFIG_FILE, to_json(config))
 
 
@@ -182,7 +177,6 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _recorded(folder: Path) -> dict[str, Any]:
-    """Return the config recorded in `folder`."""
     if not (folder / CONFIG_FILE).exists():
         raise ValueError(f"{folder} contains no run to resume: omit --resume to start one")
     return read_json(folder / CONFIG_FILE, records.CONFIG)
@@ -273,7 +267,6 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
         try:
             row = json.loads(line)
             check(row, records.ROW)
-            row.pop("digest", None)  # only in logs of an early version
             rows.append(row)
         except (ValueError, RecursionError) as error:
             raise ValueError(

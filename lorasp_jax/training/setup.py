@@ -45,8 +45,6 @@ from lorasp_jax.training.run_folder import record_dataset
 STATISTICS_BATCHES = 8
 """Number of batches used for data-driven initialization."""
 
-LoadBase = Callable[..., tuple[Backbone, str]]
-"""Signature of `base_model`."""
 Collect = Callable[[Config, Path, Progress], dict[str, Episodes]]
 """Signature of `demonstrations`."""
 Meanwhile = Callable[[Run, "RunSetup"], Any]
@@ -84,9 +82,7 @@ class RunSetup:
         return self.available - self.memory.peak
 
 
-def build(
-    config: Config, folder: Path, *, abstract: bool = False, load_base: LoadBase = base_model
-) -> RunSetup:
+def build(config: Config, folder: Path, *, abstract: bool = False) -> RunSetup:
     """Load or create the base and attach the adapters, without writing to `folder`.
 
     This validates the config before any long-running work. With `abstract`, for a dry run, the
@@ -102,7 +98,7 @@ def build(
     environments = [envs.make(task, robot=config.robot, **sizes) for task in tasks]
     use_bundled = abstract and hub.is_remote(config.model.tokenizer)
     tokenizer = load_tokenizer("" if use_bundled else config.model.tokenizer)
-    base, base_hash = load_base(config, abstract=abstract)
+    base, base_hash = base_model(config, abstract=abstract)
     chosen = {name: getattr(config.model, name) for name in ("max_tokens", "chunk")}
     base = with_config(base, **{name: value for name, value in chosen.items() if value})
     source = open_dataset(config, base.config, folder) if config.data.source else None
@@ -131,25 +127,20 @@ def prepare(
     console: Console,
     started: float,
     *,
-    load_base: LoadBase = base_model,
     collect: Collect = demonstrations,
     meanwhile: Sequence[Meanwhile] = (),
 ) -> Run:
     """Build a run and load or collect its demonstrations.
 
     Args:
-        config, folder: the run's config and folder.
-        console: prints progress.
         started: `time.perf_counter()` when this process started.
-        load_base: returns the base, like `base_model`.
-        collect: collects demonstrations, like `demonstrations`.
         meanwhile: functions that compile what the run needs next, in threads of their own until
             the demonstrations are there. Their errors are raised here.
 
     Raises:
         ValueError: see `build`; also if the dataset cannot be read or the expert fails.
     """
-    built = build(config, folder, load_base=load_base)
+    built = build(config, folder)
     base, model = built.base, built.model
     processes.agree("base models", {"base": built.base_hash, "remat": base.config.remat})
     console.print(headline(config, model))
@@ -161,7 +152,10 @@ def prepare(
     if config.peft.needs_statistics:
         model = _adapt(config, base, config.peft, input_moments(run, base, inputs))
     if built.source:
-        console.print(_camera_summary(inputs), markup=False, soft_wrap=True)
+        cameras = [f"{name} -> {slot}" for slot, name in inputs.cameras if name]
+        size = f"{inputs.image_size} x {inputs.image_size}"
+        summary = f"cameras: {', '.join(cameras)}; resized to {size}"
+        console.print(summary, markup=False, soft_wrap=True)
     run.policy = Policy(model, inputs)
     return run
 
@@ -187,13 +181,6 @@ def headline(config: Config, model: Backbone) -> str:
         f"scale {config.scale}: {type(config.peft).__name__} on {config.model.backbone} "
         f"{config.model.size}, {summary.trained_share(model)}"
     )
-
-
-def _camera_summary(processor: Processor) -> str:
-    """Describe on one line which camera fills which of the backbone's camera slots."""
-    cameras = [f"{name} -> {slot}" for slot, name in processor.cameras if name]
-    size = processor.image_size
-    return f"cameras: {', '.join(cameras)}; resized to {size} x {size}"
 
 
 def _prompts_and_joints(

@@ -1,7 +1,6 @@
 """Logging to Weights & Biases: `--wandb PROJECT`."""
 
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from lorasp_jax.config import Config
@@ -49,12 +48,7 @@ class WeightsAndBiases(Callback):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Finish the W&B run, waiting for all uploads."""
         self._run.finish(exit_code=int(kind is not None))
 

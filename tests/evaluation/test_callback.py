@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from lorasp_jax.config import EvaluationConfig
-from lorasp_jax.evaluation import Result
+from lorasp_jax.evaluation import Result, callback
 from lorasp_jax.evaluation.callback import Evaluation
 from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.policies.policy import Policy
@@ -18,7 +18,8 @@ from tests.runs import CONFIG, random_episodes
 
 
 @pytest.fixture
-def run(tmp_path):
+def run(tmp_path, monkeypatch):
+    monkeypatch.setattr(callback, "compiled_rollout", lambda _, task: (task, None))
     settings = EvaluationConfig(episodes=8, num_envs=4, execute_steps=1, every=100)
     optim = dataclasses.replace(CONFIG.optim, steps=300)
     config = dataclasses.replace(CONFIG, evaluation=settings, optim=optim, log_every=40)
@@ -29,7 +30,7 @@ def run(tmp_path):
     return run
 
 
-def test_evaluation_runs_at_the_next_log_step(run):
+def test_evaluation_runs_at_the_next_log_step(run, monkeypatch):
     evaluated, rendered, may_render = [], [], threading.Event()
 
     def evaluate(policy, env, key, episodes, **_):
@@ -42,7 +43,9 @@ def test_evaluation_runs_at_the_next_log_step(run):
         rendered.append(env)
         path.touch()
 
-    evaluation = Evaluation(lambda _, task: (task, None), evaluate, write_video)
+    monkeypatch.setattr(callback, "evaluate", evaluate)
+    monkeypatch.setattr(callback.video, "write_episode", write_video)
+    evaluation = Evaluation()
     steps = [*range(40, 300, 40), 300]
     with run.timed("train"):
         logged = {step: evaluation.on_log(run, step, {}) for step in steps[:3]}
@@ -65,31 +68,32 @@ def test_evaluation_runs_at_the_next_log_step(run):
     assert phases <= run.seconds["total"]  # evaluation is not counted as training
 
 
-def test_rows_that_the_device_computes_wrongly_are_reported(run):
+def test_rows_that_the_device_computes_wrongly_are_reported(run, monkeypatch):
     outcomes = tuple(index % 2 == 0 for index in range(64))
     result = Result(0.5, 64, (0.4, 0.6), outcomes, 30.0, {}, {}, poses=(), draw=None)
-    evaluation = Evaluation(lambda _, task: (task, None), lambda *_, **__: result, None)
-    evaluation.on_log(run, 120, {})
+    monkeypatch.setattr(callback, "evaluate", lambda *_, **__: result)
+    Evaluation(media=False).on_log(run, 120, {})
     assert "warning: success depends on bit 0 of an episode's index" in run.console.file.getvalue()
 
 
-def test_evaluation_can_be_disabled(run):
-    evaluation = Evaluation(evaluate=lambda *_, **__: pytest.fail("evaluated"))
+def test_evaluation_can_be_disabled(run, monkeypatch):
+    monkeypatch.setattr(callback, "evaluate", lambda *_, **__: pytest.fail("evaluated"))
     settings = dataclasses.replace(run.config.evaluation, every=0)
     run.config = dataclasses.replace(run.config, evaluation=settings)
-    assert evaluation.on_log(run, 40, {}) == {}
+    assert Evaluation().on_log(run, 40, {}) == {}
 
 
-def test_a_task_has_the_same_layouts_in_single_and_multi_task_runs(run):
+def test_a_task_has_the_same_layouts_in_single_and_multi_task_runs(run, monkeypatch):
     keys = []
 
     def evaluate(policy, env, key, episodes, **_):
         keys.append((env, key))
         return Result(0.5, episodes, (0.4, 0.6), (), 30.0, {}, {}, poses=())
 
+    monkeypatch.setattr(callback, "evaluate", evaluate)
     for tasks in (run.config.tasks, run.config.tasks[1:]):
         run.config = dataclasses.replace(run.config, tasks=tasks)
-        evaluation = Evaluation(lambda _, task: (task, None), evaluate)
+        evaluation = Evaluation()
         for when in ("before", "at step 100", "after"):
             evaluation._evaluate_tasks(run, when)
     pick_place = [key for task, key in keys if task == "pick_place"]

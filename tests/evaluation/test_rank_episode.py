@@ -53,8 +53,9 @@ def policy(request, tmp_path_factory):
     return nano_policy(tmp_path_factory.mktemp("nano") / "run", NANO[request.param])
 
 
-@pytest.mark.parametrize("camera", ["side", "wrist"])
-@pytest.mark.parametrize(("row", "column"), [(0, 0), (0, 3), (2, 1), (3, 0)])
+@pytest.mark.parametrize(
+    ("camera", "row", "column"), [("side", 0, 3), ("side", 2, 1), ("wrist", 0, 0), ("wrist", 3, 0)]
+)
 def test_a_painted_patch_changes_only_its_own_rank(policy, camera, row, column):
     """Painted inside its patch, because resizing blurs the border."""
     config = policy.model.config
@@ -139,7 +140,7 @@ def test_the_robot_executes_some_actions_of_a_chunk(tmp_path):
     settings = {"execute_steps": 3, "denoise_steps": 2}
     config = {**to_json(CONFIG), "evaluation": settings}
     found = rank_episode.play(policy, env, config, key)
-    rollout = jax.jit(make_rollout(env, execute_steps=3, denoise_steps=2))(policy, key)
+    rollout = make_rollout(env, execute_steps=3, denoise_steps=2)(policy, key)
     steps = int(rollout.steps[0])
     assert len(found.poses.geom_xpos) == steps
     assert found.success == rollout.success[0]

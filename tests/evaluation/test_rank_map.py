@@ -29,11 +29,6 @@ def refused(capsys, *arguments):
     return printed
 
 
-def test_an_unfinished_run(folder, capsys):
-    (folder / "results.json").unlink()
-    assert "no finished run in" in refused(capsys, folder)
-
-
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
@@ -49,13 +44,12 @@ def test_runs_without_a_map(changes, reason, folder, capsys):
     assert not [*folder.glob("rank_map_*")]
 
 
-def test_an_unknown_task(folder, capsys):
+def test_a_run_without_its_policy_its_results_or_the_task(folder, capsys):
+    assert "contains no policy" in refused(capsys, folder)
     line = refused(capsys, folder, "--task", "pres")
     assert f"the tasks of {folder} are press, got 'pres'" in line
-
-
-def test_a_run_without_its_policy(folder, capsys):
-    assert "contains no policy" in refused(capsys, folder)
+    (folder / "results.json").unlink()
+    assert "no finished run in" in refused(capsys, folder)
 
 
 def test_every_task_gets_a_film(folder, capsys, monkeypatch):

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from envs.state import Poses
+from lorasp_jax.evaluation.programs import Rollout
 from lorasp_jax.evaluation.results import _result
-from lorasp_jax.evaluation.rollout import Rollout
 
 
 def batch(success, steps, counts, randomized=None):

@@ -1,6 +1,7 @@
-"""Closed-loop rollouts: lowering for every platform, and their results."""
+"""Closed-loop rollouts in simulation, and lowering of the policy for every platform."""
 
 import dataclasses
+import functools
 
 import jax
 import numpy as np
@@ -8,25 +9,11 @@ import pytest
 
 import envs
 from lorasp_jax.evaluation import evaluate, make_rollout
-from lorasp_jax.evaluation.rollout import _max_rank
-from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP
+from lorasp_jax.evaluation.programs import predict
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Offline
 from tests.runs import CONFIG, make_run
-
-
-@pytest.fixture(scope="module")
-def env():
-    return envs.make("press", robot="piper", num_envs=2, image_size=32)
-
-
-def policy_with(folder, env, targets=CONFIG.targets, **fields):
-    peft = LoRASP(rank=8, hidden_width=8, **fields)
-    config = dataclasses.replace(CONFIG, peft=peft, targets=targets)
-    policy = make_run(folder, config).policy
-    prompts = PromptTable.of(Offline(), env.instructions, policy.model.config, num_joints=6)
-    return Policy(policy.model, dataclasses.replace(policy.processor, prompts=prompts))
 
 
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
@@ -38,21 +25,28 @@ def policy_with(folder, env, targets=CONFIG.targets, **fields):
         pytest.param("tpu", "TPU v5e", "bisection", marks=pytest.mark.slow),
     ],
 )
-def test_lowers_for(platform, kind, gate, env, tmp_path):
-    policy = policy_with(tmp_path / "run", env, ("q_proj",))
+def test_lowers_for(platform, kind, gate, tmp_path):
+    policy = make_run(tmp_path / "run", dataclasses.replace(CONFIG, targets=("q_proj",))).policy
     device = jax.sharding.AbstractDevice(device_kind=kind, num_cores=None, platform=platform)
     mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
-    shapes = jax.eval_shape(lambda: (policy, jax.random.key(0)))
+    images = {name: np.zeros((2, 32, 32, 3), np.uint8) for name in ("side", "wrist")}
+    observation = {"image": images, "state": np.zeros((2, 7), np.float32)}
+    rows, done = np.zeros(2, np.int32), np.zeros(2, bool)
+    inputs = jax.random.key(0), np.int32(0), observation, rows, done
+    shapes = jax.eval_shape(lambda: (policy.with_sampler(), *inputs))
     with jax.sharding.use_abstract_mesh(mesh):
-        traced = jax.jit(make_rollout(env, execute_steps=4, denoise_steps=2)).trace(*shapes)
+        traced = jax.jit(functools.partial(predict, denoise_steps=2)).trace(*shapes)
         text = traced.lower(lowering_platforms=(platform,)).as_text()
     assert ("__gpu$xla.gpu.triton" in text) == (gate == "pallas")
 
 
 @pytest.mark.slow
-def test_evaluate(env, tmp_path):
-    policy = policy_with(tmp_path / "run", env)
-    rollout = jax.jit(make_rollout(env, execute_steps=4, denoise_steps=1))
+def test_evaluate(tmp_path):
+    env = envs.make("press", robot="piper", num_envs=2, image_size=32)
+    policy = make_run(tmp_path / "run").policy
+    prompts = PromptTable.of(Offline(), env.instructions, policy.model.config, num_joints=6)
+    policy = Policy(policy.model, dataclasses.replace(policy.processor, prompts=prompts))
+    rollout = make_rollout(env, execute_steps=4, denoise_steps=1)
     reported = []
     result = evaluate(
         policy,
@@ -83,29 +77,3 @@ def test_evaluate(env, tmp_path):
     assert (again.success, again.steps) == (result.success, result.steps)
     with pytest.raises(ValueError, match="num_episodes must be a positive multiple of 2, got 3"):
         evaluate(policy, env, jax.random.key(0), 3, rollout=rollout)
-
-
-@pytest.mark.slow
-def test_a_sampler_gives_the_same_rollout(env, tmp_path):
-    policy = policy_with(tmp_path / "run", env)
-    rollout = make_rollout(env, execute_steps=4, denoise_steps=1)
-    trace = jax.make_jaxpr(rollout, return_shape=True)
-    (one, shapes), (other, others) = (
-        trace(p, jax.random.key(0)) for p in (policy, policy.with_sampler())
-    )
-    assert shapes == others
-    assert shapes.active_rank_histogram["action"].shape[-1] == 9
-    assert loop_body(one) == loop_body(other)  # the sampler is created before the loop
-    assert len(one.eqns) > len(other.eqns)
-
-
-def loop_body(jaxpr):
-    """Return the body of a rollout's loop."""
-    (body,) = (e.params["jaxpr"] for e in jaxpr.eqns if e.primitive.name == "scan")
-    return str(body)
-
-
-def test_max_rank(tmp_path):
-    lora = make_run(tmp_path / "lora", dataclasses.replace(CONFIG, peft=LoRA(rank=5))).policy
-    full = make_run(tmp_path / "full", dataclasses.replace(CONFIG, peft=FullFineTuning())).policy
-    assert [_max_rank(policy.with_sampler()) for policy in (lora, full)] == [5, 0]

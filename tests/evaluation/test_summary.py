@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from lorasp_jax.evaluation import Result
+from lorasp_jax.evaluation import Result, callback
 from lorasp_jax.evaluation.callback import Evaluation, success, summarize
 from lorasp_jax.training import records
 from lorasp_jax.training.run_folder import read_json, write_json
@@ -44,11 +44,12 @@ def test_summary(tmp_path):
     assert 0 < summary["trainable_parameters"] < summary["total_parameters"]
 
 
-def test_summary_without_evaluation_of_the_base(tmp_path):
+def test_summary_without_evaluation_of_the_base(tmp_path, monkeypatch):
     run = make_run(tmp_path / "run")
     settings = dataclasses.replace(run.config.evaluation, before=False)
     run.config = dataclasses.replace(run.config, evaluation=settings)
-    Evaluation(evaluate=lambda *_, **__: pytest.fail("evaluated")).on_start(run)
+    monkeypatch.setattr(callback, "evaluate", lambda *_, **__: pytest.fail("evaluated"))
+    Evaluation().on_start(run)
     assert not (run.folder / "before.json").exists()
     summary = summarize(run, {"press": result(0.9, RANKS)})
     assert summary["tasks"]["press"].keys() == {"after"}

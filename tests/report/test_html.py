@@ -5,17 +5,21 @@ import re
 
 import pytest
 
+from lorasp_jax.report import figures
 from lorasp_jax.report.html import speed, write_report
 from lorasp_jax.training.run_folder import STOPPED, MetricsLog, to_json, write_json
 from tests.runs import CONFIG, RESULTS, finish
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path, monkeypatch):
+    """A finished run; drawing its figures takes most of a report's time."""
+    monkeypatch.setattr(figures, "svg", lambda _: "<svg/>")
     return finish(tmp_path)
 
 
-def test_report_shows_the_results_and_is_self_contained(folder):
+def test_report_shows_the_results_and_is_self_contained(folder, monkeypatch):
+    monkeypatch.undo()
     page = write_report(folder).read_text()
     assert "75.0 % [63.2, 84.0] of 64" in page
     assert "3.1 % [0.9, 10.7] of 64" in page
@@ -66,13 +70,9 @@ def test_unfinished_run(folder):
         write_report(folder)
 
 
-def without_base(folder):
+def test_run_without_evaluation_of_the_base(folder):
     tasks = {task: {"after": value["after"]} for task, value in RESULTS["tasks"].items()}
     write_json(folder / "results.json", RESULTS | {"tasks": tasks})
-
-
-def test_run_without_evaluation_of_the_base(folder):
-    without_base(folder)
     page = write_report(folder).read_text()
     assert "before" not in page.partition("<h2>Settings")[0]
     assert "<tr><th>task</th><th>after</th></tr>" in page
@@ -121,32 +121,11 @@ def test_median_speed_and_peak_memory(folder):
     assert "data wait" not in page
 
 
-def test_small_memory_is_not_zero(folder):
-    assert speed([{"memory/peak_gib": 3 / 1024}]) == {"peak memory": "3.0 MiB"}
-
-
-def test_page_adapts_to_screen_width_and_color_scheme(folder):
-    page = write_report(folder).read_text()
-    assert "<meta name=viewport content='width=device-width, initial-scale=1'>" in page
-    style = page.partition("<style>")[2].partition("</style>")[0]
-    assert "color-scheme: light dark" in style
-    assert "@media (prefers-color-scheme: dark)" in style
-    assert not re.search(r"#[0-9a-f]{3,6}", style.partition("body {")[2])  # otherwise by variable
-
-
 def test_data_wait_is_a_fraction_of_all_time():
     rate, wait = "speed/samples_per_second", "speed/data_wait"
     rows = [{rate: 10.0}, {rate: 10.0, wait: 0.0}, {rate: 5.0, wait: 0.5}]  # 1, 1 and 2 seconds
     assert speed(rows)["data wait"] == "25.0%"
-
-
-def test_video_is_readable(folder):
-    import av
-
-    with av.open(str(folder / "rollout_press.mp4")) as container:
-        stream = container.streams.video[0]
-        assert (stream.width, stream.height, stream.codec_context.pix_fmt) == (64, 32, "yuv420p")
-        assert sum(1 for _ in container.decode(stream)) == 4
+    assert speed([{"memory/peak_gib": 3 / 1024}]) == {"peak memory": "3.0 MiB"}
 
 
 @pytest.mark.parametrize("name", ["cameras_press.png", "rollout_press.mp4"])

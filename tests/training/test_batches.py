@@ -14,9 +14,10 @@ from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.optim import make_optimizer
 from lorasp_jax.training.random_streams import StepKeys
 from lorasp_jax.training.step import init_state
-from tests.runs import CONFIG, make_run, random_episodes
+from tests.runs import CONFIG, Miniature, make_run, random_episodes
 
 KEY = jax.random.key(3)
+SMALL = dataclasses.replace(CONFIG, targets=("inp", "out"))
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +38,7 @@ def test_batches_do_not_depend_on_the_number_of_steps_per_call(drawn):
 
 
 def test_a_batch_is_that_of_sample_batch(drawn, steps, tmp_path):
-    processor = make_run(tmp_path / "run", CONFIG).policy.processor
+    processor = make_run(tmp_path / "run", SMALL, Miniature()).policy.processor
     raw = jax.tree.map(lambda x: x[0], drawn.take(KEY, 7, 1))
     found = encode(StepKeys.of(KEY, 7).state_noise, raw, processor, state_noise=0.1)
     batch_key, _ = jax.random.split(jax.random.fold_in(KEY, 7))
@@ -67,7 +68,7 @@ def test_other_demonstrations_have_the_same_program(tmp_path):
     """Even if the number of tasks differs."""
 
     def lowered(name, *tasks):
-        run = make_run(tmp_path / name, dataclasses.replace(CONFIG, tasks=tasks))
+        run = make_run(tmp_path / name, dataclasses.replace(SMALL, tasks=tasks), Miniature())
         graphdef, adapters, frozen = adaptation.split(run.policy.model)
         methods = adaptation.methods(run.policy.model).values()
         optimizer = make_optimizer(run.config.optim, methods)

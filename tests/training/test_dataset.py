@@ -5,13 +5,9 @@ import io
 import json
 import time
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-import pytest
 from rich.console import Console
 
-from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import DataConfig, ModelConfig
 from lorasp_jax.data.batches import flatten
 from lorasp_jax.evaluation.callback import NoEvaluation
@@ -20,97 +16,23 @@ from lorasp_jax.models.smolvla import SmolVLAConfig
 from lorasp_jax.report.html import write_report
 from lorasp_jax.training import setup
 from lorasp_jax.training.base import base_model
-from lorasp_jax.training.batches import StreamedBatches
-from lorasp_jax.training.batches import streamed as read
 from lorasp_jax.training.cost import preflight
-from lorasp_jax.training.cost.speed import Speed
-from lorasp_jax.training.distributed import mesh as meshes
-from lorasp_jax.training.loop import train
-from lorasp_jax.training.program import Program
-from lorasp_jax.training.run_folder import read_metrics, to_json, write_json
+from lorasp_jax.training.run_folder import to_json, write_json
 from tests.models.random_models import random_backbone
-from tests.runs import CONFIG, Terminate, leaves, make_run, random_episodes, repeatable
-
-
-def streamed(folder, devices=1):
-    run = make_run(folder, devices=devices)
-    run.dataset = flatten(list(run.episodes.values()))
-    run.streams = True
-    return run
-
-
-@pytest.mark.slow
-def test_a_streamed_run_resumes_to_the_bit(tmp_path):
-    whole = streamed(tmp_path / "whole")
-    _, before, _ = adaptation.split(whole.policy.model)
-    train(whole)
-    with pytest.raises(KeyboardInterrupt):
-        train(streamed(tmp_path / "halved"), [Terminate()])
-    halved = streamed(tmp_path / "halved")
-    train(halved, resume=True)
-    assert [row["step"] for row in read_metrics(whole.folder)] == [2, 4]
-    assert repeatable(whole.folder) == repeatable(halved.folder)
-    assert all(0 <= row["speed/data_wait"] < 1 for row in read_metrics(whole.folder))
-    _, adapters, _ = adaptation.split(whole.policy.model)
-    _, resumed, _ = adaptation.split(halved.policy.model)
-    for name, value in leaves(adapters).items():
-        np.testing.assert_array_equal(value, leaves(resumed)[name], err_msg=name)
-        assert (value != leaves(before)[name]).any()
-
-
-@pytest.mark.slow
-def test_every_step_has_the_next_batch(tmp_path):
-    """Starting at the step where the run resumes, for any number of calls."""
-    run = streamed(tmp_path / "run")
-    mesh = meshes.make_mesh()
-
-    @jax.jit
-    def record(frozen, batches, state, key):
-        assert len(batches.state) == 1
-        return state + 1, {"sum": jnp.atleast_1d(batches.state.sum() + frozen)}
-
-    def sums(start, *counts):
-        speed = Speed(8, None)
-        steps = Program(record, 1.0, StreamedBatches(read(run, mesh, start), speed), speed)
-        state, totals = jnp.asarray(start), []
-        for count in counts:
-            state, metrics = steps(state, jax.random.key(0), int(state), count)
-            assert metrics["sum"].shape == (count,)
-            totals += [float(metrics["sum"].sum())]
-        assert state == start + sum(counts)
-        return totals
-
-    batches = read(run, mesh, 0)
-    each = [float(next(batches).state.sum() + 1) for _ in range(9)]
-    near = {"rtol": 1e-5, "atol": 1e-5}  # another program sums in another order
-    expected = [sum(each[:2]), sum(each[2:6]), sum(each[6:])]
-    np.testing.assert_allclose(sums(0, 2, 4, 3), expected, **near)
-    np.testing.assert_allclose(sums(5, 1, 3), [each[5], sum(each[6:])], **near)
-    shards = next(batches).image["side"].addressable_shards
-    assert [shard.data.shape[:2] for shard in shards] == [(1, 1)] * 8
-
-
-@pytest.mark.slow
-def test_a_streamed_run_on_eight_devices(tmp_path):
-    """The batch is sharded over them; the losses equal those of one device."""
-    many = streamed(tmp_path / "many", devices=8)
-    train(many)
-    one = streamed(tmp_path / "one")
-    train(one)
-    rows = zip(read_metrics(one.folder), read_metrics(many.folder), strict=True)
-    for expected, found in rows:
-        assert found["task"] == pytest.approx(expected["task"], rel=1e-5)
+from tests.runs import CONFIG, make_run, random_episodes
 
 
 def prepare(folder, monkeypatch, source, available=2**40, model_config=None):
     model = random_backbone(model_config or Pi0Config.dummy())
     monkeypatch.setattr(preflight, "available_bytes", lambda: available)
+    remat = "none", preflight.Memory(*6 * [0.0])
+    monkeypatch.setattr(preflight, "choose_remat", lambda *_: remat)
     evaluation = dataclasses.replace(CONFIG.evaluation, execute_steps=1)
     data = DataConfig(source=str(source))
     config = dataclasses.replace(CONFIG, data=data, evaluation=evaluation)
     console = Console(file=io.StringIO(), width=200)
-    load_base = lambda *_, **__: (model, "")  # noqa: E731
-    return setup.prepare(config, folder, console, time.perf_counter(), load_base=load_base)
+    monkeypatch.setattr(setup, "base_model", lambda *_, **__: (model, ""))
+    return setup.prepare(config, folder, console, time.perf_counter())
 
 
 def test_prepare(tmp_path, monkeypatch):
@@ -129,9 +51,6 @@ def test_prepare(tmp_path, monkeypatch):
     slots = np.array(run.policy.processor.robot_slots)
     np.testing.assert_allclose(known["mean"][slots], expected.action.mean(0), atol=1e-6)
     small = 2**21
-    monkeypatch.setattr(
-        preflight, "choose_remat", lambda *_: ("none", preflight.Memory(*6 * [0.0]))
-    )
     assert not prepare(tmp_path, monkeypatch, "removed, but cached", small).streams
     (tmp_path / "dataset.json").unlink()
     assert prepare(tmp_path, monkeypatch, "removed, but cached", small // 64).streams

@@ -10,8 +10,8 @@ import pytest
 from rich.console import Console
 
 from lorasp_jax.config import EvaluationConfig
-from lorasp_jax.evaluation.callback import Evaluation
-from lorasp_jax.evaluation.programs import split_rollout
+from lorasp_jax.evaluation import callback
+from lorasp_jax.evaluation.programs import make_rollout
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import LoRA
 from lorasp_jax.training import early, loop, program, setup
@@ -45,16 +45,15 @@ def prepare(monkeypatch, tmp_path):
         CONFIG, peft=LoRA(rank=4), targets=("action_out_proj",), evaluation=settings
     )
 
-    def load_base(*_, **__):
-        return random_backbone(Pi0Config.dummy()), ""
+    base = random_backbone(Pi0Config.dummy()), ""
+    monkeypatch.setattr(setup, "base_model", lambda *_, **__: base)
 
     def collect(config, *_):
         return {task: random_episodes(task, 0) for task in config.tasks}
 
     def prepare(*meanwhile, collect=collect):
         console = Console(file=io.StringIO())
-        options = {"load_base": load_base, "collect": collect, "meanwhile": meanwhile}
-        return setup.prepare(config, tmp_path, console, 0.0, **options)
+        return setup.prepare(config, tmp_path, console, 0.0, collect=collect, meanwhile=meanwhile)
 
     return prepare
 
@@ -73,11 +72,12 @@ def test_the_run_compiles_nothing_else(prepare, monkeypatch):
 
     def compile_rollout(run, task):
         del run, task
-        return ROOM, split_rollout(ROOM, execute_steps=1, denoise_steps=2)
+        return ROOM, make_rollout(ROOM, execute_steps=1, denoise_steps=2)
 
     monkeypatch.setattr(program, "jit_steps", recorded)
     monkeypatch.setattr(loop, "jit_steps", recorded)
-    evaluation = Evaluation(compile_rollout, write_video=None)
+    monkeypatch.setattr(callback, "compiled_rollout", compile_rollout)
+    evaluation = callback.Evaluation(media=False)
     with compilations() as counts:
         run = prepare(early.compile_training, evaluation.compile_early)
     assert counts == POLICY | dict.fromkeys(WORLD, 1)

@@ -2,9 +2,6 @@
 
 import dataclasses
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import jax
@@ -16,25 +13,18 @@ from flax import nnx
 from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io import native
+from lorasp_jax.base import hub
 from lorasp_jax.base.digest import with_digest
 from lorasp_jax.config import ModelConfig
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import FullFineTuning
 from lorasp_jax.policies import tokenizer
 from lorasp_jax.policies.policy import Policy
-from lorasp_jax.policies.processor import Statistics
 from lorasp_jax.training import base, export
-from tests import ROOT
 from tests.models.random_models import random_backbone
 from tests.runs import CONFIG, leaves, make_run
 
 BASES = sorted(path.parent for path in Path("assets").glob("*/config.json"))
-
-
-def perturbed(run):
-    """Change every trainable parameter, as training would."""
-    run.policy = with_random_adapters(run.policy)
-    return run
 
 
 def with_random_adapters(policy):
@@ -45,34 +35,26 @@ def with_random_adapters(policy):
     return Policy(nnx.merge(graphdef, jax.tree.map(randomize, adapters), frozen), policy.processor)
 
 
-@pytest.mark.slow
-def test_adapters(tmp_path):
-    run = perturbed(make_run(tmp_path / "run"))
-    export.write(run)
-    assert {path.name for path in run.folder.iterdir()} == {"adapter.safetensors", "adapter.json"}
-    metadata = json.loads((run.folder / "adapter.json").read_text())["metadata"]
-    assert (metadata["robot"], metadata["control_dt"]) == ("piper", 0.1)
-    assert Statistics.from_json(json.dumps(metadata["policy"]["statistics"]))
-    base_model = random_backbone(Pi0Config.dummy())
-    loaded = native.load_adapters(run.folder, base_model, base=run.base_hash)
-    expected = leaves(adaptation.split(run.policy.model)[1])
-    for name, value in leaves(adaptation.split(loaded)[1]).items():
-        np.testing.assert_array_equal(value, expected[name], err_msg=name)
-    with pytest.raises(ValueError, match="was trained on base"):
-        native.load_adapters(run.folder, base_model, base="another")
+def run_on_a_base(folder, method=CONFIG.peft):
+    """Make a run in `folder`/run on a base in `folder`/base."""
+    models.save(folder / "base", random_backbone(Pi0Config.dummy()))
+    model_config = dataclasses.replace(CONFIG.model, checkpoint=str(folder / "base"))
+    config = dataclasses.replace(CONFIG, model=model_config, peft=method)
+    run = make_run(folder / "run", config, models.load(folder / "base"))
+    run.base_hash = models.weights_hash(folder / "base")
+    return run
 
 
 @pytest.mark.parametrize("method", [CONFIG.peft, FullFineTuning()], ids=["adapters", "base"])
 def test_a_policy_loads(tmp_path, method):
-    models.save(tmp_path / "base", random_backbone(Pi0Config.dummy()))
-    model_config = dataclasses.replace(CONFIG.model, checkpoint=str(tmp_path / "base"))
-    config = dataclasses.replace(CONFIG, model=model_config, peft=method)
-    run = make_run(tmp_path / "run", config, models.load(tmp_path / "base"))
+    run = run_on_a_base(tmp_path, method)
     run.policy = with_random_adapters(run.policy)
-    run.base_hash = models.weights_hash(tmp_path / "base")
     with pytest.raises(ValueError, match="contains no policy: no run has finished there"):
         export.load_policy(run.folder)
     export.write(run)
+    described = export.describe(run.folder)
+    assert (described["robot"], described["tasks"]) == ("piper", ["press", "pick_place"])
+    assert (described["control_dt"], described["physics_dt"]) == (0.1, 0.005)
     loaded = export.load_policy(run.folder)
     found, expected = leaves(loaded.processor), leaves(run.policy.processor)
     assert found.keys() == expected.keys()
@@ -84,18 +66,9 @@ def test_a_policy_loads(tmp_path, method):
         np.testing.assert_array_equal(value, expected[name], err_msg=name)
 
 
-ELSEWHERE = """
-import sys, huggingface_hub
-huggingface_hub.snapshot_download = lambda *_, **__: sys.exit("the Hub was contacted")
-from lorasp_jax import models
-from lorasp_jax.training.export import load_policy
-print(models.weights_hash(load_policy(sys.argv[1]).model))
-"""
-
-
 @pytest.mark.parametrize("kind", ["shipped", "folder"])
 def test_a_policy_loads_from_another_working_directory(tmp_path, monkeypatch, kind):
-    """In a new process, where the base's relative path leads to another model."""
+    """Where the base's relative path leads to another model."""
     if kind == "shipped":
         model_config = ModelConfig()
     else:
@@ -108,23 +81,15 @@ def test_a_policy_loads_from_another_working_directory(tmp_path, monkeypatch, ki
     export.write(run)
     elsewhere = tmp_path / "elsewhere"
     models.save(elsewhere / model_config.source, random_backbone(Pi0Config.dummy(), seed=1))
-    command = [sys.executable, "-c", ELSEWHERE, str(run.folder)]
-    env = os.environ | {"PYTHONPATH": str(ROOT)}
-    found = subprocess.run(
-        command, check=False, cwd=elsewhere, env=env, capture_output=True, text=True
-    )
-    assert found.stdout.split() == [run.base_hash], found.stderr
+    monkeypatch.chdir(elsewhere)
+    monkeypatch.setattr(hub, "_from_hub", lambda *_: pytest.fail("the Hub was contacted"))
+    loaded = export.load_policy(run.folder).model
+    assert models.weights_hash(loaded) == run.base_hash
 
 
 def test_the_error_for_a_missing_base_suggests_a_remedy(tmp_path, monkeypatch):
+    export.write(run_on_a_base(tmp_path))
     monkeypatch.chdir(tmp_path)
-    models.save("base", random_backbone(Pi0Config.dummy()))
-    model_config = dataclasses.replace(CONFIG.model, checkpoint="base")
-    run = make_run(
-        tmp_path / "run", dataclasses.replace(CONFIG, model=model_config), models.load("base")
-    )
-    run.base_hash = models.weights_hash("base")
-    export.write(run)
     (tmp_path / "base").rename("moved")
     message = rf"^{tmp_path / 'base'} does not exist.*; pass base= if the base of .*run has moved$"
     with pytest.raises(ValueError, match=message):
@@ -137,10 +102,7 @@ def test_the_error_for_a_missing_base_suggests_a_remedy(tmp_path, monkeypatch):
 
 
 def test_another_tokenizer_is_rejected(tmp_path, monkeypatch):
-    models.save(tmp_path / "base", random_backbone(Pi0Config.dummy()))
-    model_config = dataclasses.replace(CONFIG.model, checkpoint=str(tmp_path / "base"))
-    config = dataclasses.replace(CONFIG, model=model_config)
-    run = make_run(tmp_path / "run", config, models.load(tmp_path / "base"))
+    run = run_on_a_base(tmp_path)
     export.write(run)
     encode = tokenizer.Offline.encode
 
@@ -165,23 +127,6 @@ def test_an_incomplete_policy_is_rejected(tmp_path, changes):
     (tmp_path / "adapter.json").write_text(json.dumps(with_digest(facts)))
     with pytest.raises(ValueError, match=r"does not describe a policy|was random"):
         export.load_policy(tmp_path)
-
-
-@pytest.mark.slow
-def test_base(tmp_path):
-    config = dataclasses.replace(CONFIG, peft=FullFineTuning(), targets=(".*",))
-    run = perturbed(make_run(tmp_path / "run", config))
-    counts = adaptation.count(run.policy.model)
-    assert counts.trainable == counts.total
-    export.write(run)
-    folder = run.folder / "base"
-    loaded = models.load(folder, Pi0Config.dummy())
-    expected = leaves(nnx.state(adaptation.merge(run.policy.model), nnx.Param))
-    for name, value in leaves(nnx.state(loaded, nnx.Param)).items():
-        np.testing.assert_array_equal(value, expected[name].astype(jnp.bfloat16).astype(np.float32))
-    training = json.loads((folder / base.TRAINING).read_text())
-    assert (training["robot"], training["tasks"]) == ("piper", ["press", "pick_place"])
-    assert (training["control_dt"], training["physics_dt"]) == (0.1, 0.005)
 
 
 @pytest.mark.parametrize("path", BASES, ids=lambda path: path.name)

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from lorasp_jax.data.batches import fit_to_size, flatten, windows
+from lorasp_jax.peft import LoRA
 from lorasp_jax.training import demonstrations
 from lorasp_jax.training.loop import train
 from tests.runs import CONFIG, Miniature, Terminate, make_run, random_episodes, repeatable
 
-SAME = dataclasses.replace(CONFIG, targets=("inp", "out"))
+SAME = dataclasses.replace(CONFIG, peft=LoRA(rank=4), targets=("inp", "out"))
 FRESH = dataclasses.replace(SAME, data=dataclasses.replace(SAME.data, fresh_every=2))
 
 

@@ -43,11 +43,13 @@ def main(args: argparse.Namespace) -> None:
 
 def prepare(folder: Path, steps: int, devices: int | None = None):
     """Return a run that logs and saves at every step."""
+    from lorasp_jax.peft import LoRA
     from tests.runs import CONFIG, Miniature, make_run
 
     # Two processes have 16 devices, and a batch is a multiple of that.
     config = dataclasses.replace(
         CONFIG,
+        peft=LoRA(rank=4),  # compiles faster than others
         optim=dataclasses.replace(CONFIG.optim, steps=steps, batch_size=16),
         targets=("inp", "out"),
         log_every=1,

@@ -88,7 +88,7 @@ def delayed_rollout(
     """Create a function (policy, key, d) that runs `env.num_envs` episodes with a delay of d steps.
 
     No program depends on d. Without delay, synchronous and naive execution are the rollout of
-    `programs.split_rollout`, bit for bit.
+    `evaluation.make_rollout`, bit for bit.
 
     Raises:
         ValueError: see `check_delay`, by the function that is returned.

@@ -47,7 +47,7 @@ def _train(job: Job) -> dict[str, Any]:
     _source.cache_clear()
     console, started = Console(width=WIDTH), time.perf_counter()
     collect = functools.partial(shared_demonstrations, job.study_folder)
-    callbacks = [Export()] if job.cell.evaluate else [Export(), Evaluation(write_video=None)]
+    callbacks = [Export()] if job.cell.evaluate else [Export(), Evaluation(media=False)]
     with open_run(job.config, job.folder.parent, resume="auto"):
         run = setup.prepare(job.config, job.folder, console, started, collect=collect)
         loop.train(run, callbacks, resume=True)
@@ -66,7 +66,7 @@ def _derive(job: Job) -> dict[str, Any]:
             episodes = held_out_demonstrations(job.study_folder, job.config)
             run.policy = job.cell.transform(source, job.results, episodes)
     if not job.cell.evaluate:
-        Evaluation(write_video=None).on_end(run)
+        Evaluation(media=False).on_end(run)
     return _finish(job, run, source)
 
 

@@ -134,7 +134,8 @@ def _use_cudnn(q: jax.Array, k: jax.Array, mask: jax.Array | None) -> bool:
     even = mask is not None or (queries % 2 == 0 and keys % 2 == 0)  # masked inputs get padded
     supported = CUDNN_MIN_HEAD_DIM <= head_dim <= 256 and head_dim % 8 == 0 and even
     large = queries >= CUDNN_MIN_QUERIES
-    return jax.default_backend() == "gpu" and half_precision and supported and large
+    on_gpu = platform() == jax.default_backend() == "gpu"  # cannot be lowered elsewhere
+    return on_gpu and half_precision and supported and large
 
 
 def _use_cached_attention(q: jax.Array, mask: jax.Array) -> bool:

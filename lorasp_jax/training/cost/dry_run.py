@@ -8,15 +8,12 @@ from rich.console import Console
 from lorasp_jax.base import hub
 from lorasp_jax.config import Config
 from lorasp_jax.training import early, setup
-from lorasp_jax.training.base import base_model
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.cost.preflight import byte_unit
 from lorasp_jax.training.run import Run
 
 
-def dry_run(
-    config: Config, folder: Path, console: Console, load_base: setup.LoadBase = base_model
-) -> None:
+def dry_run(config: Config, folder: Path, console: Console) -> None:
     """Build the run, compile its training step and print the cost, without writing to `folder`.
 
     A dataset cache in `folder` is used if present.
@@ -24,7 +21,7 @@ def dry_run(
     Raises:
         ValueError: see `setup.build`.
     """
-    built = setup.build(config, folder, abstract=True, load_base=load_base)
+    built = setup.build(config, folder, abstract=True)
     remote = (config.model.source, config.model.tokenizer)
     if names := [name for name in remote if hub.is_remote(name)]:
         console.print(f"not downloaded for a dry run: {', '.join(names)}", soft_wrap=True)

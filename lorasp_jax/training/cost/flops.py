@@ -17,12 +17,10 @@ PEAK = {"NVIDIA H200": 989e12, "NVIDIA H100": 989e12, "NVIDIA A100": 312e12, "TP
 """Dense bf16 FLOP/s by prefix of the device name (NVIDIA's and Google's data sheets; SXM variants,
 without sparsity)."""
 
-_CUDNN = {"dot_product_attention_fwd_wrapper": 4, "dot_product_attention_bwd_wrapper": 8}
-"""FLOPs of cuDNN attention in units of batch size x heads x queries x keys x head size. The forward
-pass has two matrix products, the backward pass four; a fifth is recomputation and not counted."""
-
-_SHORT_ATTENTION = {"short_attention_forward": 4, "short_attention_backward": 8}
-"""The same for `kernels.short_attention`."""
+_CPU = jax.sharding.AbstractMesh(
+    (), (), abstract_device=jax.sharding.AbstractDevice("cpu", num_cores=None, platform="cpu")
+)
+"""Traced for it, a function has no GPU kernels, whose matrix products a jaxpr does not show."""
 
 
 def count(function: Callable, *arguments: Any) -> float:
@@ -31,7 +29,8 @@ def count(function: Callable, *arguments: Any) -> float:
     Operations with unused results are not counted. `function` must work with `jax.jit`;
     `arguments` are arrays or `jax.ShapeDtypeStruct`s.
     """
-    jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
+    with jax.sharding.use_abstract_mesh(_CPU):
+        jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
     return _jaxpr_flops(_compat.eliminate_dead_code(jaxpr, [True] * len(jaxpr.outvars))[0])
 
 
@@ -47,12 +46,6 @@ def peak() -> float | None:
     return next((value for name, value in PEAK.items() if kind.startswith(name)), None)
 
 
-def bodies(equation: Any) -> list[Any]:
-    """Return the jaxprs among the parameters of an equation, such as the body of a loop."""
-    values = [getattr(value, "jaxpr", value) for value in equation.params.values()]
-    return [value for value in values if hasattr(value, "eqns")]
-
-
 def _jaxpr_flops(jaxpr: Any) -> float:
     return sum(_equation_flops(equation) for equation in jaxpr.eqns)
 
@@ -63,21 +56,10 @@ def _equation_flops(equation: Any) -> float:
         (contracted, _), _ = params["dimension_numbers"]
         left = equation.invars[0].aval.shape
         return 2.0 * equation.outvars[0].aval.size * math.prod(left[i] for i in contracted)
-    if name in _CUDNN:
-        query, key = (v.aval.shape for v in equation.invars[:2])
-        batch, tokens, heads, size = query
-        return float(_CUDNN[name] * batch * heads * tokens * key[1] * size)
-    if name == "pallas_call" and params.get("name") in _SHORT_ATTENTION:
-        # Only the outputs always have the axes of jax.vmap. The first one has the shape of q.
-        size, keys = equation.outvars[0].aval.size, equation.invars[1].aval.shape[-3]
-        return float(_SHORT_ATTENTION[params["name"]] * size * keys)
-    if name == "pallas_call" and params.get("name") == "cached_attention":
-        # The first output [B, P, T, N, H] has a part for each of P programs that share the keys.
-        output, mask = equation.outvars[0].aval, equation.invars[1].aval
-        return 4.0 * output.size / output.shape[-4] * mask.shape[-1]
     if name == "cond":
         return max(_jaxpr_flops(branch.jaxpr) for branch in params["branches"])
     if name == "while":  # the number of iterations is unknown: count one
         return _jaxpr_flops(params["body_jaxpr"].jaxpr)
-    once = sum(map(_jaxpr_flops, bodies(equation)))
+    values = [getattr(value, "jaxpr", value) for value in params.values()]
+    once = sum(_jaxpr_flops(value) for value in values if hasattr(value, "eqns"))
     return once * (params["length"] if name == "scan" else 1)

@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import os
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 from flax import nnx
@@ -61,15 +61,6 @@ class Memory:
         return f"{', '.join(parts)}, peak {self.peak / unit:.2f} {name}"
 
 
-class AbstractStep(NamedTuple):
-    """The loss of a training step, (adapters, frozen, batch) -> loss, metrics, and input shapes."""
-
-    loss: Callable[[Any, Any, Batch], tuple[jax.Array, Metrics]]
-    adapters: Any
-    frozen: Any
-    batch: Batch
-
-
 def choose_remat(
     config: Config, backbone: BackboneConfig, available: float
 ) -> tuple[Remat, Memory]:
@@ -96,17 +87,17 @@ def estimate_memory(config: Config, backbone: BackboneConfig) -> Memory:
     """Estimate the memory of one training step, sharded over `config.fsdp` devices."""
     local_batch = max(1, config.optim.batch_size // jax.device_count())
     micro_batch = max(1, local_batch // config.optim.accumulate)
-    step = abstract_step(config, backbone, micro_batch)
+    _, (shapes, frozen, _) = abstract_step(config, backbone, micro_batch)
     optimizer = make_optimizer(config.optim, {config.peft.as_saved})
     init = functools.partial(init_state, optimizer=optimizer, ema=config.optim.ema > 0)
     local_bytes = functools.partial(meshes.bytes_on_device, fsdp=config.fsdp)
-    adapters = local_bytes(step.adapters)
+    adapters = local_bytes(shapes)
     saved = functools.partial(_saved_bytes, config, size=micro_batch)
     return Memory(
-        base=local_bytes(step.frozen),
+        base=local_bytes(frozen),
         adapters=adapters,
         gradients=adapters * (1 if config.optim.accumulate == 1 else 2),
-        optimizer=local_bytes(jax.eval_shape(init, step.adapters)) - adapters,
+        optimizer=local_bytes(jax.eval_shape(init, shapes)) - adapters,
         activations=saved(backbone) + nbytes(abstract_batch(backbone, local_batch)),
         recomputation=0 if backbone.remat == "none" else _recomputed_bytes(saved, backbone),
     )
@@ -126,12 +117,12 @@ def _saved_bytes(config: Config, backbone: BackboneConfig, *, size: int) -> int:
 
     Its inputs, such as the parameters, are not counted.
     """
-    step = abstract_step(config, backbone, size)
+    loss, shapes = abstract_step(config, backbone, size)
 
     def forward(adapters: Any, frozen: Any, batch: Batch) -> Any:
-        return jax.vjp(lambda a: step.loss(a, frozen, batch), adapters, has_aux=True)[1]
+        return jax.vjp(lambda a: loss(a, frozen, batch), adapters, has_aux=True)[1]
 
-    jaxpr = jax.make_jaxpr(forward)(step.adapters, step.frozen, step.batch).jaxpr
+    jaxpr = jax.make_jaxpr(forward)(*shapes).jaxpr
     inputs = {id(variable) for variable in (*jaxpr.invars, *jaxpr.constvars)}
     saved = {id(v): v.aval for v in jaxpr.outvars if id(v) not in inputs}
     return nbytes([*saved.values()])
@@ -150,8 +141,13 @@ def abstract_model(config: Config, backbone: BackboneConfig) -> Backbone:
     return nnx.eval_shape(lambda: adapted_model(config, backbone, jax.random.key(0)))
 
 
-def abstract_step(config: Config, backbone: BackboneConfig, batch_size: int) -> AbstractStep:
-    """Return the run's loss, with auxiliary weights of zero, and the shapes of its inputs."""
+def abstract_step(
+    config: Config, backbone: BackboneConfig, batch_size: int
+) -> tuple[Callable[[Any, Any, Batch], tuple[jax.Array, Metrics]], tuple[Any, Any, Batch]]:
+    """Return the run's loss, with auxiliary weights of zero, and the shapes of its inputs.
+
+    These are adapters, frozen parameters and the batch.
+    """
     graphdef, adapters, frozen = adaptation.split(abstract_model(config, backbone))
     weights: Any = dict.fromkeys(auxiliary_weights(config.auxiliary, 1), 0.0)
 
@@ -159,15 +155,14 @@ def abstract_step(config: Config, backbone: BackboneConfig, batch_size: int) -> 
         key, delay = jax.random.key(0), config.optim.rtc_max_delay
         return loss_fn(adapters, frozen, graphdef, batch, key, weights, max_delay=delay)
 
-    return AbstractStep(loss, adapters, frozen, abstract_batch(backbone, batch_size))
+    return loss, (adapters, frozen, abstract_batch(backbone, batch_size))
 
 
 def step_flops(config: Config, backbone: BackboneConfig) -> float:
     """Count the FLOPs of one training step over all devices, without recomputation."""
     backbone = dataclasses.replace(backbone, remat="none")
-    step = abstract_step(config, backbone, config.optim.batch_size)
-    gradient = jax.grad(step.loss, has_aux=True)
-    return flops.count(gradient, step.adapters, step.frozen, step.batch)
+    loss, shapes = abstract_step(config, backbone, config.optim.batch_size)
+    return flops.count(jax.grad(loss, has_aux=True), *shapes)
 
 
 def abstract_batch(config: BackboneConfig, size: int) -> Batch:

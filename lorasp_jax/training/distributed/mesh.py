@@ -4,6 +4,7 @@ The training step is written for the global batch. `jax.jit` with `NamedSharding
 over any number of devices; this replaces `pmap` (docs.jax.dev/en/latest/migrate_pmap.html).
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -43,41 +44,28 @@ def batches_sharding(mesh: Mesh) -> NamedSharding:
     return NamedSharding(mesh, PartitionSpec(None, ("data", "fsdp")))
 
 
-def split_axis(shape: Sequence[int], size: int, fsdp: int, minimum: int) -> int | None:
-    """Return the axis to shard over `fsdp` devices, or None to replicate the array.
-
-    The longest axis divisible by `fsdp` is sharded. Arrays of `size` < `minimum` bytes are
-    replicated.
-    """
-    divisible = [axis for axis, length in enumerate(shape) if length % fsdp == 0]
-    if fsdp == 1 or not divisible or size < minimum:
-        return None
-    return max(divisible, key=lambda axis: shape[axis])
-
-
 def shardings(tree: Any, mesh: Mesh, minimum: int = MINIMUM_SHARDED_BYTES) -> Any:
     """Return a sharding for each array of a tree: large arrays over "fsdp", the others replicated.
 
+    The longest axis that `fsdp` divides is sharded; arrays under `minimum` bytes are replicated.
     A sharding depends only on shape and dtype, so optimizer moments and averages of parameters are
     sharded like the parameters.
     """
 
     def sharding(array: Any) -> NamedSharding:
-        size = array.size * array.dtype.itemsize
-        axis = split_axis(array.shape, size, mesh.shape["fsdp"], minimum)
-        names = ("fsdp" if i == axis else None for i in range(array.ndim))
-        return NamedSharding(mesh, PartitionSpec(*names) if axis is not None else PartitionSpec())
+        fsdp, size = mesh.shape["fsdp"], array.size * array.dtype.itemsize
+        divisible = [axis for axis, length in enumerate(array.shape) if length % fsdp == 0]
+        if fsdp == 1 or not divisible or size < minimum:
+            return replicated(mesh)
+        longest = max(divisible, key=lambda axis: array.shape[axis])
+        names = ("fsdp" if axis == longest else None for axis in range(array.ndim))
+        return NamedSharding(mesh, PartitionSpec(*names))
 
     return jax.tree.map(sharding, tree)
 
 
-def bytes_on_device(tree: Any, fsdp: int, minimum: int = MINIMUM_SHARDED_BYTES) -> float:
+def bytes_on_device(tree: Any, fsdp: int) -> int:
     """Return the bytes per device of a tree sharded by `shardings`."""
-
-    def local_bytes(array: Any) -> float:
-        size = array.size * array.dtype.itemsize
-        is_whole = split_axis(array.shape, size, fsdp, minimum) is None
-        return size if is_whole else size / fsdp
-
     leaves = [leaf for leaf in jax.tree.leaves(tree) if hasattr(leaf, "dtype")]
-    return float(sum(local_bytes(leaf) for leaf in leaves))
+    placed = zip(leaves, shardings(leaves, make_mesh(fsdp)), strict=True)
+    return sum(math.prod(where.shard_shape(x.shape)) * x.dtype.itemsize for x, where in placed)

@@ -29,9 +29,8 @@ _EXIT_TIMEOUT = 60  # s; after it, JAX aborts the others if a process has died o
 _BARRIER_TIMEOUT = 24 * 3600 * 1000  # ms; the first process may collect and evaluate for hours
 _VARIABLES = ("JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 _MAX_FACTS = 2**16  # bytes
-_LEAVING = (
-    "lorasp_jax_leaving"  # folder of the exit codes of processes that leave before the others
-)
+_LEAVING = "lorasp_jax_leaving"
+"""Folder of the exit codes of processes that leave before the others."""
 _POLL = 1  # s
 _connected = threading.Event()
 

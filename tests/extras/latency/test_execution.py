@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lorasp_jax.evaluation.programs import split_rollout
+from lorasp_jax.evaluation.programs import make_rollout
 from lorasp_jax.extras.latency.execution import (
     EXECUTIONS,
     Execution,
@@ -131,7 +131,7 @@ def test_what_a_chunk_continues(numbering, execution, expected):
 def test_without_delay_it_is_the_ordinary_rollout(execution):
     key, steps = jax.random.key(3), {"execute_steps": 3, "denoise_steps": 2}
     for room in ROOMS:
-        expected = split_rollout(room, **steps)(policy(), key)
+        expected = make_rollout(room, **steps)(policy(), key)
         found = delayed_rollout(room, Execution(execution, 3), denoise_steps=2)(policy(), key, 0)
         np.testing.assert_array_equal(found.success, expected.success)
         np.testing.assert_array_equal(found.steps, expected.steps)

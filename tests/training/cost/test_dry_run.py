@@ -27,10 +27,6 @@ from tests.runs import CONFIG, random_episodes
 LIMIT, EPISODES = 50, 6
 
 
-def load_base(*_, **__):
-    return random_backbone(Pi0Config.dummy()), ""
-
-
 @pytest.fixture
 def config(monkeypatch):
     """A config for one device, without simulation."""
@@ -43,6 +39,8 @@ def config(monkeypatch):
     mesh = meshes.make_mesh(1, jax.devices()[:1])
     monkeypatch.setattr(meshes, "make_mesh", lambda *_: mesh)
     monkeypatch.setattr(setup.envs, "make", lambda *_, **__: env)
+    base = random_backbone(Pi0Config.dummy()), ""
+    monkeypatch.setattr(setup, "base_model", lambda *_, **__: base)
     evaluation = dataclasses.replace(CONFIG.evaluation, execute_steps=1)
     data = DataConfig(episodes=EPISODES)
     method = LoRA(rank=4)  # traces and compiles faster than others
@@ -55,7 +53,7 @@ def test_the_printed_memory_is_that_of_the_compiled_program(config, tmp_path, mo
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(preflight, "MIB", 1)
     monkeypatch.setattr(messages, "PATIENCE", 0.0)
-    dry_run.dry_run(config, tmp_path, Console(width=150), load_base)
+    dry_run.dry_run(config, tmp_path, Console(width=150))
     assert not list(tmp_path.iterdir())
     printed, errors = capsys.readouterr()
     assert errors.startswith("compiling the training step")  # at once, even in a pipe
@@ -76,8 +74,7 @@ def test_the_printed_memory_is_that_of_the_compiled_program(config, tmp_path, mo
     assert batches * step_bytes < compiled["arguments"] - 0.98 * state
     assert compiled["arguments"] < 1.02 * state + 2 * batches * step_bytes
     assert compiled["peak"] > compiled["arguments"] + compiled["dataset"]
-    model = setup.build(config, tmp_path, abstract=True, load_base=load_base).model
-    trained, total = adaptation.count(model)
+    trained, total = adaptation.count(preflight.abstract_model(config, Pi0Config.dummy()))
     assert f"({trained:,} of {total:,})" in printed
     assert "TFLOP" in printed
 
@@ -86,6 +83,8 @@ def test_the_printed_memory_is_that_of_the_compiled_program(config, tmp_path, mo
 def test_published_models_need_no_download(file, monkeypatch):
     for download in ("_from_hub", "_from_bucket"):
         monkeypatch.setattr(hub, download, lambda *_: pytest.fail("it downloads"))
+    remat = "none", preflight.Memory(*6 * [0.0])
+    monkeypatch.setattr(preflight, "choose_remat", lambda *_: remat)
     config = load(ROOT / "configs" / f"{file}.py", "smoke")
     assert all(hub.is_remote(x) for x in (config.model.source, config.model.tokenizer))
     model = dataclasses.replace(config.model, size="nano")
@@ -104,7 +103,7 @@ def test_a_dataset_larger_than_the_free_memory_streams(config, tmp_path):
     """Each call then takes a single batch, and no dataset is on the device."""
     random_episodes("press", 0).save(tmp_path / "press.npz")
     config = dataclasses.replace(config, data=DataConfig(source=str(tmp_path / "press.npz")))
-    built = setup.build(config, tmp_path, load_base=load_base)
+    built = setup.build(config, tmp_path)
     run = Run(config, tmp_path, Console(), "")
     whole = nbytes(flatten([random_episodes("press", 0)]))
     for free, bytes_held, steps in ((1e12, whole, config.log_every), (1.0, 0, 1)):

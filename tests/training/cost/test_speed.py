@@ -1,20 +1,12 @@
 """Logged throughput, data wait and memory use."""
 
-import re
 from types import SimpleNamespace
 
 import jax
-import jax.numpy as jnp
 import pytest
 
-from lorasp_jax.base import messages
-from lorasp_jax.data.batches import flatten
-from lorasp_jax.training.batches import DrawnBatches
 from lorasp_jax.training.cost import flops, speed
 from lorasp_jax.training.cost.speed import Speed
-from lorasp_jax.training.distributed import mesh as meshes
-from lorasp_jax.training.program import Program
-from tests.runs import random_episodes
 
 
 @pytest.fixture
@@ -65,15 +57,3 @@ def test_memory_if_the_device_reports_it(monkeypatch):
     assert speed.memory() == {"memory/in_use_gib": 1.0, "memory/peak_gib": 1.5}
     monkeypatch.setattr(jax, "local_devices", device)
     assert speed.memory() == {}
-
-
-def test_compilation_is_announced_once(capsys, monkeypatch):
-    monkeypatch.setattr(messages, "PATIENCE", 0.0)
-    steps = jax.jit(lambda frozen, batches, state, key: (state, {"loss": jnp.ones(2)}))
-    batches = DrawnBatches(flatten([random_episodes("press", 0)]), meshes.make_mesh(), 8, 2)
-    run = Program(steps, jnp.ones(2), batches, Speed(1, None))
-    for _ in range(2):
-        run(jnp.zeros(()), jax.random.key(0), 0, 2)
-    printed = capsys.readouterr().err
-    assert len(re.findall(r"compiling the training step .*\.\.\.", printed)) == 1
-    assert re.search(r"compiled the training step in \d+ s", printed)
