@@ -1,29 +1,30 @@
 """Digests that detect corrupted data.
 
-Array digests do not depend on the sharding. Orbax misses some corruption: it stores incompressible
-data raw, where a flipped bit silently restores a different value. JSON digests are stored with the
-values, under "digest".
+Array digests are computed on the arrays' devices and do not depend on the sharding. Orbax misses
+some corruption: it stores incompressible data raw, where a flipped bit silently restores a
+different value. JSON digests are stored with the values, under "digest".
 """
 
+import functools
 import hashlib
 import json
-import zlib
+import math
 from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental import multihost_utils
 
 DIGEST = "digest"
 """Key of a JSON object's digest."""
 
 
 def digest(arrays: Mapping[str, jax.Array], *extra: str) -> str:
-    """Return the SHA-256 (hex) of `extra` and each array's name, dtype, shape and checksum."""
+    """Return the SHA-256 (hex) of `extra` and each array's name, dtype, shape and `mixed_sum`."""
+    sums = jax.device_get({name: _sum(array) for name, array in arrays.items()})
     entries = [
-        [name, str(array.dtype), list(array.shape), _checksum(array)]
+        [name, str(array.dtype), list(array.shape), int(sums[name])]
         for name, array in sorted(arrays.items())
     ]
     return hashlib.sha256(json.dumps([entries, extra]).encode()).hexdigest()
@@ -31,7 +32,8 @@ def digest(arrays: Mapping[str, jax.Array], *extra: str) -> str:
 
 def fingerprints(weights: Mapping[str, Any]) -> dict[str, str]:
     """Hash each array to eight hex digits, in bf16 so that fp32 and bf16 copies match."""
-    return {name: f"{_checksum(array, rounded=True):08x}" for name, array in weights.items()}
+    sums = jax.device_get({name: _sum(array, rounded=True) for name, array in weights.items()})
+    return {name: f"{int(value):08x}" for name, value in sums.items()}
 
 
 def with_digest(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -63,14 +65,53 @@ def _json_digest(values: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(normalized, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _checksum(array: Any, *, rounded: bool = False) -> int:
-    """Compute the CRC-32 of an array's bytes, optionally of floats rounded to bf16.
+def _sum(array: Any, *, rounded: bool = False) -> Any:
+    """Compute `mixed_sum`, optionally of floats rounded to bf16.
 
-    It detects every flipped bit, and misses any other change with probability 2^-32.
+    Arrays in host memory use NumPy, which avoids a compilation for each shape.
     """
-    if isinstance(array, jax.Array) and not array.is_fully_addressable:
-        array = multihost_utils.process_allgather(array, tiled=True)
+    rounded = rounded and jnp.issubdtype(array.dtype, jnp.floating)
+    on_host = isinstance(array, np.ndarray) or (
+        array.is_fully_addressable and all(d.platform == "cpu" for d in array.devices())
+    )
+    if not on_host:
+        return mixed_sum(array, rounded=rounded)
     array = np.asarray(array)
-    if rounded and jnp.issubdtype(array.dtype, jnp.floating):
-        array = array.astype(jnp.bfloat16)
-    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+    return host_sum(array.astype(jnp.bfloat16) if rounded else array)
+
+
+def host_sum(array: np.ndarray, block: int = 2**18) -> int:
+    """Compute `mixed_sum` in NumPy, `block` words at a time so that they fit in the CPU cache."""
+    words = np.ascontiguousarray(array).reshape(-1).view(f"uint{min(8 * array.itemsize, 32)}")
+    total = 0
+    for start in range(0, len(words), block):
+        mixed = words[start : start + block].astype(np.uint32)
+        mixed ^= np.arange(start, start + len(mixed)).astype(np.uint32) * np.uint32(0x9E3779B9)
+        mixed = (mixed ^ (mixed >> 16)) * np.uint32(0x85EBCA6B)
+        mixed = (mixed ^ (mixed >> 13)) * np.uint32(0xC2B2AE35)
+        total += int(np.sum(mixed ^ (mixed >> 16), dtype=np.uint64))
+    return total % 2**32
+
+
+@functools.partial(jax.jit, static_argnames="rounded")
+def mixed_sum(array: jax.Array, *, rounded: bool = False) -> jax.Array:
+    """Sum the 32-bit words of all elements, each mixed with its position: `[]` uint32.
+
+    Elements are read bitwise as integers, 64-bit ones as two words. `rounded` first casts them to
+    bf16. Words are mixed by the finalizer of MurmurHash3 (github.com/aappleby/smhasher,
+    MurmurHash3.cpp:68), a permutation of 32-bit words. A change of a single word is therefore
+    always detected, and any other is missed with probability 2^-32. Integer addition is exact, so
+    the order of summation does not matter.
+    """
+    if rounded or array.dtype == bool:
+        array = array.astype(jnp.bfloat16 if rounded else jnp.uint8)
+    word = jnp.dtype(f"uint{min(8 * array.dtype.itemsize, 32)}")
+    words = jax.lax.bitcast_convert_type(array, word).astype(jnp.uint32)
+    position = jnp.zeros(words.shape, jnp.uint32)
+    for axis in range(words.ndim):
+        stride = jnp.uint32(math.prod(words.shape[axis + 1 :]) % 2**32)
+        position += stride * jax.lax.broadcasted_iota(jnp.uint32, words.shape, axis)
+    words ^= position * jnp.uint32(0x9E3779B9)
+    words = (words ^ (words >> 16)) * jnp.uint32(0x85EBCA6B)
+    words = (words ^ (words >> 13)) * jnp.uint32(0xC2B2AE35)
+    return jnp.sum(words ^ (words >> 16), dtype=jnp.uint32)

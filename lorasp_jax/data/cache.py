@@ -31,7 +31,7 @@ from lorasp_jax.data.batches import Steps
 from lorasp_jax.data.cache_writer import Column, map_column
 from lorasp_jax.data.source import Progress, Source
 
-FORMAT = "lorasp-cache-3"
+FORMAT = "lorasp-cache-2"
 HEADER = "cache.json"
 ROWS = ("state", "action", "length", "instruction", "task")
 """Columns other than images: state and action per step, and the others per episode."""

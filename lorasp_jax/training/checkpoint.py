@@ -7,6 +7,7 @@ stored as well.
 
 import contextlib
 import errno
+import itertools
 import os
 import shutil
 from collections.abc import Iterator
@@ -127,9 +128,10 @@ class Checkpoints:
 
     def _rename_corrupt(self, corrupt: dict[int, str], resume_step: int) -> None:
         for step, reason in corrupt.items():
-            renamed = self._folder / f"{step}.damaged"
+            names = itertools.chain([""], (f".{number}" for number in itertools.count(1)))
+            paths = (self._folder / f"{step}.damaged{name}" for name in names)
+            renamed = next(path for path in paths if not path.exists())
             if processes.is_first():
-                shutil.rmtree(renamed, ignore_errors=True)  # of an earlier resume
                 rename(self._folder / str(step), renamed)
             self._warn(
                 f"the checkpoint at step {step} is corrupt ({reason}): renamed to {renamed}, "

@@ -111,6 +111,29 @@ def test_a_corrupt_file_is_never_restored_with_other_values(master, tmp_path):
     assert steps[2] >= 10  # Orbax does not need every file
 
 
+@pytest.mark.slow
+def test_corruption_at_many_positions(master, tmp_path):
+    def damages(content):
+        size, every = len(content), max(len(content) // 25, 1)
+        yield from (flipped(content, position) for position in range(0, size, every))
+        yield from (content[:cut] for cut in (0, 1, size // 3, size - 1))
+
+    steps = sweep(master, tmp_path, damages)
+    assert sum(steps.values()) > 400
+    assert min(steps.values()) > 100
+
+
+def test_repeatedly_corrupt_checkpoints_are_all_kept(folder):
+    for expected in (["1", "2.damaged"], ["1", "2.damaged", "2.damaged.1"]):
+        (folder / "checkpoints/2/meta/metadata").write_text("{}")
+        assert restore(folder)[0] == 1
+        assert names(folder) == expected
+        checkpoints = Checkpoints(folder, "base", Console(file=io.StringIO()))
+        checkpoints.save(state(2))  # as the resumed run does
+        checkpoints.close()
+        assert restore(folder) == (2, "")
+
+
 def test_nothing_changes_if_all_checkpoints_are_corrupt(folder):
     for step in (1, 2):
         (folder / f"checkpoints/{step}/meta/metadata").write_text("{}")
@@ -167,6 +190,20 @@ def test_removal_retries_while_other_threads_still_write(folder, monkeypatch):
     monkeypatch.setattr(shutil, "rmtree", rmtree)
     assert restore(folder)[0] == 2
     assert names(folder) == ["1", "2"]
+
+
+@pytest.mark.parametrize("kind", ["float32", "bfloat16", "bool", "int8"])
+def test_the_digest_depends_on_every_bit(kind):
+    array = np.asarray(jax.random.normal(jax.random.key(0), (3, 5)) > 0.3).astype(jnp.dtype(kind))
+    digests = {digest({"a": jnp.asarray(array)})}
+    bits = 1 if kind == "bool" else 8 * array.dtype.itemsize
+    for byte in range(0, array.nbytes, 7):
+        for bit in range(min(bits, 8)):
+            changed = bytearray(array.tobytes())
+            changed[byte] ^= 1 << bit
+            other = np.frombuffer(bytes(changed), array.dtype).reshape(array.shape)
+            digests.add(digest({"a": jnp.asarray(other)}))
+    assert len(digests) == 1 + len(range(0, array.nbytes, 7)) * min(bits, 8)
 
 
 def test_the_digest_depends_on_names_shapes_order_dtypes_and_notes():
