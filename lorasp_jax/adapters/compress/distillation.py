@@ -11,6 +11,7 @@ import numpy as np
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.compress import calibration, compaction
 from lorasp_jax.adapters.compress.calibration import Forward, Layer, Sums
+from lorasp_jax.dense import validate
 from lorasp_jax.peft import LoRA
 from lorasp_jax.peft.method import Params
 
@@ -46,7 +47,7 @@ def distill(
     for path, layer in layers.items():
         kernel = layer.kernel_matrices()
         largest = min(layer.method.rank, *kernel.shape[-2:])
-        r = largest if rank is None else min(rank, largest)
+        r = largest if rank is None else min(validate.size("rank", rank), largest)
         fit = adaptation.over_stack(functools.partial(_fitted, rank=r), kernel)
         u = adaptation.over_stack(layer.method.up, kernel)(layer.adapter.get_value())
         params = fit(sums[path]["xx"], sums[path]["xz"], u)

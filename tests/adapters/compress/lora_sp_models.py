@@ -7,7 +7,6 @@ from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.dense import AdapterParam, Dense
 from lorasp_jax.peft import LoRASP, LoRASPRelease
 from tests.adapters.test_adaptation import Net
-from tests.models.random_models import with_noise
 
 RANK = 12
 TOKENS = 40
@@ -23,7 +22,10 @@ def perturbed(model, seed=0, size=1.0):
     """Add noise to all adapters, so that scores differ; `size` scales their deltas."""
     for i, location in enumerate(paths.locate(nnx.List([model]), Dense)):
         if location.child.adapter is not None:
-            params = with_noise(location.child.adapter.get_value(), 1.0, seed + i)
+            leaves, structure = jax.tree.flatten(location.child.adapter.get_value())
+            keys = jax.random.split(jax.random.key(seed + i), len(leaves))
+            noisy = [p + jax.random.normal(k, p.shape) for k, p in zip(keys, leaves, strict=True)]
+            params = jax.tree.unflatten(structure, noisy)
             params["bank"]["u"] *= size
             location.child.adapter = AdapterParam(params)
     return model
