@@ -128,7 +128,7 @@ def merged(policy):
     """Return the policy distilled to adapters that do not depend on the input, and merged."""
     episodes = {"press": random_episodes("press", 5)}
     pairs = transforms.keyed_batches(policy, episodes, 4, 1)["press"]
-    model, _ = lorasp_jax.distill(policy.model, pairs, 4, forward=transforms._forward)
+    model, _ = lorasp_jax.distill(policy.model, pairs, 4, forward=transforms.forward)
     return dataclasses.replace(policy, model=adaptation.merge(model))
 
 
