@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from envs.datasets import rlds
 from envs.datasets.episodes import Episodes
 from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
@@ -80,9 +81,9 @@ def read_base(folder: Path) -> Any:
 
 
 def dataset(folder: Path) -> None:
-    random_episodes("press", 0).save(folder.parent / "press.npz")
+    rlds.write(random_episodes("press", 0), folder.parent / "rlds")
     folder.rmdir()
-    cache.write([open_source(folder.parent / "press.npz")], folder, lambda done, total: None)
+    cache.write([open_source(folder.parent / "rlds")], folder, lambda done, total: None)
 
 
 def read_dataset(folder: Path) -> Any:

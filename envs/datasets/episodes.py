@@ -112,7 +112,7 @@ class Episodes:
             ValueError: the file is missing or damaged, or has another format or control period.
         """
         with as_value_error(path := Path(path)):
-            with np.load(path) as archive:
+            with path.open("rb") as file, np.load(file) as archive:
                 fields: dict[str, Any] = dict(archive)
             header = json.loads(fields.pop("header").tobytes())
             fields |= {name: header[name] for name in _METADATA}
