@@ -126,6 +126,15 @@ LEROBOT = [
 ]
 METADATA = {"format": ["x"], "cameras": [3, ["front"]], "control_dt": ["x", 0, NAN], "steps": ["x"]}
 METADATA |= {"instructions": [3, []], "actions": ["x"]}
+HEADER = {
+    "format": ["x", None],
+    "cameras": [{"front": [8, 8]}, {"side": "xy"}, {"x/../../side": [8, 8]}],
+    "control_dt": [0.0, HUGE],
+    "steps": [0, HUGE],
+    "crc32": [{}],
+    "crc32/state": [1],
+    "tasks": [[], "x"],
+}
 METHODS = {"": [[], {}, {"nowhere": {}}], "/lin~0/method": ["lorra", None], "/lin~0/unknown": [1]}
 METHODS |= {"/lin~0/rank": ["8", 0, NAN, 4, 10**9], "/lin~0/router": ["x"]}
 PEFT = {"peft_type": [None, "LOHA"], "lora_alpha": ["x", 0, HUGE], "use_dora": [True, "x"]}
@@ -148,7 +157,7 @@ DAMAGE: dict[str, list[Damage]] = {
     ],
     "cache": [
         *[missing("state.npy"), cut(cache.HEADER), cut("image_side.npy")],
-        *[field(cache.HEADER, "format", bad) for bad in ("x", None)],
+        *[field(cache.HEADER, name, bad) for name, values in HEADER.items() for bad in values],
     ],
     "npz": [
         *[missing("*.npz"), cut("*.npz"), array("state", np.full((3, 4, 7), NAN, np.float32))],

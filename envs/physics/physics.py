@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import functools
 import importlib.util
+import io
 import types
 from collections.abc import Sequence
 from typing import Any, Literal, get_args
@@ -33,7 +34,7 @@ def _mjx() -> Any:
         import warp
 
         warp.config.log_level = warp.LOG_WARNING  # otherwise every loaded kernel prints a line
-    with contextlib.redirect_stdout(None):  # MJX prints two lines if warp-lang is missing
+    with contextlib.redirect_stdout(io.StringIO()):  # MJX prints two lines if warp-lang is missing
         from mujoco import mjx
     # MJX sums over a body's children with scatters. Their order of addition is undefined on GPU: on
     # an H200, two calls with the same input differed in the last bits.

@@ -220,22 +220,22 @@ def _attach_all(
     statistics: Mapping[str, jax.Array],
 ) -> set[int]:
     """Attach adapters in place; return the indices of the rules used."""
-    used: set[int] = set()
+    layers = paths.locate_layers(root, einsums)
+    adapters = {i: m for i, (_, m) in enumerate(rules) if m is not None and not m.trains_base}
+    found = {location.path: paths.find_rule(rules, location.path) for location in layers}
+    methods = {path: None if i is None else adapters.get(i) for path, i in found.items()}
 
     def attach_to(location: paths.Location) -> AdaptedLayer | None:
-        i = paths.find_rule(rules, location.path)
-        method = None if i is None else rules[i][1]
-        if i is None or method is None or method.trains_base:
+        if (method := methods[location.path]) is None:
             return None
-        used.add(i)
         layer_key = jax.random.fold_in(key, zlib.crc32(location.path.encode()))
         with paths.naming("adapt", location.path):
             layer = nnx_layers.make_adaptable(location.child, einsums)
             attach(layer, method, layer_key, statistics.get(location.path))
         return layer
 
-    paths.replace(paths.locate_layers(root, einsums), attach_to)
-    return used
+    paths.replace(layers, attach_to)
+    return adapters.keys() & found.values()
 
 
 def _unfreeze(root: nnx.List[Any], rules: paths.Rules) -> set[int]:

@@ -124,16 +124,17 @@ def _from_hub(name: str, only: list[str] | None, repository: str) -> Path:
 def _from_bucket(url: str) -> Path:
     import fsspec
 
-    if url.startswith("gs://"):
-        importlib.import_module("gcsfs")  # whose absence fsspec would report in its own words
-
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "lorasp_jax"
     target = cache / url.rstrip("/").replace("://", "/", 1)
     waiting = f"waiting: another process is downloading {url}"
     try:
         with locked(target, lambda: print(waiting, file=sys.stderr)):
             if not target.exists():
+                if url.startswith("gs://"):  # fsspec would report its absence in its own words
+                    importlib.import_module("gcsfs")
                 _copy(*fsspec.core.url_to_fs(url), target)
+    except ModuleNotFoundError:
+        raise
     except Exception as error:  # each backend raises its own errors
         raise ValueError(f"cannot download {url}: {first_line(error)}") from error
     return target

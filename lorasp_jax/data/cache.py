@@ -13,6 +13,7 @@ shuffled windows, two cameras), this gives 37,000 windows/s at 128 x 128 pixels 
 """
 
 import json
+import math
 import os
 import zlib
 from collections.abc import Iterator, Sequence
@@ -22,9 +23,10 @@ from typing import Any
 
 import numpy as np
 
-from envs.datasets.episodes import SHARED, Episodes
+from envs.datasets.episodes import SHARED, Episodes, check_camera
 from lorasp_jax.base.digest import verify_digest, with_digest
 from lorasp_jax.base.files import as_value_error, read_json
+from lorasp_jax.base.json_values import check
 from lorasp_jax.base.locks import locked
 from lorasp_jax.base.writing import atomic_folder
 from lorasp_jax.data.batches import Steps
@@ -39,6 +41,15 @@ _IMAGE = "image_"
 _DTYPES = {"state": np.float32, "action": np.float32, "image": np.uint8}
 METADATA = tuple(name for name in SHARED if name not in ("task", "instructions"))
 """Fields of `Episodes` that are the same in all episodes of a cache."""
+_HEADER_TYPES: dict[str, Any] = {
+    **dict.fromkeys(("robot", "actions"), str),
+    **dict.fromkeys(("control_dt", "physics_dt"), float),
+    "steps": int,
+    "tasks": [str],
+    "instructions": [str],
+    "cameras": {str: (int, int)},
+    "crc32": {str: int},
+}
 
 
 def write(sources: Sequence[Source], path: str | os.PathLike[str], progress: Progress) -> None:
@@ -175,13 +186,8 @@ class Cache:
         header = self.path / HEADER
         if not header.is_file():
             raise ValueError(f"{path} is not a cache: it has no {HEADER}")
-        with as_value_error(header):  # what the digest confirms needs no other check
-            self.metadata: dict[str, Any] = verify_digest(read_json(header, self.path))
-            if self.metadata["format"] != FORMAT:
-                raise ValueError(
-                    f"format {self.metadata['format']!r} is not {FORMAT!r}: convert the dataset "
-                    "again, or, if it is the cache of a run, use another --name"
-                )
+        with as_value_error(header):
+            self.metadata: dict[str, Any] = _read_header(header)
         self.cameras: dict[str, list[int]] = self.metadata["cameras"]
         self.control_dt: float = self.metadata["control_dt"]
         self.num_steps: int = self.metadata["steps"]
@@ -192,6 +198,8 @@ class Cache:
         }
         self._columns = {name: self._map(name) for name in ROWS}
         self._end = np.cumsum(self._columns["length"], dtype=np.int64)
+        with as_value_error(header):
+            self._check_columns()
 
     def __len__(self) -> int:
         """Number of episodes."""
@@ -237,7 +245,39 @@ class Cache:
             if zlib.crc32(images.data) != self.metadata["crc32"][_IMAGE + name]:
                 raise ValueError(f"{path} is damaged (its checksum does not match)")
 
+    def _check_columns(self) -> None:
+        """Raise ValueError unless rows, indices and values are valid, whoever wrote the cache."""
+        length = self._columns["length"]
+        if not len(length) or length.min() < 1 or self._end[-1] != self.num_steps:
+            raise ValueError(f"its episodes must not be empty and have {self.num_steps} steps")
+        for name, texts in (("task", self.metadata["tasks"]), ("instruction", self.instructions)):
+            low, high = self._columns[name].min(), self._columns[name].max()
+            if len(self._columns[name]) != len(length) or low < 0 or high >= len(texts):
+                raise ValueError(f"{name} indices must be 0 to {len(texts) - 1} in each episode")
+        for name in ("state", "action"):
+            if not np.isfinite(self._columns[name]).all():
+                raise ValueError(f"{name} has values that are not finite")
+        self.episode(0, ()).validate_numbers()
+
     def _map(self, name: str, shape: tuple[int, ...] | None = None) -> np.ndarray:
         """Memory-map a column; verify its checksum unless a shape is given instead."""
         path, dtype = self.path / f"{name}.npy", _DTYPES.get(name.partition("_")[0], np.int32)
-        return map_column(path, dtype, shape or self.metadata["crc32"][name])
+        return map_column(self.path, path, dtype, shape or self.metadata["crc32"][name])
+
+
+def _read_header(path: Path) -> dict[str, Any]:
+    """Read and check cache.json, which anybody may have written."""
+    header: dict[str, Any] = verify_digest(read_json(path, path.parent))
+    if header.get("format") != FORMAT:
+        raise ValueError(
+            f"format {header.get('format')!r} is not {FORMAT!r}: convert the dataset again, or, if "
+            "it is the cache of a run, use another --name"
+        )
+    check(header, _HEADER_TYPES)
+    if not 0 < header["control_dt"] < math.inf:
+        raise ValueError(f"control_dt must be positive and finite, got {header['control_dt']}")
+    for name in header["cameras"]:
+        check_camera(name)
+    if header["crc32"].keys() != {*ROWS, *(_IMAGE + name for name in header["cameras"])}:
+        raise ValueError("checksums are missing")
+    return header

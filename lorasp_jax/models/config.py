@@ -45,6 +45,11 @@ class VisionConfig:
     def __post_init__(self) -> None:
         _check_sizes(self)
 
+    @property
+    def kernel_sizes(self) -> tuple[int, ...]:
+        """Sizes that determine kernel shapes; the number of heads does not."""
+        return self.width, self.depth, self.mlp, self.patch, self.shuffle
+
 
 @dataclass(frozen=True)
 class ExpertConfig:
@@ -59,6 +64,12 @@ class ExpertConfig:
 
     def __post_init__(self) -> None:
         _check_sizes(self)
+
+    @property
+    def kernel_sizes(self) -> tuple[int, ...]:
+        """Sizes that determine kernel shapes; head counts and head_dim enter only as products."""
+        inner, context = self.heads * self.head_dim, self.kv_heads * self.head_dim
+        return self.width, self.depth, self.mlp, inner, context
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ Settings = dict[str, Any]
 
 _REMOVED = {"granularity": "token", "schedule": None, "normalized_bank": False}
 """Former options of LoRA-SP, which saved settings may name, and the values that they had."""
+_REMOVED_OF_RELEASE = {"hidden_width": None}
 _LORA_SP = ("lora_sp", "lora_sp_release", "LoRASP", "LoRASPRelease")
 
 
@@ -25,12 +26,15 @@ def without_removed(settings: Mapping[str, Any]) -> Settings:
     Raises:
         ValueError: a former option has another value than its default.
     """
-    if str(settings.get("method")) not in _LORA_SP:
+    method = str(settings.get("method"))
+    if method not in _LORA_SP:
         return dict(settings)
-    for name in _REMOVED.keys() & settings.keys():
-        if settings[name] != _REMOVED[name]:
+    release = method in ("lora_sp_release", "LoRASPRelease")
+    removed = _REMOVED | (_REMOVED_OF_RELEASE if release else {})
+    for name in removed.keys() & settings.keys():
+        if settings[name] != removed[name]:
             raise ValueError(
                 f"LoRA-SP has no option {name} any more, so an adapter trained with "
                 f"{name}={settings[name]!r} cannot be used"
             )
-    return {name: value for name, value in settings.items() if name not in _REMOVED}
+    return {name: value for name, value in settings.items() if name not in removed}

@@ -64,6 +64,8 @@ class Statistics:
         """
         valid = np.asarray(valid, bool)
         check_slots(slots, dim, np.shape(state)[-1])
+        if not valid.any():
+            raise ValueError("statistics need at least one valid step")
         moments = (_measure(np.asarray(values, np.float64)[valid]) for values in (state, action))
         return cls(*moments).to_slots(slots, dim)
 

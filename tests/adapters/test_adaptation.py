@@ -125,6 +125,16 @@ def test_the_model_is_not_modified(net):
     assert not shared & {leaf.unsafe_buffer_pointer() for leaf in trainable}  # may be donated
 
 
+def test_a_rule_may_name_any_path_of_a_shared_layer():
+    class Tied(nnx.Module):
+        def __init__(self):
+            self.a = self.b = nnx.Embed(5, 4, rngs=nnx.Rngs(0))
+
+    model = adapted(Tied(), ("^a$", LoRA(rank=2)), ("^b$", LoRA(rank=3)))
+    assert model.a is model.b
+    assert model.a.method.rank == 2
+
+
 def test_first_match_wins_and_none_skips(net):
     model = adapted(net, ("heads/1", None), ("inp|heads", LoRA(rank=2)), ("", FullFineTuning()))
     assert set(adaptation.methods(model)) == {

@@ -1,7 +1,9 @@
 """The cache: data round-trip, and writes are atomic."""
 
 import dataclasses
+import json
 import shutil
+import zlib
 
 import jax
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 
 from envs.datasets import rlds
 from envs.datasets.episodes import Episodes
+from lorasp_jax.base.digest import DIGEST, with_digest
 from lorasp_jax.base.errors import REFUSED
 from lorasp_jax.data import __main__ as command_line
 from lorasp_jax.data import cache, rlds_export
@@ -210,17 +213,32 @@ def test_opening(tmp_path, simulated):
 
 
 @pytest.mark.parametrize(
-    ("name", "change"),
+    ("name", "change", "sentence"),
     [
-        ("state", lambda x: x.astype(">f4")),
-        ("action", lambda x: x * np.float32(2)),
-        ("task", lambda x: x[:-1]),
-        ("image_side", lambda x: x[:, :-1]),
+        ("state", lambda x: x.astype(">f4"), "type, shape or checksum"),
+        ("state", np.asfortranarray, "Fortran order"),
+        ("action", lambda x: x * np.float32(np.nan), "not finite"),
+        ("length", lambda x: x[:0], "must not be empty"),
+        (
+            "length",
+            lambda x: x * np.where(np.arange(len(x)), 1, -1).astype(np.int32),
+            "not be empty",
+        ),
+        ("task", lambda x: x[:-1], "task indices must be"),
+        ("instruction", lambda x: x - np.int32(9), "instruction indices must be"),
+        ("image_side", lambda x: x[:, :-1], "type, shape or checksum"),
     ],
 )
-def test_other_columns_are_refused(name, change, simulated, tmp_path):
+def test_invalid_columns_are_refused(name, change, sentence, simulated, tmp_path):
+    """Even if their checksums are correct."""
     folder = shutil.copytree(simulated[1].path, tmp_path / "cache")
     path = folder / f"{name}.npy"
-    np.save(path, change(np.load(path)))
-    with pytest.raises(ValueError, match=rf"{name}\.npy is damaged"):
+    array = change(np.load(path))
+    np.save(path, array)
+    header = folder / cache.HEADER
+    facts = json.loads(header.read_text())
+    facts["crc32"][name] = zlib.crc32(array.tobytes())
+    del facts[DIGEST]
+    header.write_text(json.dumps(with_digest(facts)))
+    with pytest.raises(ValueError, match=sentence):
         cache.Cache(folder)

@@ -17,7 +17,7 @@ import numpy as np
 
 from lorasp_jax.adapters.io.native import read_tensors
 from lorasp_jax.base import json_values
-from lorasp_jax.base.files import as_value_error, read_json
+from lorasp_jax.base.files import RefusedError, as_value_error, read_json
 from lorasp_jax.peft.fields import short
 
 CONFIG, TENSORS = "adapter_config.json", "adapter_model.safetensors"
@@ -127,13 +127,13 @@ def _from_peft(config: Mapping[str, Any], module: str, tensors: Adapter) -> Adap
 def _alpha(config: Mapping[str, Any], module: str) -> Any:
     """α of a module: that of the first pattern that matches its name or a suffix after a dot.
 
-    As in PEFT (get_pattern_key of 0.21.2), but only for names with anchors, dots and escapes: a
-    pattern with repetitions, such as (a+)+b, may take forever to match.
+    As in PEFT (get_pattern_key of 0.21.2), but without repetitions except a leading ".*": a pattern
+    such as (a+)+b may take forever to match.
     """
     for pattern, alpha in (config.get("alpha_pattern") or {}).items():
-        if not re.fullmatch(r"[\w.\\^$-]*", pattern):
-            raise ValueError(
-                f"alpha_pattern has {short(pattern)}; only names with ^, $, . and \\ are supported"
+        if not re.fullmatch(r"(\.\*)?([\w.^$()\[\]|-]|\\\D)*", pattern):
+            raise RefusedError(
+                f"alpha_pattern has {short(pattern)}: a pattern with repetitions is not supported"
             )
         if re.match(rf"(.*\.)?({pattern})$", module):
             return alpha

@@ -33,6 +33,7 @@ class Log:
         self._folder, self._observations = folder, 0
         self._writer = ThreadPoolExecutor(1)
         self._error: BaseException | None = None
+        self._later(self._file.flush)  # starts the thread now, not while an arm moves
 
     def line(self, time: float, **values: Any) -> None:
         """Append a line."""

@@ -86,7 +86,7 @@ def test_round_trip(methods, tmp_path):
 
 
 def test_patterns_match_name_suffixes(copy):
-    edit_config(copy, alpha_pattern={r"lin\.2": 16}, rank_pattern={"2": 4})
+    edit_config(copy, alpha_pattern={r".*(lin|mlp)\.[2-9]": 16}, rank_pattern={"2": 4})
     model = hugging_face.load_peft(copy, Net())
     assert [model.lin[i].method.scale for i in (0, 2)] == [2, 4]
 

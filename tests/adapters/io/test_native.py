@@ -161,6 +161,11 @@ def test_settings_that_name_removed_options():
         with pytest.raises(ValueError, match=name):
             peft.from_settings(peft.to_settings(method) | removed | other)
 
+    release = peft.to_settings(peft.LoRASPRelease(rank=8))
+    assert peft.from_settings(release | {"hidden_width": None}) == peft.LoRASPRelease(rank=8)
+    with pytest.raises(ValueError, match="hidden_width"):
+        peft.from_settings(release | {"hidden_width": 4})
+
 
 @pytest.mark.parametrize("name", peft.names())
 def test_settings_round_trip(name):

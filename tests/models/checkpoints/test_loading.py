@@ -66,6 +66,14 @@ def test_lerobot(lerobot, caplog):
         models.load(lerobot)
 
 
+def test_a_config_overrides_the_sizes_of_lerobot_but_not_the_heads(lerobot):
+    fields = json.loads((lerobot / "config.json").read_text())
+    (lerobot / "config.json").write_text(json.dumps({"type": fields["type"]}))
+    with pytest.raises(ValueError, match="pass a config"):
+        models.load(lerobot)
+    assert models.load(lerobot, smolvla.CONFIG).config == smolvla.CONFIG
+
+
 def test_config_json_is_read_once(lerobot):
     folder = loading.find(lerobot)
     assert (folder.layout, folder.config) == ("lerobot", smolvla.CONFIG)
