@@ -152,7 +152,7 @@ DAMAGE: dict[str, list[Damage]] = {
         column(INDEX, "videos/observation.images.side/from_timestamp", -5.0),
     ],
     "rlds": [
-        *[missing("metadata.json"), cut("features.json"), cut("*array_record*")],
+        *[missing("metadata.json"), missing("dataset_info.json"), cut("*array_record*")],
         *[field("metadata.json", name, bad) for name, values in METADATA.items() for bad in values],
     ],
     "cache": [

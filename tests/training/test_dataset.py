@@ -8,6 +8,7 @@ import time
 import numpy as np
 from rich.console import Console
 
+from envs.datasets import rlds
 from lorasp_jax.config import DataConfig, ModelConfig
 from lorasp_jax.data.batches import flatten
 from lorasp_jax.evaluation.callback import NoEvaluation
@@ -37,8 +38,8 @@ def prepare(folder, monkeypatch, source, available=2**40, model_config=None):
 
 def test_prepare(tmp_path, monkeypatch):
     group = random_episodes("press", 0)
-    group.save(tmp_path / "press.npz")
-    run = prepare(tmp_path, monkeypatch, tmp_path / "press.npz")
+    rlds.write(group, tmp_path / "rlds")
+    run = prepare(tmp_path, monkeypatch, tmp_path / "rlds")
     assert (run.config.tasks, run.config.robot, run.simulated) == (("press",), "piper", True)
     assert not run.streams
     slots = [slot for slot, _ in run.policy.processor.cameras]
@@ -70,9 +71,9 @@ def test_published_smolvla_is_trimmed_to_the_cameras_of_the_dataset(tmp_path, mo
     group = random_episodes("press", 0)
     for names in (("side",), ("side", "top", "wrist")):
         images = {name: group.image["side"] for name in names}
-        path = tmp_path / f"{len(names)}.npz"
-        dataclasses.replace(group, image=images).save(path)
-        run = prepare(tmp_path / path.stem, monkeypatch, path, model_config=dummy)
+        path = tmp_path / f"{len(names)}"
+        rlds.write(dataclasses.replace(group, image=images), path)
+        run = prepare(tmp_path / f"run{len(names)}", monkeypatch, path, model_config=dummy)
         slots = zip(whole.cameras, names, strict=False)
         assert run.policy.processor.cameras == tuple(slots)
 

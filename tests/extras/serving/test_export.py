@@ -95,7 +95,8 @@ def test_policies_that_cannot_be_exported(tmp_path, monkeypatch):
 
     before, policy, out = jax.config.values.copy(), make_policy(), tmp_path / "policy"
     processor = policy.processor
-    silent = dataclasses.replace(processor, prompts=processor.prompts.select([]))
+    prompts = dataclasses.replace(processor.prompts, instructions=())
+    silent = dataclasses.replace(processor, prompts=prompts)
     with pytest.raises(ValueError, match="without instructions"):
         exporting.write(dataclasses.replace(policy, processor=silent), out)
     with pytest.raises(ValueError, match="already exists"):

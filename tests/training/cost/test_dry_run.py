@@ -9,6 +9,7 @@ import pytest
 from flax import nnx
 from rich.console import Console
 
+from envs.datasets import rlds
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.base import hub, messages
 from lorasp_jax.config import DataConfig
@@ -101,8 +102,8 @@ def test_published_models_need_no_download(file, monkeypatch):
 
 def test_a_dataset_larger_than_the_free_memory_streams(config, tmp_path):
     """Each call then takes a single batch, and no dataset is on the device."""
-    random_episodes("press", 0).save(tmp_path / "press.npz")
-    config = dataclasses.replace(config, data=DataConfig(source=str(tmp_path / "press.npz")))
+    rlds.write(random_episodes("press", 0), tmp_path / "rlds")
+    config = dataclasses.replace(config, data=DataConfig(source=str(tmp_path / "rlds")))
     built = setup.build(config, tmp_path)
     run = Run(config, tmp_path, Console(), "")
     whole = nbytes(flatten([random_episodes("press", 0)]))
