@@ -7,7 +7,7 @@ import json
 import jax
 import pytest
 
-from benchmarks import compile_time, data, deployment, long_run, scaling
+from benchmarks import compile_time, data, deployment, long_run, scaling, serving
 from benchmarks.deployment import Case
 from lorasp_jax import peft
 from lorasp_jax.data.cache import Cache
@@ -96,6 +96,17 @@ def test_compile_time(tmp_path, capsys, monkeypatch):
     assert {"bare", *peft.names()} <= {row["model"] for row in rows}
     assert rows[0]["ratio"] == 1
     assert "lora_sp" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_serving():
+    # A batch takes so long that this holds on a machine busy with other tests, too.
+    command = serving.waiting_command(image_size=16, cameras=1, seconds=0.1)
+    (one, times), (eight, times_of_eight) = serving.measure(command, calls=10)
+    assert (times.shape, times_of_eight.shape) == ((10, 3), (80, 3))
+    assert (times[:, 0] > times[:, 1]).all()
+    assert (times[:, 1] >= 100).all()
+    assert eight > 2 * one
 
 
 DUMMY = argparse.Namespace(

@@ -33,7 +33,7 @@ COMMANDS = [
     (["train.py", *MULTITASK, "--robot", "juggle"], "unknown robot 'juggle': choose from"),
 ]
 PROGRAM = """
-import contextlib, os, runpy, sys
+import os, runpy, sys
 from jax._src import xla_bridge
 from lorasp_jax.cli import train
 
@@ -44,11 +44,13 @@ os._exit = leave
 for arguments in {commands}:
     print("command:", *arguments)
     sys.argv = arguments[arguments[0] == "-m" :]
-    with contextlib.suppress(SystemExit):
+    try:
         if arguments[0] == "-m":
             runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
         else:
             runpy.run_path(sys.argv[0], run_name="__main__")
+    except SystemExit as exit:
+        print("exit code:", exit.code)
     started = ["a JAX backend"] if xla_bridge.backends_are_initialized() else []
     print("slow:", *[name for name in {slow} if name in sys.modules], *started)
 """
@@ -69,4 +71,5 @@ def test_help_and_unknown_names_are_fast():
     assert len(parts) == len(COMMANDS), done.stdout
     for part, (arguments, expected) in zip(parts, COMMANDS, strict=True):
         assert expected in part, arguments
+        assert f"exit code: {0 if '--help' in arguments else 2}\n" in part, arguments
         assert re.search(r"^slow:$", part, re.MULTILINE), part.splitlines()[-1]

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import shutil
+import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -219,6 +220,14 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folders["statistics"] = golden("v3") / "meta"
     folders |= {f"lerobot {version}": golden(version) for version in ("v21", "v3")}
     return folders | {"peft": GOLDEN / "adapter_lora"}
+
+
+@pytest.fixture(autouse=True)
+def _offline(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*arguments: Any) -> None:
+        raise AssertionError("network access")
+
+    monkeypatch.setattr(socket.socket, "connect", refuse)
 
 
 @pytest.mark.parametrize("kind", DAMAGE)

@@ -16,9 +16,9 @@ from lorasp_jax.training.run_folder import read_metrics
 from tests.runs import CONFIG, Miniature, Terminate, leaves, make_run, repeatable
 
 
-def quick_run(folder, *, streams=False):
+def quick_run(folder, *, ema=0.5, streams=False):
     """A run of a tiny model, with gradient accumulation and a moving average."""
-    optim = dataclasses.replace(CONFIG.optim, accumulate=2, ema=0.5)
+    optim = dataclasses.replace(CONFIG.optim, accumulate=2, ema=ema)
     config = dataclasses.replace(CONFIG, optim=optim, targets=("inp", "out"))
     run = make_run(folder, config, Miniature())
     if streams:
@@ -28,6 +28,7 @@ def quick_run(folder, *, streams=False):
 
 @pytest.mark.parametrize("streams", [False, True])
 def test_resume_is_bit_exact_and_frozen_stays_frozen(streams, tmp_path):
+    """Also: a run ends with the averaged adapters, and another base is rejected."""
     whole, halved = (quick_run(tmp_path / name, streams=streams) for name in ("whole", "halved"))
     _, adapters_before, frozen_before = adaptation.split(whole.policy.model)
     train(whole)
@@ -53,6 +54,14 @@ def test_resume_is_bit_exact_and_frozen_stays_frozen(streams, tmp_path):
         name for name, v in leaves(adapters).items() if (v != leaves(adapters_before)[name]).any()
     ]
     assert len(changed) == len(leaves(adapters))
+
+    plain = quick_run(tmp_path / "plain", ema=0.0, streams=streams)
+    train(plain)
+    for name, value in leaves(adaptation.split(plain.policy.model)[1]).items():
+        assert (value != leaves(adapters)[name]).any(), name
+    halved.base_hash = "hash of another base"
+    with pytest.raises(ValueError, match="trained on a different base"):
+        train(halved, resume=True)
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from flax import nnx
 from rich.console import Console
 
 from lorasp_jax import models
-from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.config import DataConfig, ModelConfig
 from lorasp_jax.data.batches import nbytes
 from lorasp_jax.data.opening import open_source
@@ -22,6 +22,7 @@ from lorasp_jax.models import inputs
 from lorasp_jax.models.checkpoints import loading
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import FullFineTuning, LoRA
+from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Offline
 from lorasp_jax.training import base, export, setup
@@ -146,6 +147,34 @@ def test_pi05_on_the_command_line():
     assert (model.config.pi05, model.config.inputs) == (True, inputs.OURS_PI05)
 
 
+@pytest.mark.slow
+def test_pi05_on_the_command_line_trains_and_acts(config, tmp_path, monkeypatch):
+    """Its fully fine-tuned base loads again, and its prompts depend on the state."""
+    monkeypatch.setattr(setup, "base_model", base.base_model)
+    config = dataclasses.replace(config, peft=FullFineTuning(), model=ModelConfig(checkpoint=""))
+    run = prepare(override(config, ["--model.size", "nano_pi05", "--optim.steps", "2"]), tmp_path)
+    run.devices = jax.devices()[:1]
+    before = leaves(nnx.state(run.policy.model))
+    train(run)
+    after = leaves(nnx.state(run.policy.model))
+    assert any((after[name] != array).any() for name, array in before.items())
+    group = next(iter(run.episodes.values()))
+    raw = {
+        "image": {name: jnp.asarray(image[:, 0]) for name, image in group.image.items()},
+        "state": jnp.asarray(group.state[:, 0]),
+    }
+    tokens = run.policy.processor.encode(raw, jnp.zeros(3, int)).tokens
+    assert (tokens[0] != tokens[1]).any()
+    sample = jax.jit(Policy.sample)
+    actions = sample(run.policy, jax.random.key(0), raw, jnp.zeros(3, int))
+    assert jnp.isfinite(actions).all()
+    export.write(run)
+    model = models.load(tmp_path / "base")
+    assert (model.config.pi05, model.config.inputs) == (True, inputs.OURS_PI05)
+    again = sample(Policy(model, run.policy.processor), jax.random.key(0), raw, jnp.zeros(3, int))
+    np.testing.assert_allclose(again, actions, atol=0.05)  # the file is bf16
+
+
 def test_unrolling_on_the_command_line(monkeypatch):
     monkeypatch.setattr(base, "SIZES", ("dummy",))
     monkeypatch.setattr(Pi0Config, "create", lambda config, _: config)
@@ -194,6 +223,13 @@ def test_eva_uses_the_demonstrations(config, tmp_path):
     moments = setup.input_moments(run, random_backbone(Pi0Config.dummy()), run.policy.processor)
     assert set(moments) == set(found)
     assert len(found) == 3
+    model = nnx.List([run.policy.model])
+    for path, _, _, variable in paths.locate(model, adaptation.AdapterParam):
+        a = np.float64(variable.get_value()["lora_a"])
+        moment = np.float64(moments[path.rpartition("/")[0]])
+        captured = np.einsum("...ir,...ij,...jr->...", a, moment, a)
+        best = np.linalg.eigvalsh(moment)[..., -4:].sum(-1)
+        np.testing.assert_allclose(captured, best, rtol=1e-3)  # no other 4 directions capture more
 
 
 def test_eva_uses_a_streamed_dataset(config, tmp_path):

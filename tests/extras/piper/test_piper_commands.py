@@ -4,6 +4,7 @@ import dataclasses
 import json
 import signal
 import types
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -37,7 +38,9 @@ class Still(StandIn):
 @pytest.fixture(autouse=True)
 def shared_world(world, monkeypatch):
     """Let all commands use one scene, as each compiles its own."""
-    monkeypatch.setattr(faking, "World", lambda *_, **__: world)
+    make = Mock(return_value=world)
+    monkeypatch.setattr(faking, "World", make)
+    return make
 
 
 @pytest.fixture
@@ -84,6 +87,13 @@ def test_the_expert_on_the_fake_arm(tmp_path, capsys):
     assert 25 < source.num_steps < 50
     lines = (tmp_path / "log" / "log.jsonl").read_text().splitlines()
     assert json.loads(lines[0])["episode"] == 0
+
+
+def test_the_command_line_chooses_task_and_image_size(shared_world, tmp_path):
+    shared_world.side_effect = ValueError("this test needs no scene")
+    words = ["--expert", "--task", "pour", "--image-size", "32", "--log", str(tmp_path)]
+    assert fake(words) == 2
+    shared_world.assert_called_once_with("pour", image_size=32)
 
 
 @pytest.mark.usefixtures("patient")
