@@ -8,6 +8,7 @@ import huggingface_hub
 import numpy as np
 import pytest
 import safetensors.numpy
+from flax import nnx
 
 from lorasp_jax import models
 from lorasp_jax.models.checkpoints import loading, published
@@ -66,12 +67,13 @@ def test_lerobot(lerobot, caplog):
         models.load(lerobot)
 
 
-def test_a_config_overrides_the_sizes_of_lerobot_but_not_the_heads(lerobot):
-    fields = json.loads((lerobot / "config.json").read_text())
-    (lerobot / "config.json").write_text(json.dumps({"type": fields["type"]}))
+def test_a_config_overrides_the_sizes_in_config_json(tmp_path):
+    config = Pi0Config.dummy()
+    published.save(tmp_path / "dummy", config.create(nnx.Rngs(0)), "lerobot")
+    (tmp_path / "dummy" / "config.json").write_text('{"type": "pi0"}')
     with pytest.raises(ValueError, match="pass a config"):
-        models.load(lerobot)
-    assert models.load(lerobot, smolvla.CONFIG).config == smolvla.CONFIG
+        models.load(tmp_path / "dummy")
+    assert models.load(tmp_path / "dummy", config).config == config
 
 
 def test_config_json_is_read_once(lerobot):
