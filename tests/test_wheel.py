@@ -90,7 +90,8 @@ def test_missing_base_is_named(installed, tmp_path):
     arguments = ["train", "--config", "configs/multitask.py", "--scale", "accelerator", "--dry-run"]
     process = installed("lorasp-jax", *arguments, cwd=tmp_path)
     assert process.returncode == 2
-    assert "pi0_nano, smolvla_nano; choose one of these, or pass the path" in process.stderr
+    assert "pi0_small does not exist" in process.stderr
+        assert "pi0_nano, smolvla_nano" in process.stderr
     assert process.stderr.count("\n") == 1
 
 
