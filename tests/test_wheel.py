@@ -91,7 +91,7 @@ def test_missing_base_is_named(installed, tmp_path):
     process = installed("lorasp-jax", *arguments, cwd=tmp_path)
     assert process.returncode == 2
     assert "pi0_small does not exist" in process.stderr
-        assert "pi0_nano, smolvla_nano" in process.stderr
+    assert "pi0_nano, smolvla_nano" in process.stderr
     assert process.stderr.count("\n") == 1
 
 

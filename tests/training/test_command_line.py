@@ -78,5 +78,5 @@ def test_a_lerobot_dataset(version, tmp_path, monkeypatch):
     assert train.main([*COMMAND, *options, "--optim.steps", "20"]) == 0
     first, *_, last = read_metrics(Path("runs/multitask"))
     assert last["task"] < first["task"]
-    for name in ("report.html", "adapter.safetensors", "cache/steps/statistics.json"):
+    for name in ("report.html", "adapter.safetensors", "cache/steps/cache.json"):
         assert Path("runs/multitask", name).stat().st_size
