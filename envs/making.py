@@ -58,8 +58,7 @@ def make(
         discount: the learner's discount in (0, 1], for the dense reward.
         distractors: number of unrelated objects on the table, up to 4.
         backend: physics engine, jax or warp; None: the fastest available.
-        renderer: rays (the ray caster, which runs everywhere) or warp (MuJoCo Warp's renderer,
-            which also draws meshes and textures).
+        renderer: rays (runs everywhere) or warp (MuJoCo Warp's, draws meshes and textures, too).
 
     Raises:
         TypeError: `robot`, `control_dt` or an integer argument has the wrong type.
@@ -74,11 +73,8 @@ def make(
     distractors = checks.count("distractors", distractors, MAX_COUNT, minimum=0)
     control_dt = _check_dt(control_dt, task_definition.time_limit)
     checks.choice("actions", actions, MODES)
-    checks.choice("reward", reward, REWARDS)
-    if not 0 < checks.number("discount", discount) <= 1:
-        raise ValueError(f"discount must be above 0 and at most 1, got {discount!r}")
-    objects = task_definition.scene + distractor_mjcf(distractors)
-    model = scene.build(objects, robot_model)
+    _check_reward(reward, discount)
+    model = scene.build(task_definition.scene + distractor_mjcf(distractors), robot_model)
     return Env(
         task=task_definition,
         robot=robot_model,
@@ -92,6 +88,12 @@ def make(
         physics=physics.Physics(model, physics.default_backend() if backend is None else backend),
         renderer=_renderer(renderer, model, image_size, antialias, num_envs),
     )
+
+
+def _check_reward(reward: str, discount: float) -> None:
+    checks.choice("reward", reward, REWARDS)
+    if not 0 < checks.number("discount", discount) <= 1:
+        raise ValueError(f"discount must be above 0 and at most 1, got {discount!r}")
 
 
 def _renderer(

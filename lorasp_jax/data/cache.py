@@ -262,7 +262,7 @@ class Cache:
     def _map(self, name: str, shape: tuple[int, ...] | None = None) -> np.ndarray:
         """Memory-map a column; verify its checksum unless a shape is given instead."""
         path, dtype = self.path / f"{name}.npy", _DTYPES.get(name.partition("_")[0], np.int32)
-        return map_column(self.path, path, dtype, shape or self.metadata["crc32"][name])
+        return map_column(path, dtype, shape or self.metadata["crc32"][name])
 
 
 def _read_header(path: Path) -> dict[str, Any]:

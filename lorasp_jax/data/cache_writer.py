@@ -38,11 +38,10 @@ class Column:
             np.lib.format.write_array_header_1_0(file, header)
 
 
-def map_column(folder: Path, path: Path, dtype: Any, expected: int | tuple[int, ...]) -> np.ndarray:
+def map_column(path: Path, dtype: Any, expected: int | tuple[int, ...]) -> np.ndarray:
     """Memory-map an array.
 
     Args:
-        folder: folder that must contain the file once links are resolved.
         path: the .npy file.
         dtype: expected dtype.
         expected: checksum of the array's bytes, for which all are read, or its shape.
@@ -51,7 +50,7 @@ def map_column(folder: Path, path: Path, dtype: Any, expected: int | tuple[int, 
         ValueError: the file is missing or damaged.
     """
     with as_value_error(path):
-        array: Any = np.load(check_regular(path, folder), mmap_mode="r")
+        array: Any = np.load(check_regular(path, path.parent), mmap_mode="r")
         if not array.flags.c_contiguous:
             raise ValueError("it is in Fortran order")
         found = array.shape if isinstance(expected, tuple) else zlib.crc32(array.data)
