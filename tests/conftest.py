@@ -7,6 +7,8 @@ os.environ["JAX_PLATFORMS"] = "cpu"
 
 import jax
 
+import pytest
+
 import envs  # noqa: F401  # sets XLA's flag for fast simulation before JAX starts
 from lorasp_jax.base import compilation_cache as cache
 from tests import xla
@@ -27,3 +29,10 @@ def pytest_collection_finish():
     """Collect garbage less often: imports are permanent and tracing creates many objects."""
     gc.freeze()
     gc.set_threshold(20_000, 20, 20)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _keep_programs():
+    """Exempt the programs of each file from later collections, which would traverse them all."""
+    yield
+    gc.freeze()

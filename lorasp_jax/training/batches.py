@@ -7,12 +7,11 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 
-from envs.datasets.episodes import Episodes
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import RawBatch, Steps, draw, fit_to_size, flatten, nbytes
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.training.cost.speed import Speed
-from lorasp_jax.training.demonstrations import in_thread
+from lorasp_jax.training.demonstrations import Demonstrations, in_thread
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.random_streams import StepKeys
@@ -21,7 +20,7 @@ from lorasp_jax.training.run import Run
 MAX_BYTES = 2**28
 """Largest size of the batches of one call, unless a single batch is larger."""
 
-CollectGeneration = Callable[[Config, int], dict[str, Episodes]]
+CollectGeneration = Callable[[Config, int], Demonstrations]
 """Collects demonstrations per task for generation 1, 2, ... (see `fresh_demonstrations`)."""
 
 

@@ -13,11 +13,13 @@ from envs.datasets.episodes import Episodes
 from lorasp_jax.config import Config
 from lorasp_jax.training.random_streams import RandomStream
 
+Demonstrations = dict[str, Episodes]
+"""Episodes by task."""
 Progress = Callable[[str, int, int], None]
 """Called with the task, the number of collected episodes and the total."""
 
 
-def demonstrations(config: Config, folder: Path, progress: Progress) -> dict[str, Episodes]:
+def demonstrations(config: Config, folder: Path, progress: Progress) -> Demonstrations:
     """Load the episodes of every task from `folder`/cache, or collect and cache them there."""
     paths = [folder / "cache" / f"{task}.npz" for task in config.tasks]
     load = functools.partial(_load_or_collect, config, progress=progress)
@@ -25,7 +27,7 @@ def demonstrations(config: Config, folder: Path, progress: Progress) -> dict[str
     return dict(zip(config.tasks, episodes, strict=True))
 
 
-def fresh_demonstrations(config: Config, generation: int) -> dict[str, Episodes]:
+def fresh_demonstrations(config: Config, generation: int) -> Demonstrations:
     """Collect new episodes of every task for one generation (1, 2, ...), without caching them."""
     keys = jax.vmap(lambda key: jax.random.fold_in(key, generation))(_keys(config))
     collect = functools.partial(_collect, config)

@@ -35,7 +35,7 @@ from lorasp_jax.policies.tokenizer import Tokenizer, load_tokenizer
 from lorasp_jax.training.base import base_model, quantized, with_config
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.dataset import as_cache, is_simulated, open_dataset, outline
-from lorasp_jax.training.demonstrations import Progress, demonstrations, in_thread
+from lorasp_jax.training.demonstrations import Demonstrations, Progress, demonstrations, in_thread
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.random_streams import RandomStream
@@ -45,7 +45,7 @@ from lorasp_jax.training.run_folder import record_dataset
 STATISTICS_BATCHES = 8
 """Number of batches used for data-driven initialization."""
 
-Collect = Callable[[Config, Path, Progress], dict[str, Episodes]]
+Collect = Callable[[Config, Path, Progress], Demonstrations]
 """Signature of `demonstrations`."""
 Meanwhile = Callable[[Run, "RunSetup"], Any]
 """What `prepare` runs while it collects demonstrations."""
@@ -324,7 +324,7 @@ def _load_dataset(run: Run, source: Source, free_bytes: float) -> None:
     run.console.print(f"{cache.num_steps} steps in {len(cache)} episodes, {location}")
 
 
-def _collect(run: Run, instructions: Sequence[str], collect: Collect) -> dict[str, Episodes]:
+def _collect(run: Run, instructions: Sequence[str], collect: Collect) -> Demonstrations:
     """Collect demonstrations, with a progress bar per task."""
     with bars(run.console, "episodes") as progress:
         bar_ids: dict[str, TaskID] = {}

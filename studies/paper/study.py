@@ -20,12 +20,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from envs import Episodes, Randomization
+from envs import Randomization
 from lorasp_jax.config import Config, DataConfig, EvaluationConfig, ModelConfig, OptimConfig
 from lorasp_jax.extras.study import Cell, Derived, Study
 from lorasp_jax.extras.study.study import Results
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP, Method
 from lorasp_jax.policies.policy import Policy
+from lorasp_jax.training.demonstrations import Demonstrations
 from studies.paper import naming, page, transforms
 from studies.paper.claims import make_claims
 from studies.paper.measures import measure
@@ -259,6 +260,6 @@ def _cut(ranked: Sequence[str], policy: Policy, results: Results, _: Mapping) ->
     return transforms.cut(policy, _mean_rank(results, ranked))
 
 
-def _pruned(policy: Policy, _: Results, episodes: Mapping[str, Episodes]) -> Policy:
+def _pruned(policy: Policy, _: Results, episodes: Demonstrations) -> Policy:
     """Drop the directions that LoRA-SP does not use on held-out demonstrations."""
     return transforms.pruned(policy, episodes)

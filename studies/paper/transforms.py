@@ -16,12 +16,12 @@ import numpy as np
 from flax import nnx
 
 import lorasp_jax
-from envs.datasets.episodes import Episodes
 from lorasp_jax.adapters import paths
 from lorasp_jax.dense import AdaptedLayer, AdapterParam
-from lorasp_jax.extras.study.held_out import forward, keyed_batches
 from lorasp_jax.peft import AdaLoRA, LoRA
 from lorasp_jax.policies.policy import Policy
+from lorasp_jax.training.demonstrations import Demonstrations
+from lorasp_jax.training.fixed_batches import forward, keyed_batches
 
 
 def cut(policy: Policy, mean_rank: float) -> Policy:
@@ -111,7 +111,7 @@ def _triplets(
 
 def pruned(
     policy: Policy,
-    episodes: Mapping[str, Episodes],
+    episodes: Demonstrations,
     *,
     tolerance: float = 0.0,
     batch_size: int = 64,

@@ -16,10 +16,11 @@ from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.extras.deployment import variants
 from lorasp_jax.extras.deployment.variants import BATCH_SIZE, BATCHES, VARIANTS, WHOLE
 from lorasp_jax.extras.study import Derived, held_out, page, statistics
-from lorasp_jax.extras.study.held_out import Keyed
 from lorasp_jax.extras.study.statistics import Estimate
-from lorasp_jax.extras.study.study import Demonstrations, Results, evaluated
-from lorasp_jax.training.demonstrations import fresh_demonstrations
+from lorasp_jax.extras.study.study import Results, evaluated
+from lorasp_jax.training import fixed_batches
+from lorasp_jax.training.demonstrations import Demonstrations, fresh_demonstrations
+from lorasp_jax.training.fixed_batches import Keyed
 from lorasp_jax.training.run import Run
 
 CALLS = 20
@@ -66,14 +67,14 @@ _other_demonstrations = functools.lru_cache(maxsize=1)(fresh_demonstrations)
 
 def mean_loss(policy: lorasp_jax.policies.Policy, episodes: Demonstrations) -> float:
     """Return the flow-matching loss, averaged over valid action elements, then over tasks."""
-    by_task = held_out.keyed_batches(policy, episodes, BATCH_SIZE, BATCHES)
+    by_task = fixed_batches.keyed_batches(policy, episodes, BATCH_SIZE, BATCHES)
     losses = [_loss(policy.model, pair) for pairs in by_task.values() for pair in pairs]
     return float(jnp.stack(losses).mean())
 
 
 @jax.jit
 def _loss(model: Any, keyed: Keyed) -> jax.Array:
-    per_element, _ = held_out.forward(model, keyed)
+    per_element, _ = fixed_batches.forward(model, keyed)
     mask = keyed[1].action_mask
     return jnp.where(mask, per_element, 0).sum() / mask.sum()
 

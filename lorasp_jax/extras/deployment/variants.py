@@ -8,19 +8,14 @@ from typing import Any, Literal
 from flax import nnx
 
 import lorasp_jax
-from lorasp_jax.adapters import adaptation
 from lorasp_jax.base import compilation_cache as cache
 from lorasp_jax.base.files import check_local
-from lorasp_jax.extras.study.held_out import (
-    Keyed,
-    forward,
-    held_out_demonstrations,
-    keyed_batches,
-)
-from lorasp_jax.extras.study.study import Demonstrations
+from lorasp_jax.extras.study.held_out import held_out_demonstrations
 from lorasp_jax.training import export
 from lorasp_jax.training.base import in_bf16, quantized
+from lorasp_jax.training.demonstrations import Demonstrations
 from lorasp_jax.training.finished_run import recorded_config
+from lorasp_jax.training.fixed_batches import Keyed, forward, keyed_batches
 
 BATCH_SIZE, BATCHES = 64, 8
 """Windows per batch, and batches per task, for calibration and for the loss."""
@@ -39,7 +34,8 @@ def _pruned(model: nnx.Module, batches: Batches) -> nnx.Module:
 
 
 def _half(model: nnx.Module, batches: Batches) -> nnx.Module:
-    (rank,) = {method.rank for method in adaptation.methods(model).values() if is_bank(method)}
+    methods: Any = (getattr(module, "method", None) for _, module in nnx.iter_modules(model))
+    (rank,) = {method.rank for method in methods if is_bank(method)}
     return lorasp_jax.prune(model, batches, rank=max(rank // 2, 1), forward=forward)[0]
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import lorasp_jax
 from lorasp_jax.base import hub
-from lorasp_jax.models.checkpoints import loading
 from lorasp_jax.policies import statistics_files
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor
@@ -82,11 +81,10 @@ def load_checkpoint(
         ValueError: something is missing or does not fit; see `models.load`, `statistics_files.read`
             and `Processor.of`.
     """
-    found = loading.find(where)
-    config = sized("pi0", size) if size else found.config
+    config = sized("pi0", size) if size else lorasp_jax.models.load_config(where)
     if dtype:
         config = dataclasses.replace(config, dtype=dtype, param_dtype=dtype)
-    moments = statistics_files.read(statistics or found.folder, dataset=dataset)
+    moments = statistics_files.read(statistics or where, dataset=dataset)
     if not joints and moments.dim == config.action_dim:
         raise ValueError(
             f"the statistics of {where} do not show the robot's number of joints: pass --joints"
@@ -96,7 +94,7 @@ def load_checkpoint(
     prompts = PromptTable.of(words, ["press the button"], config, num_joints=joints)
     prompts = dataclasses.replace(prompts, instructions=())
     processor = Processor.of(config, moments, prompts, num_joints=joints, cameras=cameras or None)
-    model = found.load(config)
+    model = lorasp_jax.models.load(where, config)
     models = {UNADAPTED: model}
     for name, path in (adapters or {}).items():
         models[name] = lorasp_jax.load_adapters(path, model)

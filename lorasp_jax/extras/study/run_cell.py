@@ -9,13 +9,13 @@ from typing import Any
 
 from rich.console import Console
 
+import lorasp_jax
 from lorasp_jax.base import compilation_cache as cache
 from lorasp_jax.evaluation import metrics
 from lorasp_jax.evaluation.callback import Evaluation
 from lorasp_jax.extras.study.held_out import held_out_demonstrations, shared_demonstrations
 from lorasp_jax.extras.study.runner import Job
 from lorasp_jax.extras.study.study import Cell, Derived
-from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training import loop, records, setup
 from lorasp_jax.training.export import Export, load_policy
 from lorasp_jax.training.run import Run
@@ -70,7 +70,7 @@ def _derive(job: Job) -> dict[str, Any]:
     return _finish(job, run, source)
 
 
-def _finish(job: Job, run: Run, source: Policy | None) -> dict[str, Any]:
+def _finish(job: Job, run: Run, source: lorasp_jax.policies.Policy | None) -> dict[str, Any]:
     """Return what cell.json records about a run, whose policy simulation may have evaluated."""
     with run.timed("evaluate"):
         found = (job.cell.evaluate or _simulated)(run)

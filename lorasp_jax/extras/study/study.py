@@ -11,19 +11,23 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from lorasp_jax.config import MAX_NAME_BYTES, Config
 
 if TYPE_CHECKING:  # a finished study should load no model code
-    from envs.datasets.episodes import Episodes
-    from lorasp_jax.policies.policy import Policy
+    import lorasp_jax
+    from lorasp_jax.training.demonstrations import Demonstrations
     from lorasp_jax.training.run import Run
 
 Results: TypeAlias = Mapping[str, Mapping[str, Any]]
 """The content of cell.json by cell name."""
 Evaluate: TypeAlias = Callable[["Run"], dict[str, Any]]
 """Evaluates the policy of a cell's run; returns what cell.json records: `outcomes`, and more."""
-Demonstrations: TypeAlias = Mapping[str, "Episodes"]
-"""Demonstrations by task."""
-Measure: TypeAlias = Callable[["Run", Demonstrations, "Policy | None"], dict[str, Any]]
+Measure: TypeAlias = Callable[
+    ["Run", "Demonstrations", "lorasp_jax.policies.Policy | None"], dict[str, Any]
+]
 """Maps a cell's run, held-out demonstrations by task, and the source's policy if the cell is
 derived, to further entries of cell.json."""
+Transform: TypeAlias = Callable[
+    ["lorasp_jax.policies.Policy", Results, "Demonstrations"], "lorasp_jax.policies.Policy"
+]
+"""Maps the source's policy, the results and held-out demonstrations to a derived cell's policy."""
 RESERVED = ("demonstrations", "held_out", "locks", "logs", "results.json")
 """What a study's folder contains besides the folders of cells."""
 _PART = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._+=-]*")
@@ -79,7 +83,7 @@ class Derived:
 
     name: str
     source: str | Path
-    transform: Callable[["Policy", Results, Demonstrations], "Policy"] | None = None
+    transform: Transform | None = None
     after: tuple[str, ...] = ()
     config: Callable[[Config], Config] = lambda config: config
     settings: Mapping[str, Any] = field(default_factory=dict)

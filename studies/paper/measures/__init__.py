@@ -1,18 +1,17 @@
 """What figures need beyond results.json, measured at the end of a cell on held-out data."""
 
 import itertools
-from collections.abc import Mapping
 from typing import Any
 
 import jax
 from flax import nnx
 
-from envs.datasets.episodes import Episodes
 from lorasp_jax.adapters import adaptation
-from lorasp_jax.extras.study.held_out import keyed_batches, sampler
 from lorasp_jax.peft.lora_sp.bank import BankMethod
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training.base import base_model
+from lorasp_jax.training.demonstrations import Demonstrations
+from lorasp_jax.training.fixed_batches import keyed_batches, sampler
 from lorasp_jax.training.run import Run
 from studies.paper.measures import cost, directions, gradients, layers, spectra
 
@@ -20,7 +19,7 @@ BATCH_SIZE, BATCHES = 64, 4
 """Windows per batch, and batches per task."""
 
 
-def measure(run: Run, episodes: Mapping[str, Episodes], source: Policy | None) -> dict[str, Any]:
+def measure(run: Run, episodes: Demonstrations, source: Policy | None) -> dict[str, Any]:
     """Return the costs of training, and the measures on held-out demonstrations; see `measures`."""
     config, policy = run.config, run.policy
     if source:
@@ -34,7 +33,7 @@ def measure(run: Run, episodes: Mapping[str, Episodes], source: Policy | None) -
 
 def measures(
     policy: Policy,
-    episodes: Mapping[str, Episodes],
+    episodes: Demonstrations,
     *,
     base: nnx.Module | None = None,
     source: Policy | None = None,
@@ -75,7 +74,7 @@ def measures(
 
 
 def _gradient_cosines(
-    policy: Policy, episodes: Mapping[str, Episodes], batch_size: int, batches: int
+    policy: Policy, episodes: Demonstrations, batch_size: int, batches: int
 ) -> dict[str, Any]:
     samples = {task: sampler(policy, group, batch_size) for task, group in episodes.items()}
     key = jax.random.key(0)
@@ -87,7 +86,7 @@ def _gradient_cosines(
 
 
 def _directions(
-    policy: Policy, episodes: Mapping[str, Episodes], batch_size: int, batches: int
+    policy: Policy, episodes: Demonstrations, batch_size: int, batches: int
 ) -> dict[str, Any]:
     by_task = {
         task: directions.directions_in_use(policy.model, pairs)

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax.extras.study.held_out import Keyed, forward
 from lorasp_jax.peft import Aux
+from lorasp_jax.training.fixed_batches import Keyed, forward
 
 QUARTILES = (0.0, 0.25, 0.5, 0.75, 1.0)
 

@@ -13,7 +13,7 @@ from flax import nnx
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import AuxiliaryConfig
 from lorasp_jax.data.batches import Batch
-from lorasp_jax.extras.study.held_out import Sample
+from lorasp_jax.training.fixed_batches import Sample
 from lorasp_jax.training.optim import auxiliary_weights
 from lorasp_jax.training.step import loss_fn
 from studies.paper.measures import layers
@@ -33,7 +33,7 @@ def gradient_cosines(
 
     Args:
         model: a backbone with trainable parameters.
-        samples: see `held_out.sampler`, by task.
+        samples: see `fixed_batches.sampler`, by task.
         key: draws the batches, and the noise and flow times of their losses.
         batches: number of pairs of batches.
 
