@@ -6,7 +6,6 @@ import os
 os.environ["JAX_PLATFORMS"] = "cpu"
 
 import jax
-
 import pytest
 
 import envs  # noqa: F401  # sets XLA's flag for fast simulation before JAX starts
