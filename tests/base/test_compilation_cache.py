@@ -41,16 +41,12 @@ def compile_in_process(home, **environment):
 
 
 def test_the_next_process_reads_what_one_compiled(tmp_path):
+    """The folder of the first is the next one's user's, who keeps her limit."""
     events, folder, limit = compile_in_process(tmp_path)
     assert "/jax/compilation_cache/cache_misses" in events
     assert Path(folder) == tmp_path / ".cache" / "lorasp_jax" / "jax"
     assert limit > 0, "JAX locks only the files of a limited cache"
-    events, _, _ = compile_in_process(tmp_path)
+    assert list(Path(folder).glob("*-cache"))
+    events, mine, limit = compile_in_process(tmp_path, JAX_COMPILATION_CACHE_DIR=folder)
     assert "/jax/compilation_cache/cache_hits" in events
-
-
-def test_a_folder_of_the_user_keeps_her_limit(tmp_path):
-    mine = tmp_path / "mine"
-    _, folder, limit = compile_in_process(tmp_path, JAX_COMPILATION_CACHE_DIR=str(mine))
-    assert (folder, limit) == (str(mine), -1)
-    assert list(mine.glob("*-cache"))
+    assert (mine, limit) == (folder, -1)

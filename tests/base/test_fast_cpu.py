@@ -1,5 +1,6 @@
-"""The XLA flag that MJX needs on CPU with old JAX; each test in a fresh process."""
+"""The XLA flag that MJX needs on CPU with old JAX."""
 
+import functools
 import inspect
 import os
 import subprocess
@@ -9,7 +10,7 @@ import jax
 import pytest
 
 import envs
-from lorasp_jax.base import fast_cpu
+from lorasp_jax.base import _compat, fast_cpu
 from tests import xla
 
 OLD = jax.__version_info__ < (0, 11)
@@ -28,13 +29,20 @@ def python(code, flags=""):
     )
 
 
-def test_import_sets_the_flag_again_if_flags_are_replaced():
+@pytest.mark.parametrize(
+    "call",
+    [
+        "lorasp_jax.base.fast_cpu.warn_if_late()",  # as envs.make does, which loads MJX for seconds
+        pytest.param("envs.make('press')", marks=pytest.mark.slow),
+    ],
+)
+def test_import_sets_the_flag_again_if_flags_are_replaced(call):
     python(
-        "import os, jax, envs\n"
+        "import os, jax, envs, lorasp_jax.base.fast_cpu\n"
         "is_set = lambda: '--xla_cpu_use_fusion_emitters=false' in os.environ['XLA_FLAGS']\n"
         f"assert is_set() == {OLD}\n"
         "os.environ['XLA_FLAGS'] = '--xla_force_host_platform_device_count=2'\n"
-        "envs.make('press')\n"
+        f"{call}\n"
         f"assert is_set() == {OLD}\n"
         "assert jax.device_count() == 2",
         "--xla_force_host_platform_device_count=3",
@@ -42,9 +50,25 @@ def test_import_sets_the_flag_again_if_flags_are_replaced():
 
 
 @old
-def test_the_users_flag_stays():
+def test_the_users_flag_stays(monkeypatch):
     flags = "--xla_cpu_use_fusion_emitters=true"
-    python(f"import os, envs\nassert os.environ['XLA_FLAGS'] == {flags!r}", flags)
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    for started in (True, False):
+        monkeypatch.setattr(_compat, "backends_are_initialized", lambda started=started: started)
+        assert not fast_cpu.set_flag()
+    assert os.environ["XLA_FLAGS"] == flags
+
+
+@old
+def test_too_late_warns_once(monkeypatch):
+    jax.devices()
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.setattr(fast_cpu, "is_late", fast_cpu.is_late.__wrapped__)
+    once = functools.cache(fast_cpu.warn_if_late.__wrapped__)
+    monkeypatch.setattr(fast_cpu, "warn_if_late", once)
+    with pytest.warns(UserWarning, match="15 to 400 times slower.*Import envs before") as caught:
+        assert all(envs.make("press") for _ in range(2))
+    assert len(caught) == 1
 
 
 LATE = (
@@ -70,9 +94,9 @@ FAST = (
 
 
 @old
-@pytest.mark.parametrize("then", ["", pytest.param(FAST, marks=pytest.mark.slow)])
-def test_too_late_warns_once_and_our_programs_are_fast(then):
-    python(LATE + then, xla.UNOPTIMIZED)
+@pytest.mark.slow
+def test_too_late_warns_once_and_our_programs_are_fast():
+    python(LATE + FAST, xla.UNOPTIMIZED)
 
 
 @old

@@ -18,22 +18,22 @@ FIELDS = ("qpos", "qvel", "xpos", "xmat", "site_xpos", "site_xmat")  # that task
 
 def world(scene, key: int = 0) -> mujoco.MjData:
     """Return MuJoCo data of a random layout, robot at home; moves fixed bodies of the model."""
-    return _placed(scene, scene.task.place(jax.random.key(key)))
+    return _placed(scene, layout(scene, key))
 
 
 def episode(scene, key: int = 0) -> Iterator[mujoco.MjData]:
     """Yield the same data at the start and after each control step of the expert, until success."""
-    layout = scene.task.place(jax.random.key(key))
-    data = _placed(scene, layout)
-    command = jnp.append(jnp.asarray(scene.robot.home, jnp.float32), 0.04)  # m, gripper
+    places = layout(scene, key)
+    data = _placed(scene, places)
+    command = np.array([*scene.robot.home, 0.04], np.float32)  # m, gripper
     data.qpos[scene.num_joints : scene.num_joints + 2] = 0.02
     mujoco.mj_forward(scene.model, data)
     yield data
-    knots, times = _plan(scene, layout, command, jax.random.key(key))
+    knots, times = _plan(scene, places, command, jax.random.key(key))
     commands, held = [command, command], 0
     for step in range(1, scene.expert_steps + 1):
         commands.append(_target(knots, times, step * scene.control_dt))
-        for control in _controls(jnp.stack(commands[-3:]), scene.control_dt):
+        for control in _controls(np.stack(commands[-3:]), scene.control_dt):
             data.ctrl[:] = control
             mujoco.mj_step(scene.model, data)
         mujoco.mj_forward(scene.model, data)
@@ -42,6 +42,12 @@ def episode(scene, key: int = 0) -> Iterator[mujoco.MjData]:
         if held >= scene.task.hold_steps:
             return
     raise AssertionError("the expert did not succeed")
+
+
+@functools.cache
+def layout(scene, key: int) -> dict[str, jax.Array]:
+    """Return a random layout."""
+    return jax.jit(scene.task.place)(jax.random.key(key))
 
 
 def measure(scene, data, size: float = 1.0) -> tuple[bool, np.ndarray]:

@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -18,9 +17,14 @@ def robot(robot_name):
 
 def command(robot, key):
     """Return targets near home, and others a little farther away."""
-    draw = jax.random.normal(jax.random.key(key), (2, robot.num_joints))
-    joints = jnp.asarray(robot.home, jnp.float32) + jnp.array([0.05, 0.1])[:, None] * draw
-    return jnp.concatenate([joints, jnp.array([[0.02], [0.04]])], axis=1)
+    draw = np.random.default_rng(key).normal(size=(2, robot.num_joints))
+    joints = robot.home + np.array([[0.05], [0.1]]) * draw
+    return np.concatenate([joints, [[0.02], [0.04]]], axis=1, dtype=np.float32)
+
+
+from_targets = jax.jit(actions.from_targets, static_argnums=(0, 1))
+to_targets = jax.jit(actions.to_targets, static_argnums=(0, 1))
+tool_pose = jax.jit(robots.tool_pose, static_argnums=0)
 
 
 @pytest.mark.parametrize("mode", names.MODES)
@@ -35,20 +39,18 @@ def test_bounds_of_each_mode(robot, mode):
 
 def test_delta_joint_is_a_difference(robot):
     now, then = command(robot, 0)
-    action = actions.from_targets("delta_joint", robot, now, then)
+    action = from_targets("delta_joint", robot, now, then)
     np.testing.assert_allclose(action[:-1], then[:-1] - now[:-1], atol=1e-6)
     assert action[-1] == then[-1]  # the opening is absolute
-    np.testing.assert_allclose(
-        actions.to_targets("delta_joint", robot, now, action), then, atol=1e-6
-    )
+    np.testing.assert_allclose(to_targets("delta_joint", robot, now, action), then, atol=1e-6)
 
 
 def test_end_effector_reaches_the_same_pose(robot):
     now, then = command(robot, 1)
-    action = actions.from_targets("end_effector", robot, now, then)
-    found = jax.jit(actions.to_targets, static_argnums=(0, 1))("end_effector", robot, now, action)
+    action = from_targets("end_effector", robot, now, then)
+    found = to_targets("end_effector", robot, now, action)
     for ours, theirs in zip(
-        robots.tool_pose(robot, found[:-1])[:2], robots.tool_pose(robot, then[:-1])[:2], strict=True
+        tool_pose(robot, found[:-1])[:2], tool_pose(robot, then[:-1])[:2], strict=True
     ):
         np.testing.assert_allclose(ours, theirs, atol=3e-3)
     assert found[-1] == then[-1]
@@ -56,11 +58,11 @@ def test_end_effector_reaches_the_same_pose(robot):
 
 def test_end_effector_moves_in_the_base_frame(robot):
     now, _ = command(robot, 2)
-    action = jnp.array([0.02, 0.0, -0.01, 0.0, 0.0, 0.2, 0.03])
-    found = actions.to_targets("end_effector", robot, now, action)
-    (start, before, _), (end, after, _) = (robots.tool_pose(robot, q[:-1]) for q in (now, found))
-    np.testing.assert_allclose(end - start, action[:3], atol=2e-3)
-    turn = after @ before.T  # about the vertical
+    action = np.array([0.02, 0.0, -0.01, 0.0, 0.0, 0.2, 0.03], np.float32)
+    found = to_targets("end_effector", robot, now, action)
+    (start, before, _), (end, after, _) = (tool_pose(robot, q[:-1]) for q in (now, found))
+    np.testing.assert_allclose(np.subtract(end, start), action[:3], atol=2e-3)
+    turn = np.asarray(after) @ np.asarray(before).T  # about the vertical
     np.testing.assert_allclose(turn[:2, :2], [[0.980, -0.199], [0.199, 0.980]], atol=0.01)
 
 

@@ -10,23 +10,25 @@ import pytest
 
 from envs import robots
 from envs.experts import expert
-from envs.tasks import View, route
-from tests.envs.expert_in_c import world
+from envs.tasks import route
+from tests.envs.expert_in_c import measure, world
 
 
 def succeeds(scene, data) -> bool:
     mujoco.mj_forward(scene.model, data)
-    return bool(scene.task.check(View(scene.model, data))[0])
+    return measure(scene, data)[0]
 
 
 def reach(scene, data, position, opening: float) -> None:
     """Move the tool, pointing down, to a position."""
-    goal = jnp.asarray(position, jnp.float32)
-    start = jnp.asarray(scene.robot.home, jnp.float32)
-    solve = jax.jit(functools.partial(robots.inverse_kinematics, scene.robot))
-    (rotation,) = expert.tool_rotations(scene.robot, route((goal, (0.0, 0.0, 0.0), 0.0, 1.0, 0.0)))
-    data.qpos[: scene.num_joints] = solve(goal, rotation, start)
+    data.qpos[: scene.num_joints] = _solve(scene.robot, np.float32(position))
     data.qpos[scene.num_joints : scene.num_joints + 2] = opening / 2
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _solve(robot, goal):
+    (rotation,) = expert.tool_rotations(robot, route((goal, (0.0, 0.0, 0.0), 0.0, 1.0, 0.0)))
+    return robots.inverse_kinematics(robot, goal, rotation, jnp.float32(robot.home))
 
 
 def test_instructions_are_short_and_several(scene):
@@ -50,7 +52,7 @@ RANGES = {  # body -> lowest and highest x, y [m]
 
 
 def test_layouts_fill_their_range(scene, task_name):
-    layouts = jax.vmap(scene.task.place)(jax.random.split(jax.random.key(1), 2048))
+    layouts = jax.jit(jax.vmap(scene.task.place))(jax.random.split(jax.random.key(1), 2048))
     assert layouts.keys() == RANGES[task_name].keys()
     for body, (low, high) in RANGES[task_name].items():
         place = np.asarray(layouts[body])[:, :2]
@@ -63,7 +65,7 @@ def test_layouts_fill_their_range(scene, task_name):
 def test_every_layout_is_visible_to_the_side_camera(scene):
     camera = world(scene).camera("side")
     edge = np.tan(np.deg2rad(scene.model.camera("side").fovy[0]) / 2)
-    layouts = jax.vmap(scene.task.place)(jax.random.split(jax.random.key(2), 256))
+    layouts = jax.jit(jax.vmap(scene.task.place))(jax.random.split(jax.random.key(2), 256))
     for place in layouts.values():
         x, y, z = camera.xmat.reshape(3, 3).T @ (np.asarray(place)[:, :3] - camera.xpos).T
         assert np.all(z < 0)
@@ -76,7 +78,7 @@ def test_nothing_moves_or_succeeds_by_itself(scene):
     data.ctrl[: scene.num_joints] = scene.robot.home
     for _ in range(400):
         mujoco.mj_step(scene.model, data)
-        assert not scene.task.check(View(scene.model, data))[0]
+        assert not measure(scene, data)[0]
     np.testing.assert_allclose(data.xpos, before, atol=3e-3)
 
 

@@ -33,6 +33,7 @@ def test_paper(tmp_path):
     rebuild("paper", tmp_path)
 
 
+@pytest.mark.slow
 def test_metaworld(tmp_path):
     rebuild("metaworld", tmp_path)
 

@@ -18,6 +18,7 @@ from tests.runs import CONFIG, RESULTS, finish
 
 SETTINGS = dataclasses.replace(CONFIG.evaluation, episodes=4, num_envs=2, denoise_steps=3)
 TASK = RESULTS["tasks"]["press"]
+WRITE = figure.write  # most tests draw none
 
 
 def played(env, execution, *, denoise_steps, ranges):
@@ -47,6 +48,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(run_cell, "_source", lambda run: policy)
     monkeypatch.setattr(curve, "delayed_rollout", played)
     monkeypatch.setattr(command, "MAX_DELAY", 2)
+    monkeypatch.setattr(figure, "write", lambda *_: None)
     monkeypatch.setattr(run_cell.gc, "collect", lambda: 0)  # there are no models
     monkeypatch.setattr(command, "describe", lambda run: {"policy": {"config": {"chunk": 10}}})
     played.calls = []
@@ -65,7 +67,8 @@ def measured(folder):
     return results.load(folder / "latency/results.json")
 
 
-def test_every_execution_is_measured_at_every_delay(folder, capsys):
+def test_every_execution_is_measured_at_every_delay(folder, capsys, monkeypatch):
+    monkeypatch.setattr(figure, "write", WRITE)
     assert command.main([str(folder), "--episodes", "4"]) == 0
     beyond, *written = capsys.readouterr().out.splitlines()
     assert beyond.endswith("beyond d = 1 is beyond its --optim.rtc-max-delay")
@@ -85,7 +88,7 @@ def test_every_execution_is_measured_at_every_delay(folder, capsys):
     assert "<svg" in (folder / "latency.svg").read_text()
 
 
-def test_a_figure_of_several_runs(folder, tmp_path):
+def test_a_figure_of_several_runs(folder, tmp_path, monkeypatch):
     """The same file every time, whichever executions the first run has."""
     (tmp_path / "other").mkdir()
     other = finish(tmp_path / "other")
@@ -94,6 +97,7 @@ def test_a_figure_of_several_runs(folder, tmp_path):
     path = tmp_path / "both.svg"
     options = ["--delays", "0", "1", "--tasks", "press", "--figure", str(path)]
     contents = set()
+    monkeypatch.setattr(figure, "write", WRITE)
     for _ in range(2):
         assert command.main([str(folder), str(other), "--executions", "guided", *options]) == 0
         contents.add(path.read_bytes())

@@ -9,8 +9,9 @@ from lorasp_jax.extras.piper.safety import Limits
 from tests.extras.piper.benches import Bench
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def world():
+    """A scene whose programs are compiled once; each bench resets it."""
     return World("press", image_size=16)
 
 

@@ -3,10 +3,12 @@
 import json
 import signal
 import types
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from PIL import Image
+from websockets.exceptions import ConcurrencyError
 
 from lorasp_jax.extras.piper import log as logs
 from lorasp_jax.extras.piper import session as sessions
@@ -15,6 +17,8 @@ from lorasp_jax.extras.piper.log import Log
 from lorasp_jax.extras.piper.options import stop_on_signals
 from lorasp_jax.extras.piper.session import PERIOD, Settings
 from lorasp_jax.extras.serving.client import PolicyError, ServerGone
+from lorasp_jax.extras.serving.wire import FrameError
+from tests.cases import mostly_slow
 from tests.extras.piper.benches import Bench
 from tests.extras.piper.piper_runs import ARM_STEP, Run, Turning, assert_braked, assert_safe
 
@@ -74,10 +78,13 @@ def test_asking_ahead_skips_what_is_past(bench):
 
 
 @pytest.mark.parametrize(
-    ("latency", "delay", "wait"), [(0.0, 0, 0), (0.2, 2, 0), (0.16, 2, 0), (0.5, 3, 2)]
+    "case",  # latency [s], delay and wait [control steps]
+    mostly_slow([(0.0, 0, 0), (0.2, 2, 0), (0.16, 2, 0), (0.5, 3, 2)], [(0.16, 2, 0), (0.5, 3, 2)]),
+    ids=str,
 )
-def test_a_new_chunk_takes_over_as_in_the_simulation(bench, latency, delay, wait):
+def test_a_new_chunk_takes_over_as_in_the_simulation(bench, case):
     """It starts where the previous one was, at the end of an action, even if they disagree."""
+    latency, delay, wait = case
     chunks, targets, recorded = [], [], []
     base = bench.arm.read().pose[0]
 
@@ -135,7 +142,7 @@ def test_a_first_target_out_of_reach(bench, monkeypatch):
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-@pytest.mark.parametrize("number", SIGNALS)
+@pytest.mark.parametrize("number", mostly_slow(SIGNALS, [signal.SIGTERM]))
 def test_signals_brake_and_hold(bench, number):
     handlers = {each: signal.getsignal(each) for each in SIGNALS}
     run = Run(bench, Turning())
@@ -207,11 +214,9 @@ def test_asking_in_a_thread(bench):
     asker._thread.join()
     assert asker.answer().shape == (10, 7)
 
-    def gone(_):
-        raise ServerGone("gone")
-
-    asker = InThread(gone)
-    asker.ask({})
-    asker._thread.join()
-    with pytest.raises(PolicyError, match="gone"):
-        asker.answer()
+    for error in (ServerGone, FrameError, TypeError, ConcurrencyError):
+        asker = InThread(Mock(side_effect=error("gone")))
+        asker.ask({})
+        asker._thread.join()
+        with pytest.raises(PolicyError, match="gone"):
+            asker.answer()

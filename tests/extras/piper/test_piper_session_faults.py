@@ -16,6 +16,7 @@ from lorasp_jax.extras.piper.options import Server
 from lorasp_jax.extras.piper.session import PERIOD
 from lorasp_jax.extras.serving.client import PolicyClient
 from lorasp_jax.extras.serving.wire import FrameError
+from tests.cases import mostly_slow
 from tests.extras.piper.piper_runs import Run, Turning, assert_braked, assert_holds, assert_safe
 from tests.extras.serving.stand_in import StandIn, serving
 
@@ -162,12 +163,14 @@ def test_a_server_that_refuses(bench):
 
 
 @pytest.mark.usefixtures("near_rest")
-@pytest.mark.parametrize("error", [FrameError("bad"), TypeError("bad"), ConcurrencyError("bad")])
+@pytest.mark.parametrize(
+    "error", mostly_slow([FrameError, TypeError, ConcurrencyError], [TypeError])
+)
 def test_a_policy_that_raises_anything(bench, error):
     run = Run(bench, ask := Turning())
 
     def change(actions):
-        raise error
+        raise error("bad")
 
     run.at = {0.3: lambda: setattr(ask, "change", change)}
     assert run(30.0) == "bad"
@@ -175,15 +178,20 @@ def test_a_policy_that_raises_anything(bench, error):
     assert_holds(run, "bad")
 
 
-@pytest.mark.parametrize("where", ["look", "recorder", "log", "done"])
-@pytest.mark.parametrize("error", [OSError("it broke"), KeyboardInterrupt("it broke")])
-def test_every_other_error_brakes_and_is_raised(bench, where, error):
+PLACES = ("look", "recorder", "log", "done")
+CASES = [(place, error) for place in PLACES for error in (OSError, KeyboardInterrupt)]
+FAST = [*CASES[::2], ("look", KeyboardInterrupt)]
+
+
+@pytest.mark.parametrize("case", mostly_slow(CASES, FAST), ids=str)
+def test_every_other_error_brakes_and_is_raised(bench, case):
+    where, error = case
     broken = []
 
     def work(*_):
         if bench.clock.now() > due and not broken:
             broken.append(where)
-            raise error
+            raise error("it broke")
         return where == "look" and bench.world.images()
 
     due = bench.clock.now() + 0.45  # at full speed
@@ -193,7 +201,7 @@ def test_every_other_error_brakes_and_is_raised(bench, where, error):
         "log": types.SimpleNamespace(observation=work, line=lambda *_, **__: work()),
     }
     run = Run(bench, Turning(), **{name: x for name, x in part.items() if name == where})
-    with pytest.raises(type(error), match="it broke"):
+    with pytest.raises(error, match="it broke"):
         run(30.0, work if where == "done" else lambda: False)
     assert run.said == ["holding: it broke"]
     assert_braked(run)
@@ -239,7 +247,11 @@ def test_pictures_that_stop(bench):
     assert run.said[:2] == ["holding: camera wrist shows nothing new", "going on"]
 
 
-def test_pictures_that_stop_for_good(bench):
+@pytest.mark.parametrize("way", mostly_slow(["short", "long"], ["short"]))
+def test_pictures_that_stop_for_good(bench, way, request):
+    if way == "short":
+        request.getfixturevalue("near_rest")
+
     def die():
         if bench.clock.now() > due:
             raise NoPicture("camera wrist shows nothing new")

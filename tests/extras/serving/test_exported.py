@@ -180,6 +180,7 @@ def test_the_loader_imports_nothing_else_of_the_package():
     assert ours == {*packages, "lorasp_jax.extras.serving.exported"}
 
 
+@pytest.mark.slow
 def test_the_client_of_the_documentation_runs_without_the_package(folder, tmp_path):
     page = (ROOT / "docs" / "serving.md").read_text()
     (client,) = re.findall(r"^```py\n(.*?)^```", page, re.DOTALL | re.MULTILINE)

@@ -157,13 +157,13 @@ def test_a_chunk_continues_what_remains_of_the_previous_one(execution, served):
 
 def test_programs_are_shared_and_compiled_in_advance():
     policies_of_two = {"base": make_policy(), "other": make_policy(seed=1)}
-    fresh, progress, program = compiled(policies_of_two, max_batch=3), [], policies._program()
+    fresh, progress, program = compiled(policies_of_two), [], policies._program()
     program.clear_cache()
     fresh.warm_up(progress.append)
-    assert progress[-1] == "compiling other, batch 3 (6 of 6)"
-    assert program._cache_size() == 3
+    assert progress[-1] == "compiling other, batch 2 (4 of 4)"
+    assert program._cache_size() == 2
     actions(fresh, request(fresh.spec, prompt="open the pot", adapter="other"), index=(7, 7))
-    assert program._cache_size() == 3
+    assert program._cache_size() == 2
 
 
 def test_prompts(served):

@@ -137,9 +137,10 @@ class FakePiper:
     def _aim(self, joints: slice, angles: np.ndarray) -> None:
         # A count is 0.001 degrees, and a target at a limit may be rounded past it.
         low, high = ROBOT.lower[joints] - 2e-5, ROBOT.upper[joints] + 2e-5
-        within = bool(np.all((low <= angles) & (angles <= high)))
-        self._check(within, f"joints {joints.start + 1}-{joints.stop} at {np.rad2deg(angles)} deg")
-        if self._ctrl_mode == _CAN and within:
+        if not np.all((low <= angles) & (angles <= high)):
+            degrees = np.rad2deg(angles)
+            self.unsafe.append(f"joints {joints.start + 1}-{joints.stop} at {degrees} deg")
+        elif self._ctrl_mode == _CAN:
             self._target[joints] = angles
 
     def _check(self, fine: bool, what: str) -> None:
