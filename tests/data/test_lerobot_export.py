@@ -12,6 +12,7 @@ from lorasp_jax.data.keys import Keys
 from lorasp_jax.data.lerobot import LeRobot
 from lorasp_jax.data.lerobot_export import to_lerobot
 from lorasp_jax.data.opening import open_source
+from tests.cases import mostly_slow
 from tests.data.lerobots import VERSIONS, golden
 from tests.envs.datasets.test_episodes import assert_equal, make
 
@@ -20,7 +21,7 @@ def silent(done, total):
     pass
 
 
-@pytest.fixture(scope="module", params=VERSIONS)
+@pytest.fixture(scope="module", params=mostly_slow(VERSIONS, ["v3"]))
 def exported(request, tmp_path_factory):
     """The episodes of a source, the folder of its export, and the reports of progress."""
     source, reports = LeRobot(golden(request.param)), []
