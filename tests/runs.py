@@ -62,6 +62,10 @@ RESULTS = {
 """Contents of results.json."""
 
 
+PROGRAMS: dict[Any, Any] = {}
+"""For `Run.programs`: runs with equal inputs then trace and lower their program only once."""
+
+
 class Miniature(nnx.Module):
     """Two-layer stand-in for a backbone, so that a training process starts immediately."""
 

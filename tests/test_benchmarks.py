@@ -120,6 +120,7 @@ DUMMY = argparse.Namespace(
 )
 
 
+@pytest.mark.slow
 def test_merged_adapters_run_the_program_of_the_base():
     config = deployment.sized("pi0", DUMMY)
     text = {

@@ -15,8 +15,9 @@ OTHERS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("studi
 """Pages whose links and files are checked, but not their examples."""
 WITHOUT_EXAMPLES = {"runs", "launch", "benchmarks", "architecture", "libero"}
 """Reference pages, and one about another package."""
-SLOW = {"serving", "latency", "reinforcement_learning"}
-"""Pages about extras, which have tests of their own."""
+SLOW = {"serving", "latency", "deployment", "reinforcement_learning", "simulation"}
+SLOW |= {"adapt_your_model", "language_models", "published_checkpoints"}
+"""Pages that take long and whose subjects have tests of their own."""
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 OPTION = re.compile(r"^\| `(\w+)` \| `([^`]+)` \| \S", re.MULTILINE)
 LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)|src(?:set)?=\"([^\":]+)\"")
@@ -58,6 +59,11 @@ def test_examples_run(page, tmp_path, monkeypatch):
     assert bool(code.strip()) != (page.stem in WITHOUT_EXAMPLES), f"{page} has no example"
     monkeypatch.chdir(tmp_path)
     exec(compile(code, str(page), "exec"), {"__name__": "documentation"})
+
+
+def test_the_first_example_for_a_users_model_runs():
+    code = BLOCK.search((ROOT / "docs/adapt_your_model.md").read_text())[1]
+    exec(compile(code, "docs/adapt_your_model.md", "exec"), {"__name__": "documentation"})
 
 
 def test_every_method_has_a_page():

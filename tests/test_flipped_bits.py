@@ -1,5 +1,6 @@
 """Test that a flipped bit in any file of a run, policy or cache is harmless or raises an error."""
 
+import functools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -30,6 +31,7 @@ HEADERS = 200
 """Size of the header of a large file [bytes]."""
 
 
+@functools.cache
 def net() -> nnx.Module:
     return nnx.Dict(lin=nnx.Linear(3, 4, rngs=nnx.Rngs(0)))
 

@@ -17,6 +17,7 @@ from tests import ROOT
 from tests.runs import RESULTS
 
 MULTITASK = ["--config", str(ROOT / "configs" / "multitask.py"), "--scale", "smoke"]
+MULTITASK += ["--tasks", "press"]  # a single environment
 NANO = ["--model.checkpoint", str(ROOT / "assets" / "pi0_nano")]
 
 

@@ -1,13 +1,14 @@
 """Windows stay in one episode, padded and masked past its end."""
 
 import dataclasses
+import functools
 
 import jax
 import numpy as np
 import pytest
 
 from lorasp_jax.data.batches import flatten, sample_batch, windows
-from tests.runs import CONFIG, make_run, random_episodes
+from tests.runs import CONFIG, Miniature, make_run, random_episodes
 
 
 def test_flatten_keeps_valid_steps_in_order():
@@ -69,13 +70,14 @@ def test_noise_is_added_to_the_robots_slots_only(tmp_path):
 
 def test_published_weights_train_unused_slots(tmp_path):
     """And relative actions are relative to the window's first state."""
-    run = make_run(tmp_path / "run", CONFIG)
+    run = make_run(tmp_path / "run", dataclasses.replace(CONFIG, targets=("inp",)), Miniature())
     steps, own = flatten(list(run.episodes.values())), run.policy.processor
     inputs = dataclasses.replace(own.inputs, quiet_slots=False, delta=(True, False))
     sizes = {"batch_size": 16, "chunk": 4, "state_noise": 0.0}
-    plain = sample_batch(jax.random.key(1), steps, own, **sizes)
+    sample = jax.jit(functools.partial(sample_batch, **sizes))
+    plain = sample(jax.random.key(1), steps, own)
     other = dataclasses.replace(own, inputs=inputs)
-    batch = sample_batch(jax.random.key(1), steps, other, **sizes)
+    batch = sample(jax.random.key(1), steps, other)
     assert (batch.action_mask == plain.action_mask[..., :1]).all()
     assert not batch.actions[..., 6].any()
     std, known = own.statistics.action["std"][0], own.statistics.state

@@ -12,6 +12,7 @@ from lorasp_jax.data.keys import Keys
 from lorasp_jax.data.lerobot import LeRobot
 from lorasp_jax.data.lerobot_export import to_lerobot
 from lorasp_jax.data.opening import open_source
+from tests.cases import mostly_slow
 from tests.data.lerobots import VERSIONS, golden
 from tests.envs.datasets.test_episodes import assert_equal, make
 
@@ -20,24 +21,29 @@ def silent(done, total):
     pass
 
 
-@pytest.mark.parametrize("version", VERSIONS)
-def test_episodes_are_equal(version, tmp_path):
-    source, reports = LeRobot(golden(version)), []
-    to_lerobot(source, tmp_path / "dataset", lambda *done: reports.append(done))
+@pytest.fixture(scope="module", params=mostly_slow(VERSIONS, ["v3"]))
+def exported(request, tmp_path_factory):
+    """The episodes of a source, the folder of its export, and the reports of progress."""
+    source, reports = LeRobot(golden(request.param)), []
+    folder = tmp_path_factory.mktemp("exported") / "dataset"
+    to_lerobot(source, folder, lambda *done: reports.append(done))
+    return [source.episode(number) for number in range(4)], folder, reports
+
+
+def test_episodes_are_equal(exported):
+    episodes, folder, reports = exported
     assert reports == [(25, 126), (58, 126), (98, 126), (126, 126)]
-    found = LeRobot(tmp_path / "dataset")
+    found = LeRobot(folder)
     assert (found.kind, len(found)) == ("LeRobot v3.0", 4)
     joints = [*(f"joint_{i + 1}.pos" for i in range(6)), "gripper.pos"]
     assert found.names == {"state": joints, "action": joints}
-    for number in range(4):
-        assert_equal(found.episode(number), source.episode(number))
+    for number, episode in enumerate(episodes):
+        assert_equal(found.episode(number), episode)
 
 
-def test_statistics_are_those_of_all_steps(tmp_path):
-    source = LeRobot(golden("v3"))
-    to_lerobot(source, tmp_path / "dataset", silent)
-    stats = json.loads((tmp_path / "dataset" / "meta" / "stats.json").read_text())
-    episodes = [source.episode(number) for number in range(4)]
+def test_statistics_are_those_of_all_steps(exported):
+    episodes, folder, _ = exported
+    stats = json.loads((folder / "meta" / "stats.json").read_text())
     state = np.concatenate([episode.state[0] for episode in episodes]).astype(np.float64)
     pixels = np.concatenate([e.image["wrist"].reshape(-1, 3) for e in episodes]) / 255
     for name, rows, shape in (

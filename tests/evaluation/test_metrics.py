@@ -1,17 +1,17 @@
 """Wilson intervals; the tokens over which active ranks are averaged."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from lorasp_jax.base.intervals import wilson_interval
-from lorasp_jax.evaluation.metrics import (
-    layer_ranks,
-    position_bias,
-    rank_histogram,
-)
+from lorasp_jax.evaluation import metrics
+from lorasp_jax.evaluation.metrics import position_bias
 from lorasp_jax.peft import Aux
 
+layer_ranks = jax.jit(metrics.layer_ranks)
+rank_histogram = jax.jit(metrics.rank_histogram, static_argnums=2)
 RUNNING = jnp.array([False, True, False])
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 from dataclasses import field
 from types import SimpleNamespace
 
@@ -135,17 +136,17 @@ def policy(weight=0.5, method=CONFIG.peft, devices=1):
 def step_by_step(room, policy, key, ranges=None):
     """Run the same episodes in Python: the last state, unfinished worlds and ranks per call."""
     reset_key, sample_key = jax.random.split(key)
-    state, running, ranks = room.reset(reset_key, ranges), [], []
+    observe, step = jax.jit(room.observe), jax.jit(room.step)
+    sample = jax.jit(functools.partial(Policy.sample, num_steps=2, return_aux=True))
+    state, running, ranks = jax.jit(room.reset)(reset_key, ranges), [], []
     rows = policy.processor.prompts.rows(room.instructions)[state.info["instruction"]]
     for call in range(room.max_steps // 3):
-        call_key, observation = jax.random.fold_in(sample_key, call), room.observe(state)
-        actions, aux = policy.sample(
-            call_key, observation, jnp.asarray(rows), num_steps=2, return_aux=True
-        )
+        call_key, observation = jax.random.fold_in(sample_key, call), observe(state)
+        actions, aux = sample(policy, call_key, observation, jnp.asarray(rows))
         running.append(int((~state.done).sum()))
         ranks.append(aux["vision"]["fc1"].active_rank[0, ~state.done].mean(0))
         for action in actions[:, :3].swapaxes(0, 1):
-            state = room.step(state, action)
+            state = step(state, action)
     return state, running, ranks
 
 
@@ -154,8 +155,9 @@ def test_max_rank(method, rank):
     assert programs._max_rank(policy(method=method)) == rank
 
 
-@pytest.mark.parametrize("room", ROOMS)
-@pytest.mark.parametrize("ranges", [None, Randomization(turn=(0.5, 0.5))])
+@pytest.mark.parametrize(
+    ("room", "ranges"), [(ROOMS[0], None), (ROOMS[1], Randomization(turn=(0.5, 0.5)))]
+)
 def test_the_policy_acts_in_the_worlds(room, ranges):
     found = make_rollout(room, execute_steps=3, denoise_steps=2, ranges=ranges)(policy(), KEY)
     state, running, ranks = step_by_step(room, policy(), KEY, ranges)

@@ -3,6 +3,7 @@
 NumPy draws them, because JAX would compile a program for every shape.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -16,7 +17,16 @@ from lorasp_jax.models.observation import Observation
 
 def random_backbone(config: Any, seed: int = 0) -> Any:
     """Create a backbone with random parameters."""
-    return with_random_parameters(lambda: config.create(nnx.Rngs(0)), seed)
+    graphdef, parameters = _random_parameters(config, seed)
+    return nnx.merge(graphdef, jax.tree.map(jnp.array, parameters))
+
+
+@functools.lru_cache(maxsize=4)
+def _random_parameters(config: Any, seed: int) -> Any:
+    """Trace a constructor only once; in NumPy, as a training step may delete arrays of JAX."""
+    model = with_random_parameters(lambda: config.create(nnx.Rngs(0)), seed)
+    graphdef, parameters = nnx.split(model)
+    return graphdef, jax.tree.map(np.asarray, parameters)
 
 
 def with_random_parameters(build: Callable[[], nnx.Module], seed: int = 0) -> Any:

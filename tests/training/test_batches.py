@@ -1,6 +1,7 @@
 """The batches of several steps in one call."""
 
 import dataclasses
+import functools
 
 import jax
 import numpy as np
@@ -40,10 +41,12 @@ def test_batches_do_not_depend_on_the_number_of_steps_per_call(drawn):
 def test_a_batch_is_that_of_sample_batch(drawn, steps, tmp_path):
     processor = make_run(tmp_path / "run", SMALL, Miniature()).policy.processor
     raw = jax.tree.map(lambda x: x[0], drawn.take(KEY, 7, 1))
-    found = encode(StepKeys.of(KEY, 7).state_noise, raw, processor, state_noise=0.1)
+    encoded = jax.jit(functools.partial(encode, state_noise=0.1))
+    found = encoded(StepKeys.of(KEY, 7).state_noise, raw, processor)
     batch_key, _ = jax.random.split(jax.random.fold_in(KEY, 7))
     sizes = {"batch_size": 6, "chunk": 3, "state_noise": 0.1}
-    expected = sample_batch(batch_key, jax.device_put(steps), processor, **sizes)
+    sample = jax.jit(functools.partial(sample_batch, **sizes))
+    expected = sample(batch_key, jax.device_put(steps), processor)
     jax.tree.map(np.testing.assert_array_equal, found, expected)
 
 

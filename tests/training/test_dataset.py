@@ -14,13 +14,14 @@ from lorasp_jax.data.batches import flatten
 from lorasp_jax.evaluation.callback import NoEvaluation
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
+from lorasp_jax.peft import LoRA
 from lorasp_jax.report.html import write_report
 from lorasp_jax.training import setup
 from lorasp_jax.training.base import base_model
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.run_folder import to_json, write_json
 from tests.models.random_models import random_backbone
-from tests.runs import CONFIG, make_run, random_episodes
+from tests.runs import CONFIG, Miniature, make_run, random_episodes
 
 
 def prepare(folder, monkeypatch, source, available=2**40, model_config=None):
@@ -29,8 +30,11 @@ def prepare(folder, monkeypatch, source, available=2**40, model_config=None):
     remat = "none", preflight.Memory(*6 * [0.0])
     monkeypatch.setattr(preflight, "choose_remat", lambda *_: remat)
     evaluation = dataclasses.replace(CONFIG.evaluation, execute_steps=1)
-    data = DataConfig(source=str(source))
-    config = dataclasses.replace(CONFIG, data=data, evaluation=evaluation)
+    data, method = (
+        DataConfig(source=str(source)),
+        {"peft": LoRA(rank=4), "targets": ("action_out",)},
+    )
+    config = dataclasses.replace(CONFIG, data=data, evaluation=evaluation, **method)
     console = Console(file=io.StringIO(), width=200)
     monkeypatch.setattr(setup, "base_model", lambda *_, **__: (model, ""))
     return setup.prepare(config, folder, console, time.perf_counter())
@@ -79,7 +83,7 @@ def test_published_smolvla_is_trimmed_to_the_cameras_of_the_dataset(tmp_path, mo
 
 
 def test_a_run_without_simulation_has_a_report(tmp_path):
-    run = make_run(tmp_path / "run")
+    run = make_run(tmp_path / "run", dataclasses.replace(CONFIG, targets=("inp",)), Miniature())
     with run.timed("train"):
         pass
     write_json(run.folder / "config.json", to_json(run.config))

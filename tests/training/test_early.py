@@ -58,8 +58,12 @@ def prepare(monkeypatch, tmp_path):
     return prepare
 
 
-def test_the_run_compiles_nothing_else(prepare, monkeypatch):
-    texts, jit_steps = [], program.jit_steps
+def test_the_run_compiles_and_traces_nothing_else(prepare, monkeypatch):
+    texts, jit_steps, calls, train_step = [], program.jit_steps, [], program.train_step
+
+    def counted(*arguments, **options):
+        calls.append(None)
+        return train_step(*arguments, **options)
 
     def recorded(*arguments):
         def lower(*shapes):
@@ -74,6 +78,7 @@ def test_the_run_compiles_nothing_else(prepare, monkeypatch):
         del run, task
         return ROOM, make_rollout(ROOM, execute_steps=1, denoise_steps=2)
 
+    monkeypatch.setattr(program, "train_step", counted)
     monkeypatch.setattr(program, "jit_steps", recorded)
     monkeypatch.setattr(loop, "jit_steps", recorded)
     monkeypatch.setattr(callback, "compiled_rollout", compile_rollout)
@@ -81,24 +86,12 @@ def test_the_run_compiles_nothing_else(prepare, monkeypatch):
     with compilations() as counts:
         run = prepare(early.compile_training, evaluation.compile_early)
     assert counts == POLICY | dict.fromkeys(WORLD, 1)
+    traced = len(calls)
     with compilations() as counts:
         loop.train(run, [evaluation])
     assert counts == {}
     early_text, *used = texts
     assert used == [early_text]  # so that JAX finds the program in its cache on disk
-
-
-def test_the_run_traces_nothing_again(prepare, monkeypatch):
-    calls, train_step = [], program.train_step
-
-    def counted(*arguments, **options):
-        calls.append(None)
-        return train_step(*arguments, **options)
-
-    monkeypatch.setattr(program, "train_step", counted)
-    run = prepare(early.compile_training)
-    traced = len(calls)
-    loop.train(run)
     assert len(calls) == traced > 0
 
 

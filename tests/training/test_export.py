@@ -17,7 +17,7 @@ from lorasp_jax.base import hub
 from lorasp_jax.base.digest import with_digest
 from lorasp_jax.config import ModelConfig
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.peft import FullFineTuning
+from lorasp_jax.peft import FullFineTuning, LoRA
 from lorasp_jax.policies import tokenizer
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training import base, export
@@ -25,6 +25,10 @@ from tests.models.random_models import random_backbone
 from tests.runs import CONFIG, leaves, make_run
 
 BASES = sorted(path.parent for path in Path("assets").glob("*/config.json"))
+FAST = dataclasses.replace(CONFIG, peft=LoRA(rank=4), targets=("action_out_proj",))
+"""Where the method does not matter."""
+SPARSE = dataclasses.replace(CONFIG, targets=("patch_embed", "language/blocks/q_proj"))
+FULL = dataclasses.replace(CONFIG, peft=FullFineTuning())
 
 
 def with_random_adapters(policy):
@@ -35,19 +39,19 @@ def with_random_adapters(policy):
     return Policy(nnx.merge(graphdef, jax.tree.map(randomize, adapters), frozen), policy.processor)
 
 
-def run_on_a_base(folder, method=CONFIG.peft):
+def run_on_a_base(folder, config=FAST):
     """Make a run in `folder`/run on a base in `folder`/base."""
     models.save(folder / "base", random_backbone(Pi0Config.dummy()))
-    model_config = dataclasses.replace(CONFIG.model, checkpoint=str(folder / "base"))
-    config = dataclasses.replace(CONFIG, model=model_config, peft=method)
+    model_config = dataclasses.replace(config.model, checkpoint=str(folder / "base"))
+    config = dataclasses.replace(config, model=model_config)
     run = make_run(folder / "run", config, models.load(folder / "base"))
     run.base_hash = models.weights_hash(folder / "base")
     return run
 
 
-@pytest.mark.parametrize("method", [CONFIG.peft, FullFineTuning()], ids=["adapters", "base"])
-def test_a_policy_loads(tmp_path, method):
-    run = run_on_a_base(tmp_path, method)
+@pytest.mark.parametrize("config", [SPARSE, FULL], ids=["adapters", "base"])
+def test_a_policy_loads(tmp_path, config):
+    run = run_on_a_base(tmp_path, config)
     run.policy = with_random_adapters(run.policy)
     with pytest.raises(ValueError, match="contains no policy: no run has finished there"):
         export.load_policy(run.folder)
@@ -76,7 +80,7 @@ def test_a_policy_loads_from_another_working_directory(tmp_path, monkeypatch, ki
         models.save("base", random_backbone(Pi0Config.dummy()))
         model_config = dataclasses.replace(CONFIG.model, checkpoint="base")
     model = models.load(model_config.source)
-    run = make_run(tmp_path / "run", dataclasses.replace(CONFIG, model=model_config), model)
+    run = make_run(tmp_path / "run", dataclasses.replace(FAST, model=model_config), model)
     run.base_hash = models.weights_hash(model)
     export.write(run)
     elsewhere = tmp_path / "elsewhere"

@@ -10,7 +10,15 @@ from lorasp_jax.data.batches import fit_to_size, flatten, windows
 from lorasp_jax.peft import LoRA
 from lorasp_jax.training import demonstrations
 from lorasp_jax.training.loop import train
-from tests.runs import CONFIG, Miniature, Terminate, make_run, random_episodes, repeatable
+from tests.runs import (
+    CONFIG,
+    PROGRAMS,
+    Miniature,
+    Terminate,
+    make_run,
+    random_episodes,
+    repeatable,
+)
 
 SAME = dataclasses.replace(CONFIG, peft=LoRA(rank=4), targets=("inp", "out"))
 FRESH = dataclasses.replace(SAME, data=dataclasses.replace(SAME.data, fresh_every=2))
@@ -28,7 +36,9 @@ class Collect:
 
 
 def run(folder, config=FRESH):
-    return make_run(folder, config, Miniature())
+    run = make_run(folder, config, Miniature())
+    run.programs = PROGRAMS
+    return run
 
 
 def test_generations_replace_each_other(tmp_path):

@@ -11,12 +11,13 @@ import optax
 import pytest
 
 from lorasp_jax.adapters import adaptation
+from lorasp_jax.peft import LoRA
 from lorasp_jax.training import guard as guards
 from lorasp_jax.training import step as steps
 from lorasp_jax.training.loop import RunError, train
 from lorasp_jax.training.run import Callback
 from lorasp_jax.training.run_folder import read_metrics
-from tests.runs import CONFIG, Miniature, leaves, make_run
+from tests.runs import CONFIG, PROGRAMS, Miniature, leaves, make_run
 
 OPTIMIZER = optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(lambda count: 0.1 + count))
 GOOD, TINY = 1.0, 1e-6
@@ -143,9 +144,10 @@ def test_summary():
 
 def spoiled(folder, episodes, at, **optim):
     """A run with NaN in some states of the demonstrations of one task."""
-    optim = dataclasses.replace(CONFIG.optim, **optim)
-    config = dataclasses.replace(CONFIG, optim=optim, targets=("inp", "out"))
+    optim = dataclasses.replace(CONFIG.optim, max_skipped=3, **optim)
+    config = dataclasses.replace(CONFIG, peft=LoRA(rank=4), optim=optim, targets=("inp", "out"))
     run = make_run(folder, config, Miniature())
+    run.programs = PROGRAMS
     run.episodes["press"].state[episodes, at] = np.nan
     return run
 
@@ -155,10 +157,7 @@ def test_too_many_skipped_steps_stop_the_run(tmp_path):
         def on_stop(self, run, reason):
             self.reason = reason
 
-    callback, run = (
-        RecordReason(),
-        spoiled(tmp_path / "run", slice(None), slice(None), max_skipped=3),
-    )
+    callback, run = RecordReason(), spoiled(tmp_path / "run", slice(None), slice(None))
     before = leaves(adaptation.split(run.policy.model)[1])
     message = (
         r"4 consecutive steps were skipped because .* non-finite \(step 4: loss nan, gradient norm "

@@ -1,6 +1,7 @@
 """A training step: its metrics, gradient accumulation, dropout and moving average."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +27,7 @@ def test_active_ranks_by_tower_and_by_layer():
         "action": {"out": Aux(jnp.full((2, 3), 5.0)), "frozen": Aux()},
         "language": {"q_proj": Aux()},
     }
-    found = active_ranks(aux)
+    found = jax.jit(active_ranks)(aux)
     assert set(found) == {
         "active_rank/vision",
         "active_rank/vision/fc1",
@@ -50,7 +51,8 @@ def small(tmp_path_factory):
     graphdef, adapters, frozen = adaptation.split(run.policy.model)
     steps, chunk = flatten(list(run.episodes.values())), run.policy.model.config.chunk
     sizes = {"batch_size": 16, "chunk": chunk, "state_noise": 0.0}
-    batch = sample_batch(jax.random.key(0), steps, run.policy.processor, **sizes)
+    sample = jax.jit(functools.partial(sample_batch, **sizes))
+    batch = sample(jax.random.key(0), steps, run.policy.processor)
     return graphdef, with_noise(adapters, 0.1), frozen, batch
 
 

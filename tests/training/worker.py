@@ -44,7 +44,7 @@ def main(args: argparse.Namespace) -> None:
 def prepare(folder: Path, steps: int, devices: int | None = None):
     """Return a run that logs and saves at every step."""
     from lorasp_jax.peft import LoRA
-    from tests.runs import CONFIG, Miniature, make_run
+    from tests.runs import CONFIG, PROGRAMS, Miniature, make_run
 
     # Two processes have 16 devices, and a batch is a multiple of that.
     config = dataclasses.replace(
@@ -55,7 +55,9 @@ def prepare(folder: Path, steps: int, devices: int | None = None):
         log_every=1,
         checkpoint_every=1,
     )
-    return make_run(folder, config, Miniature(), devices)
+    run = make_run(folder, config, Miniature(), devices)
+    run.programs = PROGRAMS
+    return run
 
 
 def work(

@@ -10,31 +10,46 @@ from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import FullFineTuning, LoRA
 from lorasp_jax.training.cost import preflight
 
-CONFIG = Config(name="a", scale="cpu", peft=LoRA(rank=4), optim=OptimConfig(batch_size=64))
+CONFIG = Config(
+    name="a",
+    scale="cpu",
+    peft=LoRA(rank=4),
+    targets=("patch_embed", "q_proj", "down_proj"),
+    optim=OptimConfig(batch_size=64),
+)
 TINY = dataclasses.replace(Pi0Config.dummy(), vision=Pi0Config.nano().vision, image_size=64)
 
 
 @pytest.fixture(scope="module", autouse=True)
-def cached_estimates():
-    """Trace each config only once for all tests."""
+def cached_models():
+    """Trace each adapted model only once for all tests."""
+    build = preflight.abstract_model
+
+    @functools.cache
+    def model(method, targets, backbone):
+        return build(dataclasses.replace(CONFIG, peft=method, targets=targets), backbone)
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(preflight, "estimate_memory", functools.cache(preflight.estimate_memory))
+        cached = lambda config, backbone: model(config.peft, config.targets, backbone)  # noqa: E731
+        patch.setattr(preflight, "abstract_model", cached)
         yield
 
 
 @pytest.fixture(scope="module")
-def memory(cached_estimates):
+def memory(cached_models):
     return {
         remat: preflight.estimate_memory(CONFIG, dataclasses.replace(TINY, remat=remat))
         for remat in preflight.REMATS
     }
 
 
-def test_parameter_memory_is_exact(memory):
+def test_parameter_memory_is_exact(memory, monkeypatch):
+    monkeypatch.setattr(preflight, "_saved_bytes", lambda *_, **__: 0)  # only parameters count
     found = memory["none"]
     assert found.gradients == found.adapters
     assert 2 * found.adapters < found.optimizer < 2 * found.adapters + 100  # moments, counters
-    full = preflight.estimate_memory(dataclasses.replace(CONFIG, peft=FullFineTuning()), TINY)
+    every = dataclasses.replace(CONFIG, peft=FullFineTuning(), targets=(".*",))
+    full = preflight.estimate_memory(every, TINY)
     half = preflight.estimate_memory(CONFIG, dataclasses.replace(TINY, param_dtype="bfloat16"))
     assert full.base == 0
     assert full.adapters == found.base == 2 * half.base
@@ -64,14 +79,16 @@ def test_gradient_accumulation_and_ema(memory):
     assert found.activations < 0.5 * none.activations
 
 
-def test_the_least_rematerialization_that_fits_is_chosen(memory):
+def test_the_least_rematerialization_that_fits_is_chosen(memory, monkeypatch):
+    monkeypatch.setattr(preflight, "estimate_memory", lambda _, backbone: memory[backbone.remat])
     for remat in preflight.REMATS:
         assert preflight.choose_remat(CONFIG, TINY, memory[remat].peak)[0] == remat
     full = dataclasses.replace(CONFIG, model=ModelConfig(remat="full"))
     assert preflight.choose_remat(full, TINY, memory["none"].peak)[0] == "full"
 
 
-def test_a_run_that_cannot_fit_is_refused(memory):
+def test_a_run_that_cannot_fit_is_refused(memory, monkeypatch):
+    monkeypatch.setattr(preflight, "estimate_memory", lambda _, backbone: memory[backbone.remat])
     available = (memory["full"].peak + preflight.HEADROOM * memory["full"].base) / 2
     with pytest.raises(ValueError, match=r"needs about .* GiB .*--optim.batch-size") as caught:
         preflight.choose_remat(CONFIG, TINY, available)

@@ -1,4 +1,4 @@
-"""One device and eight agree; large frozen arrays are sharded."""
+"""One device and several agree; large frozen arrays are sharded."""
 
 import dataclasses
 import functools
@@ -24,18 +24,14 @@ FEW = ("language/blocks/q_proj", "action_out_proj")
 
 
 @pytest.mark.parametrize("targets", [FEW, pytest.param(CONFIG.targets, marks=pytest.mark.slow)])
-def test_one_and_eight_devices_agree(tmp_path, targets):
+def test_one_and_four_devices_agree(tmp_path, targets):
     """LoRA-SP on single and on scanned layers."""
     run = make_run(tmp_path / "run", dataclasses.replace(CONFIG, targets=targets))
     graphdef, adapters, frozen = adaptation.split(run.policy.model)
-    batch = sample_batch(
-        jax.random.key(0),
-        flatten(list(run.episodes.values())),
-        run.policy.processor,
-        batch_size=16,
-        chunk=run.policy.model.config.chunk,
-        state_noise=0.0,
-    )
+    sizes = {"batch_size": 8, "chunk": run.policy.model.config.chunk, "state_noise": 0.0}
+    sample = jax.jit(functools.partial(sample_batch, **sizes))
+    steps = flatten(list(run.episodes.values()))
+    batch = sample(jax.random.key(0), steps, run.policy.processor)
     weights = {"spectral": 1e-2, "balance": 1e-3, "z": 1e-3}
 
     value_and_grad = jax.jit(jax.value_and_grad(loss_fn, has_aux=True), static_argnums=2)
@@ -52,28 +48,35 @@ def test_one_and_eight_devices_agree(tmp_path, targets):
         )
 
     (one, _), grads_one = gradients(meshes.make_mesh(1, jax.devices()[:1]))
-    (eight, metrics), grads_eight = gradients(meshes.make_mesh(2))
-    assert float(eight) == pytest.approx(float(one), rel=1e-5)
+    # XLA's 8 threads can deadlock in the collectives of 8 devices on a busy machine.
+    (four, metrics), grads_four = gradients(meshes.make_mesh(2, jax.devices()[:4]))
+    assert float(four) == pytest.approx(float(one), rel=1e-5)
     assert {"task", "spectral", "balance", "z", "active_rank/action"} <= set(metrics)
     for name, expected in leaves(grads_one).items():
         scale = np.abs(expected).max()
         assert scale > 0, name
         np.testing.assert_allclose(
-            leaves(grads_eight)[name], expected, atol=1e-4 * scale, rtol=0, err_msg=name
+            leaves(grads_four)[name], expected, atol=1e-4 * scale, rtol=0, err_msg=name
         )
 
 
 def test_sharding_rule():
     mesh = meshes.make_mesh(4)
     assert dict(mesh.shape) == {"data": 2, "fsdp": 4}
-    big, odd, small = jnp.zeros((6, 4096, 1024)), jnp.zeros((1025, 1025)), jnp.zeros((8, 8))
-    state = init_state({"big": big, "odd": odd, "small": small}, optax.adam(0.1), ema=True)
+    shapes = {"big": (6, 2560, 1024), "odd": (1025, 1025), "small": (8, 8)}
+
+    def zeros():
+        adapters = {name: jnp.zeros(shape) for name, shape in shapes.items()}
+        return init_state(adapters, optax.adam(0.1), ema=True)
+
+    state = jax.eval_shape(zeros)
     found = meshes.shardings(state, mesh)
     for tree in (found.adapters, found.opt_state[0].mu, found.opt_state[0].nu, found.average):
         assert tree["big"].spec == PartitionSpec(None, "fsdp", None)
         assert tree["odd"].spec == tree["small"].spec == PartitionSpec()
-    assert meshes.shardings(small, mesh, minimum=1).spec == PartitionSpec("fsdp", None)
-    placed = jax.device_put(state, found)
+    by_rows = meshes.shardings(state.adapters["small"], mesh, minimum=1)
+    assert by_rows.spec == PartitionSpec("fsdp", None)
+    placed = jax.jit(zeros, out_shardings=found)()
     on_one = sum(x.addressable_shards[0].data.nbytes for x in jax.tree.leaves(placed))
     assert meshes.bytes_on_device(state, fsdp=4) == on_one < 0.3 * meshes.bytes_on_device(state, 1)
 
