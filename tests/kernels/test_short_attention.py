@@ -19,7 +19,7 @@ def inputs(tokens, keys, heads, kv_heads, dtype=jnp.bfloat16, *, masked=True, si
     q, k, v, dy = (rng.normal(size=shape) for shape in shapes)
     mask = rng.random((2, tokens, keys)) < 0.5
     mask[:, 1] = False
-    q, k, v, dy = (jnp.asarray(a.astype(dtype)) for a in (q / 2, k, v, dy))
+    q, k, v, dy = (jax.device_put(a.astype(dtype)) for a in (q / 2, k, v, dy))
     return q, k, v, mask if masked else None, dy
 
 

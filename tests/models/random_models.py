@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
@@ -25,7 +24,7 @@ def with_random_parameters(build: Callable[[], nnx.Module], seed: int = 0) -> An
 
     def draw(leaf: jax.ShapeDtypeStruct) -> jax.Array:
         fan_in = leaf.shape[-2] if len(leaf.shape) > 1 else 4
-        return jnp.asarray((rng.normal(size=leaf.shape) / fan_in**0.5).astype(leaf.dtype))
+        return jax.device_put((rng.normal(size=leaf.shape) / fan_in**0.5).astype(leaf.dtype))
 
     graphdef, parameters = nnx.split(nnx.eval_shape(build))
     return nnx.merge(graphdef, jax.tree.map(draw, parameters))
@@ -35,7 +34,7 @@ def with_noise(tree: Any, scale: float, seed: int = 0) -> Any:
     """Add noise, as if after some training: at initialization half of the gradients vanish."""
     rng = np.random.default_rng(seed)
     noise = lambda x: scale * rng.normal(size=x.shape)  # noqa: E731
-    return jax.tree.map(lambda x: jnp.asarray((np.asarray(x) + noise(x)).astype(x.dtype)), tree)
+    return jax.tree.map(lambda x: jax.device_put((np.asarray(x) + noise(x)).astype(x.dtype)), tree)
 
 
 def observation(config: Any, batch: int) -> Observation:
@@ -51,4 +50,4 @@ def observation(config: Any, batch: int) -> Observation:
         token_mask=np.arange(config.max_tokens) < np.array([[3], [5]]),
         state=rng.normal(size=(batch, dim)).astype("f"),
     )
-    return jax.tree.map(jnp.asarray, obs)
+    return jax.device_put(obs)

@@ -47,7 +47,7 @@ def obs(config):
 @pytest.fixture(scope="module")
 def actions(config):
     shape = (BATCH, config.chunk, config.action_dim)
-    return jnp.asarray(np.random.default_rng(1).normal(size=shape).astype("f"))
+    return jax.device_put(np.random.default_rng(1).normal(size=shape).astype("f"))
 
 
 @pytest.fixture(scope="module")
