@@ -9,6 +9,7 @@ from lorasp_jax.kernels.blocks import Launch
 from lorasp_jax.kernels.cached_attention import cached_attention
 from lorasp_jax.models.transformer import attention
 from lorasp_jax.training.cost import flops
+from tests.cases import mostly_slow
 
 BATCH, TOKENS, KV_HEADS, GROUP, DIM = 2, 5, 2, 3, 16
 LAUNCHES = {
@@ -16,57 +17,65 @@ LAUNCHES = {
     "splits": Launch(rows=16, keys=16, programs=2, warps=1),
     "more_splits_than_blocks": Launch(rows=16, keys=16, programs=9, warps=1),
     "one_block": Launch(rows=32, keys=64, programs=1, warps=1),
+    "default": None,
 }
 
 
 def inputs(cached, own, dtype=jnp.float32):
     """q, own keys and values, cached ones, and a mask that hides some keys from some queries."""
-    keys = jax.random.split(jax.random.key(0), 6)
-    draw = lambda key, *shape: jax.random.normal(key, (BATCH, *shape)).astype(dtype)  # noqa: E731
-    q = draw(keys[0], TOKENS, KV_HEADS * GROUP, DIM)
+    rng = np.random.default_rng(0)
+    draw = lambda *shape: rng.normal(size=(BATCH, *shape)).astype(dtype)  # noqa: E731
+    q = draw(TOKENS, KV_HEADS * GROUP, DIM)
     own_pair, cache = (
-        tuple(draw(key, count, KV_HEADS, DIM) for key in jax.random.split(k)) if count else None
-        for k, count in zip(keys[1:3], (own, cached), strict=True)
+        tuple(draw(count, KV_HEADS, DIM) for _ in range(2)) if count else None
+        for count in (own, cached)
     )
-    mask = jax.random.bernoulli(keys[3], 0.7, (BATCH, TOKENS, cached + own))
-    return q, own_pair, cache, mask.at[:, :, -1].set(True)
+    mask = rng.random((BATCH, TOKENS, cached + own)) < 0.7
+    mask[:, :, -1] = True
+    return q, own_pair, cache, mask
 
 
-@pytest.mark.parametrize("launch", [*LAUNCHES.values(), None], ids=[*LAUNCHES, "default"])
-@pytest.mark.parametrize(("cached", "own"), [(20, TOKENS), (32, TOKENS), (37, 0), (32, 0)])
-def test_matches_attention_over_concatenated_keys(cached, own, launch):
-    arrays = inputs(cached, own)
-    actual = cached_attention(*arrays, launch=launch, interpret=True)
-    q, own_pair, cache, mask = arrays
-    pairs = (cache, None) if own_pair is None else (own_pair, cache)
-    np.testing.assert_allclose(actual, attention._concatenated(q, *pairs, mask), atol=1e-5)
+@jax.jit
+def concatenated(q, own, cache, mask):
+    """Attention over cached and own keys in one array, in f32."""
+    arrays = jax.tree.map(lambda a: a.astype(jnp.float32), (q, own or cache, own and cache))
+    return attention._concatenated(*arrays, mask)
+
+
+SIZES = {"partial": (20, TOKENS), "full": (32, TOKENS), "cached": (37, 0), "full_cached": (32, 0)}
+CASES = [f"{size}-{launch}" for size in SIZES for launch in LAUNCHES]
+QUICK = [c for c in CASES if c.startswith("partial-") or c.endswith("-splits")]
+
+
+@pytest.mark.parametrize("case", mostly_slow(CASES, QUICK))
+def test_matches_attention_over_concatenated_keys(case):
+    size, launch = case.split("-")
+    arrays = inputs(*SIZES[size])
+    actual = cached_attention(*arrays, launch=LAUNCHES[launch], interpret=True)
+    np.testing.assert_allclose(actual, concatenated(*arrays), atol=1e-5)
 
 
 def test_matches_in_half_precision():
     arrays = inputs(20, 5, jnp.float16)
     actual = cached_attention(*arrays, launch=LAUNCHES["splits"], interpret=True)
-    exact = jax.tree.map(lambda a: a.astype(jnp.float32) if a.dtype == jnp.float16 else a, arrays)
-    q, own, cache, mask = exact
     assert actual.dtype == jnp.float16
-    np.testing.assert_allclose(actual, attention._concatenated(q, own, cache, mask), atol=2e-3)
+    np.testing.assert_allclose(actual, concatenated(*arrays), atol=2e-3)
 
 
 def test_a_query_without_keys_attends_to_all_of_them_equally():
     q, own, cache, mask = inputs(20, 5)
-    y = cached_attention(
-        q, own, cache, mask.at[0, 1].set(False), launch=LAUNCHES["splits"], interpret=True
-    )
-    values = jnp.concatenate([cache[1], own[1]], axis=1)[0].mean(0)
-    expected = jnp.repeat(values, GROUP, axis=0).reshape(-1)
-    np.testing.assert_allclose(y[0, 1], expected, atol=1e-6)
+    mask[0, 1] = False
+    y = cached_attention(q, own, cache, mask, launch=LAUNCHES["splits"], interpret=True)
+    values = np.concatenate([cache[1], own[1]], axis=1)[0].mean(0)
+    expected = np.repeat(values, GROUP, axis=0).reshape(-1)
+    np.testing.assert_allclose(np.asarray(y)[0, 1], expected, atol=1e-6)
 
 
 def test_large_logits_do_not_overflow():
-    q, own, cache, mask = inputs(20, 5)
-    call = functools.partial(cached_attention, launch=LAUNCHES["splits"], interpret=True)
-    y = call(1e4 * q, own, cache, mask)
-    expected = attention.attention(1e4 * q, *own, mask, cache)
-    np.testing.assert_allclose(y, expected, atol=1e-5)
+    q, *others = inputs(20, 5)
+    q *= 10_000
+    y = cached_attention(q, *others, launch=LAUNCHES["splits"], interpret=True)
+    np.testing.assert_allclose(y, concatenated(q, *others), atol=1e-5)
 
 
 @pytest.fixture
@@ -84,9 +93,10 @@ def test_attention_uses_the_kernel_only_without_gradient(interpreted):
     q, (k, v), cache, mask = inputs(20, 5, jnp.bfloat16)
     run = lambda q: attention.attention(q, k, v, mask, cache).astype(jnp.float32)  # noqa: E731
     plain = lambda q: attention._concatenated(q, (k, v), cache, mask).astype(jnp.float32)  # noqa: E731
-    np.testing.assert_allclose(run(q), plain(q), atol=0.02)
+    np.testing.assert_allclose(*(jax.jit(f)(q) for f in (run, plain)), atol=0.02)
     assert len(interpreted) == 1
-    actual, expected = (jax.grad(lambda q, f=f: jnp.sin(f(q)).sum())(q) for f in (run, plain))
+    gradient = lambda f: jax.jit(jax.grad(lambda q: jnp.sin(f(q)).sum()))(q)  # noqa: E731
+    actual, expected = map(gradient, (run, plain))
     np.testing.assert_array_equal(actual, expected)
     assert len(interpreted) == 1
 
@@ -98,20 +108,21 @@ def test_a_batch_can_be_mapped(interpreted, shared):
         cache = jax.tree.map(lambda a: a[:1].repeat(BATCH, 0), cache)
     if "mask" in shared:
         mask = mask[:1].repeat(BATCH, 0)
-    expected = attention.attention(q, k, v, mask, cache)
+    attend = lambda *arrays: attention.attention(*arrays)  # noqa: E731, PLW0108  # traced anew
+    expected = jax.jit(attend)(q, k, v, mask, cache)
     lift = lambda name, a: a[:1] if name in shared else a[:, None]  # noqa: E731
     arrays = (q[:, None], k[:, None], v[:, None], lift("mask", mask))
     lifted = jax.tree.map(lambda a: lift("cache", a), cache)
     axes = (0, 0, 0, None if "mask" in shared else 0, None if "cache" in shared else 0)
-    actual = jax.vmap(attention.attention, in_axes=axes)(*arrays, lifted)
-    np.testing.assert_array_equal(actual[:, 0], expected)
+    actual = jax.jit(jax.vmap(attend, in_axes=axes))(*arrays, lifted)
+    np.testing.assert_array_equal(np.asarray(actual)[:, 0], expected)
 
 
 def test_a_mask_may_be_shared_by_batch_and_queries():
     q, own, cache, mask = inputs(20, 5)
     call = functools.partial(cached_attention, launch=LAUNCHES["splits"], interpret=True)
     one = mask[:1, :1]
-    expected = call(q, own, cache, jnp.broadcast_to(one, mask.shape))
+    expected = call(q, own, cache, np.broadcast_to(one, mask.shape))
     np.testing.assert_array_equal(call(q, own, cache, one), expected)
 
 

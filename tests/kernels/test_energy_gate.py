@@ -9,6 +9,7 @@ import pytest
 
 from lorasp_jax.kernels import energy_gate as gate
 from tests import GOLDEN
+from tests.cases import mostly_slow
 
 GOLDEN = GOLDEN / "energy_gate_exact.npz"
 
@@ -33,14 +34,14 @@ def energy_gate(scores, eta, implementation=None):
 
 
 def random_scores(shape, seed=0):
-    return jax.nn.softplus(2 * jax.random.normal(jax.random.key(seed), shape))
+    return np.logaddexp(0, 2 * np.random.default_rng(seed).normal(size=shape)).astype(np.float32)
 
 
 @pytest.mark.parametrize(
     ("implementation", "max_misses"),
     [("bisection", 0), ("flags", 0), ("pallas", 0), ("sort", 1)],
 )
-@pytest.mark.parametrize("eta", [0.5, 0.7, 0.8, 0.9, 0.99])
+@pytest.mark.parametrize("eta", mostly_slow([0.5, 0.7, 0.8, 0.9, 0.99], quick=[0.5, 0.9, 0.99]))
 def test_equals_exact_arithmetic(golden, implementation, max_misses, eta):
     """`k` and `order` come from big-integer arithmetic; rounding in "sort" crosses η in one row."""
     row = [round(100 * eta) for eta in (0.5, 0.7, 0.8, 0.9, 0.99, 1)].index(round(100 * eta))
@@ -157,24 +158,26 @@ def test_transformations_agree(implementation):
 
 def test_gradient_of_the_kept_energy():
     """d(1 - E)/ds_i = -2 s_i (m_i - E) / Σ s² for a constant mask; zero rows have zero gradient."""
-    scores = random_scores((5, 16)).at[0].set(0)
+    scores = random_scores((5, 16))
+    scores[0] = 0
 
     def loss(scores):
         mask, _, kept = gate.energy_gate(scores, 0.8)
         return (1 - kept).sum(), (mask, kept)
 
-    gradient, (mask, kept) = jax.jit(jax.grad(loss, has_aux=True))(scores)
-    total = jnp.sum(scores**2, -1, keepdims=True).at[0].set(1)
+    gradient, (mask, kept) = jax.device_get(jax.jit(jax.grad(loss, has_aux=True))(scores))
+    total = np.sum(scores**2, -1, keepdims=True)
+    total[0] = 1
     expected = -2 * scores * (mask - kept[:, None]) / total
     np.testing.assert_allclose(gradient, expected, atol=1e-6)
-    np.testing.assert_allclose(jnp.sum(scores * gradient, -1), 0, atol=1e-6)  # scale-free
+    np.testing.assert_allclose(np.sum(scores * gradient, -1), 0, atol=1e-6)  # scale-free
     np.testing.assert_array_equal(gradient[0], 0)
 
 
 def test_target_is_an_exact_decimal():
     """Nine of ten equal energies are exactly 9/10, although 0.9 is rounded in fp32."""
     etas = [0.9, np.float32(0.9), 0.900001]
-    ranks = jax.jit(lambda s: [gate.energy_gate(s, eta)[1] for eta in etas])(jnp.ones(10))
+    ranks = jax.jit(lambda s: [gate.energy_gate(s, eta)[1] for eta in etas])(np.ones(10, "f"))
     assert ranks == [9, 9, 10]
 
 

@@ -14,7 +14,7 @@ from lorasp_jax.kernels.cached_attention import cached_attention
 from lorasp_jax.kernels.row_sharding import by_rows
 from lorasp_jax.kernels.short_attention import short_attention
 from lorasp_jax.training.distributed import mesh as meshes
-from tests.kernels.test_rowwise_kernel import close, kernel
+from tests.kernels.test_rowwise_kernel import close, kernel, normal
 
 
 def doubled(shared, arrays):
@@ -38,7 +38,7 @@ def shard(rows, fsdp=2, axes=("data", "fsdp")):
     [(16, ("data", "fsdp"), 2), (16, "data", 4), (16, "fsdp", 8), (16, None, 16)],
 )
 def test_each_device_has_its_own_rows(num_rows, axes, rows_per_call):
-    rows = jnp.arange(num_rows * 3.0).reshape(num_rows, 3)
+    rows = np.arange(num_rows * 3, dtype="f").reshape(num_rows, 3)
     (twice, counts), (total,) = call(jnp.float32(2), shard(rows, axes=axes))
     np.testing.assert_array_equal(twice, 2 * rows)
     np.testing.assert_array_equal(counts, rows_per_call)
@@ -52,16 +52,16 @@ def test_rows_that_do_not_divide_are_gathered():
     def sliced(rows):
         return by_rows(doubled, [jnp.float32(2)], [rows[:12] + 1])
 
-    rows = jnp.arange(16 * 3.0).reshape(16, 3)
+    rows = np.arange(16 * 3, dtype="f").reshape(16, 3)
     (twice, _), (total,) = sliced(shard(rows))
     np.testing.assert_array_equal(twice, 2 * rows[:12] + 2)
     np.testing.assert_array_equal(total, (rows[:12] + 1).sum(0))
 
 
 def test_vmap():
-    rows = jnp.arange(2 * 4 * 3.0).reshape(2, 4, 3)
-    factors = jnp.float32([2, 3])
-    (times, _), (totals,) = jax.vmap(call, in_axes=(0, 0))(factors, rows)
+    rows = np.arange(2 * 4 * 3, dtype="f").reshape(2, 4, 3)
+    factors = np.float32([2, 3])
+    (times, _), (totals,) = jax.jit(jax.vmap(call, in_axes=(0, 0)))(factors, rows)
     np.testing.assert_array_equal(times, factors[:, None, None] * rows)
     np.testing.assert_array_equal(totals, rows.sum(1))
 
@@ -69,9 +69,7 @@ def test_vmap():
 def test_rowwise_kernel(monkeypatch):
     """Values and gradients of the row-wise kernel on tokens of a sharded batch."""
     monkeypatch.setattr(kernels, "FEW_ROWS", 0)
-    keys = jax.random.split(jax.random.key(0), 3)
-    shared = {"w": jax.random.normal(keys[0], (16, 32)), "b": jax.random.normal(keys[1], (32,))}
-    x = jax.random.normal(keys[2], (8, 5, 48))
+    shared, x = {"w": normal(16, 32), "b": normal(32)}, normal(8, 5, 48)
 
     @jax.jit
     def gradients(shared, x):
@@ -92,8 +90,7 @@ def test_rowwise_kernel(monkeypatch):
 @pytest.mark.parametrize("batch", [1, 6, 8])
 def test_short_attention(batch):
     """Values and gradients of attention on a sharded batch, also one that does not divide."""
-    q = jax.random.normal(jax.random.key(0), (8, 5, 2, 16))
-    mask = jnp.tri(5, dtype=bool)[None].repeat(8, axis=0)
+    q, mask = normal(8, 5, 2, 16), np.tri(5, dtype=bool)[None].repeat(8, axis=0)
 
     @jax.jit
     def gradients(q, mask):
@@ -115,8 +112,8 @@ def test_short_attention(batch):
 
 def test_cached_attention():
     """Attention on a sharded batch, whose cached keys are sharded, too."""
-    q = jax.random.normal(jax.random.key(0), (8, 5, 2, 16))
-    mask = jnp.ones((8, 5, 16), bool).at[:, :, ::3].set(False)
+    q, mask = normal(8, 5, 2, 16), np.ones((8, 5, 16), bool)
+    mask[:, :, ::3] = False
 
     @jax.jit
     def attend(q, mask):

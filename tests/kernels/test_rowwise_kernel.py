@@ -23,10 +23,17 @@ def gated(shared, columns, valid, mask):
     return output, sums, mask, [mask.astype(jnp.float32).sum(-1, keepdims=True)]
 
 
+def normal(*shape):
+    return np.random.default_rng(0).normal(size=shape).astype(np.float32)
+
+
+def rows_and_valid(rows, width):
+    return normal(rows, width), np.random.default_rng(1).random((rows, 1)) < 0.7
+
+
 @pytest.fixture(scope="module")
 def shared():
-    keys = jax.random.split(jax.random.key(0))
-    return {"w": jax.random.normal(keys[0], (16, 32)), "b": jax.random.normal(keys[1], (32,))}
+    return {"w": normal(16, 32), "b": normal(32)}
 
 
 def kernel(shared, rows, valid, function=gated):
@@ -64,8 +71,7 @@ def close(actual, expected):
 )
 def test_equals_the_function(shared, num_rows, few, monkeypatch):
     monkeypatch.setattr(kernels, "FEW_ROWS", few)
-    rows = jax.random.normal(jax.random.key(1), (num_rows, 48))
-    valid = jax.random.bernoulli(jax.random.key(2), 0.7, (num_rows, 1))
+    rows, valid = rows_and_valid(num_rows, 48)
     expected, actual = (run(as_kernel, shared, rows, valid) for as_kernel in (False, True))
     assert jax.tree.map(jnp.shape, actual) == jax.tree.map(jnp.shape, expected)
     jax.tree.map(close, actual, expected)
@@ -74,8 +80,7 @@ def test_equals_the_function(shared, num_rows, few, monkeypatch):
 def test_programs_share_the_rows(shared, monkeypatch):
     """Several blocks per program, and not as many in each, give the same sums."""
     monkeypatch.setattr(kernels, "FEW_ROWS", 0)
-    rows = jax.random.normal(jax.random.key(1), (16 * 12, 48))
-    valid = jnp.ones((len(rows), 1), bool)
+    rows, valid = normal(16 * 12, 48), np.ones((16 * 12, 1), bool)
     one_block_each = run(True, shared, rows, valid)
     # Forward: 12 blocks over 5 programs, 2 or 3 each. Backward: 3 blocks over 2, 1 or 2 each.
     monkeypatch.setattr(kernels, "FORWARD", kernels.Launch(16, 4, 5))
@@ -85,14 +90,14 @@ def test_programs_share_the_rows(shared, monkeypatch):
 
 
 def test_dtypes_are_those_of_the_function(shared):
-    rows = jnp.ones((20, 48), jnp.bfloat16)
-    (_, (output, _, _)), (_, d_rows) = run(True, shared, rows, jnp.ones((20, 1), bool))
+    rows, valid = np.ones((20, 48), jnp.bfloat16), np.ones((20, 1), bool)
+    (_, (output, _, _)), (_, d_rows) = jax.eval_shape(lambda *a: run(True, *a), shared, rows, valid)
     assert output.dtype == jnp.float32
     assert d_rows.dtype == jnp.bfloat16
 
 
 def test_residuals_are_the_rows_and_the_packed_mask(shared):
-    rows, valid = jnp.ones((32, 48)), jnp.ones((32, 1), bool)
+    rows, valid = np.ones((32, 48), "f"), np.ones((32, 1), bool)
 
     _, vjp = jax.eval_shape(
         lambda rows: jax.vjp(lambda rows: kernel(shared, rows, valid)[0], rows), rows
@@ -103,7 +108,7 @@ def test_residuals_are_the_rows_and_the_packed_mask(shared):
 
 def test_layers_share_traced_kernels(shared):
     """Otherwise, tracing and lowering a training step take twice as long."""
-    rows, valid = jnp.zeros((4, 48)), jnp.ones((4, 1), bool)
+    rows, valid = np.zeros((4, 48), "f"), np.ones((4, 1), bool)
 
     def traces(layers):
         calls = []
@@ -126,10 +131,9 @@ def test_layers_share_traced_kernels(shared):
 def test_stacked_functions(shared, few, monkeypatch):
     """Two functions in one kernel, with columns that start at an offset, equal two single calls."""
     monkeypatch.setattr(kernels, "FEW_ROWS", few)
-    trees = [shared, jax.tree.map(jnp.negative, shared)]
-    pair = jax.tree.map(lambda *rows: jnp.stack(rows), *map(kernels.PackedTree.of, trees))
-    rows = jax.random.normal(jax.random.key(1), (20, 8 + 2 * 48 + 3))
-    valid = jax.random.bernoulli(jax.random.key(2), 0.7, (20, 1))
+    trees = [shared, jax.tree.map(np.negative, shared)]
+    pair = jax.tree.map(lambda *rows: np.stack(rows), *map(kernels.PackedTree.of, trees))
+    rows, valid = rows_and_valid(20, 8 + 2 * 48 + 3)
 
     def stacked(pair, rows):
         output, sums, (number,) = kernels.rowwise_kernel(
@@ -149,23 +153,22 @@ def test_stacked_functions(shared, few, monkeypatch):
         return jnp.sin(output).sum() + sums["squares"].sum(), (output, sums, number)
 
     run = lambda f: jax.jit(jax.value_and_grad(f, argnums=(0, 1), has_aux=True))  # noqa: E731
-    (_, actual), (d_pair, d_rows) = run(stacked)(pair, rows)
-    (_, expected), (d_trees, others) = run(separate)(trees, rows)
-    d_stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *d_trees)
+    (_, actual), (d_pair, d_rows) = jax.device_get(run(stacked)(pair, rows))
+    (_, expected), (d_trees, others) = jax.device_get(run(separate)(trees, rows))
+    d_stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *d_trees)
     jax.tree.map(close, (actual, d_pair.tree(), d_rows), (expected, d_stacked, others))
 
 
 def test_bits_unpack_to_the_mask():
-    mask = jax.random.bernoulli(jax.random.key(0), 0.5, (16, 128)).astype(jnp.int32)
-    packed = kernels._pack_bits(mask)
+    mask = (normal(16, 128) > 0).astype(np.int32)
+    packed = jax.jit(kernels._pack_bits)(mask)
     assert packed.dtype == jnp.uint8
-    np.testing.assert_array_equal(kernels._unpack_bits(packed), mask)
+    np.testing.assert_array_equal(jax.jit(kernels._unpack_bits)(packed), mask)
 
 
 @pytest.mark.slow
 def test_vmap_equals_a_loop(shared):
-    rows = jax.random.normal(jax.random.key(1), (3, 40, 48))
-    valid = jax.random.bernoulli(jax.random.key(2), 0.7, (3, 40, 1))
+    rows, valid = (a.reshape(3, 40, -1) for a in rows_and_valid(120, 48))
     actual = jax.vmap(lambda rows, valid: run(True, shared, rows, valid))(rows, valid)
     expected = [run(True, shared, *pair) for pair in zip(rows, valid, strict=True)]
     jax.tree.map(close, actual, jax.tree.map(lambda *leaves: jnp.stack(leaves), *expected))

@@ -46,7 +46,8 @@ def obs(config):
 
 @pytest.fixture(scope="module")
 def actions(config):
-    return jax.random.normal(jax.random.key(1), (BATCH, config.chunk, config.action_dim))
+    shape = (BATCH, config.chunk, config.action_dim)
+    return jax.device_put(np.random.default_rng(1).normal(size=shape).astype("f"))
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +94,50 @@ def adapted(model):
 @pytest.fixture(scope="module")
 def mask(actions):
     """A padded last step, two unused slots."""
-    return jnp.ones(actions.shape, bool).at[:, -1].set(False).at[:, :, 5:7].set(False)
+    mask = np.ones(actions.shape, bool)
+    mask[:, -1] = mask[:, :, 5:7] = False
+    return mask
+
+
+@pytest.fixture(scope="module")
+def loss_of(config, obs, actions, mask):
+    """Runtime fields -> the mean loss and the loss per element as a function of the parameters."""
+
+    def make(**change):
+        build = lambda: dataclasses.replace(config, **change).create(nnx.Rngs(0))  # noqa: E731
+        graphdef = nnx.split(nnx.eval_shape(build))[0]
+
+        def loss(parameters):
+            model = nnx.merge(graphdef, parameters)
+            per_element = model.loss(jax.random.key(2), obs, actions, action_mask=mask)[0]
+            return jnp.mean(per_element, where=mask), per_element
+
+        return loss
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def traced(model, loss_of):
+    """Remat -> a program that returns loss, gradients and residuals."""
+    parameters = nnx.split(model)[1]
+
+    @functools.cache
+    def trace(remat):
+        def run(parameters):
+            loss, vjp, per_element = jax.vjp(loss_of(remat=remat), parameters, has_aux=True)
+            return (loss, per_element), vjp(1.0), vjp
+
+        return jax.jit(run).trace(parameters)
+
+    return trace
+
+
+@pytest.fixture(scope="module")
+def run(model, traced):
+    """Remat -> (loss, loss per element), gradients."""
+    parameters = nnx.split(model)[1]
+    return functools.cache(lambda remat: traced(remat).lower().compile()(parameters)[:2])
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +150,8 @@ def trained(adapted, obs, actions, mask):
         per_element, aux = model.loss(jax.random.key(2), obs, actions, action_mask=mask)
         return jnp.mean(per_element, where=mask), (per_element, aux)
 
-    (_, (per_element, aux)), grads = jax.jit(jax.value_and_grad(loss, has_aux=True))(adapters)
+    values = jax.jit(jax.value_and_grad(loss, has_aux=True))(adapters)
+    (_, (per_element, aux)), grads = jax.device_get(values)
     return per_element, aux, nnx.to_pure_dict(grads)
 
 
@@ -121,9 +166,8 @@ def test_every_dense_layer_has_aux(trained, backbone, actions):
     }
 
 
-def test_adapters_initially_do_not_change_the_loss(trained, model, obs, actions, mask):
-    base = jax.jit(lambda model: model.loss(jax.random.key(2), obs, actions, action_mask=mask)[0])
-    np.testing.assert_allclose(trained[0], base(model), rtol=1e-4, atol=1e-5)
+def test_adapters_initially_do_not_change_the_loss(trained, run):
+    np.testing.assert_allclose(trained[0], run("none")[0][1], rtol=1e-4, atol=1e-5)
 
 
 def test_aux_is_masked(trained, config, obs):
@@ -181,54 +225,26 @@ def test_unused_slots_do_not_affect_the_sample(model, config, obs, actions):
     np.testing.assert_array_equal(state_rank[0], state_rank[-1])
 
 
-@pytest.fixture(scope="module")
-def loss_of(config, obs, actions):
-    """Runtime fields -> the mean loss as a function of the parameters."""
-
-    def make(**change):
-        graphdef = nnx.split(
-            nnx.eval_shape(lambda: dataclasses.replace(config, **change).create(nnx.Rngs(0)))
-        )[0]
-
-        def loss(parameters):
-            model = nnx.merge(graphdef, parameters)
-            return model.loss(jax.random.key(2), obs, actions)[0].mean()
-
-        return loss
-
-    return make
-
-
-@pytest.fixture(scope="module")
-def reference(model, loss_of):
-    """Loss and gradients without remat."""
-    return jax.jit(jax.value_and_grad(loss_of(remat="none")))(nnx.split(model)[1])
-
-
-def test_remat_does_not_change_gradients(backbone, model, loss_of, reference):
-    """Of SmolVLA, which scans its layers in the same way, with one policy."""
+def test_remat_does_not_change_gradients(backbone, run):
+    """Each policy with one of the backbones, which scan their layers in the same way."""
     close = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5)
-    for remat in ("products", "narrow", "full") if backbone is pi0 else ("full",):
-        result = jax.jit(jax.value_and_grad(loss_of(remat=remat)))(nnx.split(model)[1])
-        jax.tree.map(close, result, reference)
+    for remat in {pi0: ("narrow", "full"), smolvla: ("products",)}[backbone]:
+        jax.tree.map(close, run(remat), run("none"))
 
 
-def test_remat_saves_fewer_residuals(model, loss_of):
-    parameters = nnx.split(model)[1]
-
+def test_remat_saves_fewer_residuals(traced):
     def residual_size(remat):
-        arrays = jax.eval_shape(lambda p: jax.vjp(loss_of(remat=remat), p)[1], parameters)
-        return sum(a.size for a in jax.tree.leaves(arrays))
+        return sum(a.size for a in jax.tree.leaves(traced(remat).out_info[2]))
 
     none, products, narrow, full = map(residual_size, REMATS)
     assert none > 1.5 * products > 1.5 * full
     assert products >= narrow > full  # equal, since no layer of these is wide
 
 
-def test_unroll_and_bfloat16_hardly_change_the_loss(model, loss_of, reference):
-    parameters, loss = nnx.split(model)[1], reference[0]
-    np.testing.assert_allclose(jax.jit(loss_of(unroll=True))(parameters), loss, rtol=1e-5)
-    half = jax.jit(loss_of(dtype="bfloat16"))(parameters)
+def test_unroll_and_bfloat16_hardly_change_the_loss(model, loss_of, run):
+    parameters, loss = nnx.split(model)[1], run("none")[0][0]
+    np.testing.assert_allclose(jax.jit(loss_of(unroll=True))(parameters)[0], loss, rtol=1e-5)
+    half = jax.jit(loss_of(dtype="bfloat16"))(parameters)[0]
     assert half != loss
     np.testing.assert_allclose(half, loss, rtol=0.02)
 

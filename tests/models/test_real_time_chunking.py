@@ -1,6 +1,7 @@
 """Continuing the previous chunk, trained and guided, and flow times per action."""
 
 import dataclasses
+import functools
 import math
 
 import jax
@@ -20,7 +21,7 @@ CONFIGS = {
 }
 BATCH, STEPS = 2, 3
 SHAPE = (BATCH, CONFIGS["pi0"].chunk, CONFIGS["pi0"].action_dim)
-NOISE, PREVIOUS = (jax.random.normal(jax.random.key(i), SHAPE) for i in (1, 2))
+NOISE, PREVIOUS = np.random.default_rng(0).normal(size=(2, *SHAPE)).astype(np.float32)
 
 
 @pytest.fixture(scope="module", params=CONFIGS)
@@ -35,22 +36,23 @@ def obs(model):
 
 @pytest.fixture(scope="module")
 def sample(model, obs):
-    """(prefix, d) -> chunk; d is traced."""
+    """(prefix, d) -> chunk; d is traced, one for each row."""
 
+    @jax.jit
     def sample(prefix, length):
         options = {"prefix": prefix, "prefix_length": length}
-        return sampler.sample_actions(None, obs, num_steps=STEPS, noise=NOISE, **options)
+        return model.sampler().sample_actions(None, obs, num_steps=STEPS, noise=NOISE, **options)
 
-    sampler = model.sampler()
-    return jax.jit(sample)
+    return lambda prefix, length: np.asarray(sample(prefix, np.broadcast_to(length, BATCH)))
 
 
 def test_equal_times_per_action_are_one_time(model, obs):
-    velocity, time = jax.jit(model.velocity), jnp.array([0.3, 0.9])
-    expected = velocity(obs, NOISE, time)
-    found = velocity(obs, NOISE, jnp.broadcast_to(time[:, None], SHAPE[:2]))
-    np.testing.assert_allclose(found, expected, atol=1e-5)
-    other = velocity(obs, NOISE, jnp.array([[0.3, 0.3, 0.3, 0.5], [0.9, 0.9, 0.9, 0.9]]))
+    velocity, time = jax.jit(model.velocity), np.array([0.3, 0.9], np.float32)
+    expected = np.asarray(velocity(obs, NOISE, time))
+    times = np.repeat(time[:, None], SHAPE[1], axis=1)
+    np.testing.assert_allclose(velocity(obs, NOISE, times), expected, atol=1e-5)
+    times[0, 3] = 0.5
+    other = np.asarray(velocity(obs, NOISE, times))
     assert np.abs(other - expected)[0, 3].max() > 1e-3
     np.testing.assert_allclose(other[1], expected[1], atol=1e-5)
 
@@ -62,20 +64,18 @@ def test_without_delay_sampling_is_as_without_prefix(model, obs, sample):
 
 def test_a_trained_policy_continues_the_prefix(sample):
     """The chunk starts with the given actions; later ones depend on these, but on no others."""
-    chunks = {d: np.asarray(sample(PREVIOUS, d)) for d in range(SHAPE[1] + 1)}
-    assert sample._cache_size() == 1  # d is traced
+    chunks = {d: sample(PREVIOUS, d) for d in range(SHAPE[1] + 1)}
     for d, chunk in chunks.items():
         np.testing.assert_array_equal(chunk[:, :d], PREVIOUS[:, :d])
         if d < SHAPE[1]:
             assert (chunk[:, d] != PREVIOUS[:, d]).any()
-    later = PREVIOUS.at[:, 2:].add(1)
-    np.testing.assert_array_equal(sample(later, 2), chunks[2])
-    earlier = PREVIOUS.at[:, 0].add(1)
-    assert (np.abs(sample(earlier, 2) - chunks[2])[:, 2:].max(-1) > 1e-4).all()
+    index = np.arange(SHAPE[1])[:, None]
+    np.testing.assert_array_equal(sample(PREVIOUS + (index >= 2), 2), chunks[2])
+    assert (np.abs(sample(PREVIOUS + (index == 0), 2) - chunks[2])[:, 2:].max(-1) > 1e-4).all()
 
 
 def test_each_row_may_have_its_own_delay(sample):
-    found = sample(PREVIOUS, jnp.array([1, 3]))
+    found = sample(PREVIOUS, [1, 3])
     for row, d in enumerate((1, 3)):
         np.testing.assert_allclose(found[row], sample(PREVIOUS, d)[row], atol=1e-5)
 
@@ -123,15 +123,10 @@ def test_guidance_of_a_linear_velocity_in_float64(limit):
     def velocity(x_t, time):
         return (flat @ x_t.reshape(12)).reshape(shape) + time[:, None, None], None
 
-    found, _ = real_time_chunking.sample(
-        velocity,
-        jnp.asarray(noise),
-        prefix=jnp.asarray(previous[:, :overlap]),
-        length=jnp.int32(d),
-        guidance=limit,
-        num_steps=steps,
-        slots=jnp.asarray(slots),
-    )
+    options = {"guidance": limit, "num_steps": steps, "slots": slots}
+    run = jax.jit(functools.partial(real_time_chunking.sample, velocity, **options))
+    prefix = jnp.asarray(previous[:, :overlap])
+    found, _ = run(jnp.asarray(noise), prefix=prefix, length=jnp.int32(d))
     used = np.tile(slots, 4)
     weights = np.repeat([1, 1, 0.5 * (math.e**0.5 - 1) / (math.e - 1), 0], 3) * used
     x = noise.reshape(12) * used
@@ -146,7 +141,8 @@ def test_guidance_of_a_linear_velocity_in_float64(limit):
 
 def test_soft_mask():
     """Ones, a decay from below one to above zero, zeros; a hard mask if nothing else overlaps."""
-    mask = np.asarray(real_time_chunking.soft_mask(jnp.array([0, 2, 6]), 6, 8))
+    soft_mask = jax.jit(real_time_chunking.soft_mask, static_argnums=(1, 2))
+    mask = np.asarray(soft_mask(np.array([0, 2, 6]), 6, 8))
     np.testing.assert_array_equal(mask[1, :2], 1)
     np.testing.assert_array_equal(mask[:, 6:], 0)
     assert (np.diff(mask[0, :7]) < 0).all()
@@ -156,18 +152,21 @@ def test_soft_mask():
 
 def test_times_of_training():
     """The first d actions have time 0, with d uniform; without a delay, there is one time a row."""
-    actions, key = jnp.zeros((3000, 5, 2)), jax.random.key(0)
-    noise, time = flow_matching.draw(key, actions)
+    data = np.random.default_rng(0).normal(size=(3000, 5, 2)).astype(np.float32)
+
+    @jax.jit
+    def draw(key, data):
+        without, (noise, times) = (flow_matching.draw(key, data, d) for d in (0, 3))
+        return without, noise, times, flow_matching.interpolate(noise, data, times)[0]
+
+    (noise, time), same_noise, times, x_t = jax.device_get(draw(jax.random.key(0), data))
     assert time.shape == (3000,)
-    same_noise, times = flow_matching.draw(key, actions, 3)
     np.testing.assert_array_equal(noise, same_noise)
-    delay = np.asarray((times == 0).sum(1))
+    delay = (times == 0).sum(1)
     np.testing.assert_allclose(np.bincount(delay, minlength=6)[:4] / 3000, 0.25, atol=0.03)
     assert delay.max() == 3
-    expected = np.where(np.arange(5) < delay[:, None], 0, np.asarray(time)[:, None])
+    expected = np.where(np.arange(5) < delay[:, None], 0, time[:, None])
     np.testing.assert_array_equal(times, expected)
-    data = jax.random.normal(key, (3000, 5, 2))
-    x_t, _ = flow_matching.interpolate(noise, data, times)
     np.testing.assert_array_equal((x_t == data).all(2), expected == 0)
 
 

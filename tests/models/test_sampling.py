@@ -17,13 +17,20 @@ from lorasp_jax.models.sampling import Sampler
 from tests.models.random_models import observation, random_backbone
 from tests.nets import METHODS, trained
 
-BASE = dataclasses.replace(pi0.Config.base(), param_dtype="bfloat16")
+TOWERS = ("vision", "language", "action")
+BASE = pi0.Config.base()
+BASE = dataclasses.replace(
+    BASE,
+    **{name: dataclasses.replace(getattr(BASE, name), depth=2) for name in TOWERS},
+    vocabulary=1000,
+    param_dtype="bfloat16",
+)
 DUMMY = pi0.Config.dummy()
 DUMMY = dataclasses.replace(DUMMY, language=dataclasses.replace(DUMMY.language, mlp=128))
 
 
 def sampler(kind: Kind | None) -> Sampler:
-    """Shapes of a sampler of published size."""
+    """Shapes of a sampler with layers of published size."""
 
     def make():
         model = BASE.create(nnx.Rngs(0))
@@ -61,7 +68,7 @@ def test_float8_stays_only_where_the_gpu_multiplies_it():
     depth = BASE.language.depth
     assert language == [(2048, 16384)] * 2 * depth + [(16384, 2048)] * depth
     assert vision == action == []
-    assert nbytes(small) < 0.75 * nbytes(large)
+    assert nbytes(small) < 0.7 * nbytes(large)
 
 
 @pytest.mark.parametrize(
@@ -93,16 +100,18 @@ def test_a_float8_sampler_gives_the_actions_of_its_model(in_float8, adapted):
     model, obs = random_backbone(DUMMY), observation(DUMMY, 2)
     if adapted:
         model = trained((".*_proj", METHODS["lora_sp"]), seed=1, net=model, size=0.1)
-    model = cast(Any, quantize(model, [(".*", "float8")]).model)
-    noise = jax.random.normal(jax.random.key(0), (2, DUMMY.chunk, DUMMY.action_dim))
+    model = jax.jit(lambda model: cast(Any, quantize(model, [(".*", "float8")]).model))(model)
+    shape = (2, DUMMY.chunk, DUMMY.action_dim)
+    noise = np.random.default_rng(0).normal(size=shape).astype(np.float32)
 
     @jax.jit
     def sample(sampler):
         return sampler.sample_actions(jax.random.key(0), obs, num_steps=1, noise=noise)
 
-    velocity = jax.jit(lambda model: model.velocity(obs, noise, jax.numpy.ones(2)))
-    assert "f8_e4m3fn[2" in str(jax.make_jaxpr(velocity)(model))  # x is rounded
-    prepared = model.sampler()
+    velocity = jax.jit(lambda model: model.velocity(obs, noise, np.ones(2, "f"))).trace(model)
+    assert "f8_e4m3fn[2" in str(velocity.jaxpr)  # x is rounded
+    expected = noise - velocity.lower().compile()(model)
+    prepared = jax.jit(lambda model: model.sampler())(model)
     assert len(quantized_shapes(towers(prepared)[1])) == 3 * DUMMY.language.depth
-    for sampler in (prepared, Sampler.from_model(model, once=True)):
-        np.testing.assert_allclose(sample(sampler), noise - velocity(model), rtol=1e-4, atol=1e-5)
+    for sampler in (prepared, jax.jit(lambda m: Sampler.from_model(m, once=True))(model)):
+        np.testing.assert_allclose(sample(sampler), expected, rtol=1e-4, atol=1e-5)

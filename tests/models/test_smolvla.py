@@ -29,7 +29,7 @@ def size(model: nnx.Module) -> int:
 
 
 def normal(seed: int, *shape: int) -> jax.Array:
-    return jnp.asarray(np.random.default_rng(seed).normal(size=shape), jnp.float32)
+    return jax.device_put(np.random.default_rng(seed).normal(size=shape).astype(np.float32))
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +111,7 @@ def test_own_checkpoint_round_trip(model, tmp_path):
 def test_pixel_shuffle():
     """Merged token (i, j) holds its square of tokens in row-major order, channels last."""
     grid = np.arange(8 * 8 * 3).reshape(1, 8, 8, 3)
-    merged = patches(jnp.asarray(grid), 4)
+    merged = np.asarray(jax.jit(patches, static_argnums=1)(grid, 4))
     square = [grid[0, 4 + dy, dx, c] for dy in range(4) for dx in range(4) for c in range(3)]
     assert merged.shape == (1, 4, 48)
     np.testing.assert_array_equal(merged[0, 2], square)
@@ -121,14 +121,16 @@ def test_actions_attend_only_to_earlier_actions(model):
     images = {name: normal(i, BATCH, 32, 32, 3) for i, name in enumerate(CONFIG.cameras)}
     obs = Observation(
         images=images,
-        image_masks={name: jnp.ones(BATCH, bool) for name in images},
-        tokens=jnp.arange(BATCH * CONFIG.max_tokens).reshape(BATCH, -1),
-        token_mask=jnp.ones((BATCH, CONFIG.max_tokens), bool),
+        image_masks={name: np.ones(BATCH, bool) for name in images},
+        tokens=np.arange(BATCH * CONFIG.max_tokens, dtype=np.int32).reshape(BATCH, -1),
+        token_mask=np.ones((BATCH, CONFIG.max_tokens), bool),
         state=normal(2, BATCH, CONFIG.action_dim),
     )
     velocity = jax.jit(lambda x_t: model.velocity(obs, x_t, jnp.full(BATCH, 0.4)))
-    x_t = normal(3, BATCH, CONFIG.chunk, CONFIG.action_dim)
-    change = np.abs(velocity(x_t.at[:, 1].add(1.0)) - velocity(x_t)).max(axis=-1)
+    x_t = np.array(normal(3, BATCH, CONFIG.chunk, CONFIG.action_dim))
+    other = x_t.copy()
+    other[:, 1] += 1
+    change = np.abs(np.subtract(velocity(other), velocity(x_t))).max(axis=-1)
     assert not change[:, 0].any()
     assert (change[:, 1:] > 1e-6).all()
 
@@ -136,14 +138,22 @@ def test_actions_attend_only_to_earlier_actions(model):
 def test_cross_attention(model):
     """Compare with a NumPy implementation: no second RoPE on keys, only valid keys attended."""
     graphdef, stacked = nnx.split(model.action.blocks.cross_layer)
-    block = nnx.merge(graphdef, jax.tree.map(lambda a: a[1], stacked))
+    block = nnx.merge(graphdef, jax.tree.map(lambda a: np.asarray(a)[1], stacked))
     size, tokens, keys = CONFIG.action, 3, 5
     cache = (normal(4, 1, keys, size.kv_heads, 16), normal(5, 1, keys, size.kv_heads, 16))
-    valid = jnp.array([[True, True, False, True, True]])
-    x, table = normal(6, 1, tokens, size.width), rope_table(jnp.arange(tokens)[None], 16)
-    mask = jnp.broadcast_to(valid[:, None], (1, tokens, keys))
-    keys_values, _ = block.project_cache(cache, valid)
-    result, aux = block.attend(x, table, mask, keys_values, jnp.ones((1, tokens), bool))
+    valid = np.array([[True, True, False, True, True]])
+    x, table = (
+        normal(6, 1, tokens, size.width),
+        jax.jit(rope_table, static_argnums=1)(np.arange(tokens)[None], 16),
+    )
+    mask = np.broadcast_to(valid[:, None], (1, tokens, keys))
+
+    @jax.jit
+    def run(cache, x, table):
+        keys_values, _ = block.project_cache(cache, valid)
+        return block.attend(x, table, mask, keys_values, np.ones((1, tokens), bool))
+
+    result, aux = jax.device_get(run(cache, x, table))
     assert aux.keys() == {"q_proj", "o_proj", "gate_proj", "up_proj", "down_proj"}
 
     kernel = {name: np.asarray(getattr(block, name).kernel[...], np.float64) for name in LINEARS}
@@ -152,7 +162,8 @@ def test_cross_attention(model):
         for a, name in zip(cache, ("k_proj", "v_proj"), strict=True)
     )
     h = norm(np.asarray(x, np.float64)[0], block.input_layernorm)
-    q = rope(jnp.asarray((h @ kernel["q_proj"]).reshape(1, tokens, -1, 16)), table)[0]
+    q = np.float32(h @ kernel["q_proj"]).reshape(1, tokens, -1, 16)
+    q = np.asarray(jax.jit(rope)(q, table))[0]
     attended = np.zeros((tokens, size.heads, 16))
     for head in range(size.heads):
         kv_head = head // (size.heads // size.kv_heads)

@@ -8,7 +8,6 @@ import huggingface_hub
 import numpy as np
 import pytest
 import safetensors.numpy
-from flax import nnx
 
 from lorasp_jax import models
 from lorasp_jax.models.checkpoints import loading, published
@@ -17,6 +16,7 @@ from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
 from tests.models import test_pi0_parity as pi0
 from tests.models import test_smolvla_parity as smolvla
+from tests.models.random_models import random_backbone
 
 FIELDS = {
     "type": "smolvla",
@@ -69,7 +69,7 @@ def test_lerobot(lerobot, caplog):
 
 def test_a_config_overrides_the_sizes_in_config_json(tmp_path):
     config = Pi0Config.dummy()
-    published.save(tmp_path / "dummy", config.create(nnx.Rngs(0)), "lerobot")
+    published.save(tmp_path / "dummy", random_backbone(config), "lerobot")
     (tmp_path / "dummy" / "config.json").write_text('{"type": "pi0"}')
     with pytest.raises(ValueError, match="pass a config"):
         models.load(tmp_path / "dummy")

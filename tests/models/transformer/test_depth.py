@@ -1,5 +1,7 @@
 """Compare unrolled layers with the scan: values, gradients and residuals."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +18,8 @@ from lorasp_jax.models.transformer.depth import (
     unstack,
 )
 from lorasp_jax.peft import LoRA
+from tests.jaxprs import primitives
+from tests.models.random_models import with_random_parameters
 from tests.nets import METHODS, trained
 from tests.peft.lora_sp.test_method import WithFusedKernel
 
@@ -38,17 +42,19 @@ class Layer(nnx.Module):
         return x + self.down(jnp.tanh(self.up(x)))
 
 
+NET = with_random_parameters(Net)
+X = np.sin(np.arange(TOKENS * WIDTH, dtype=np.float32)).reshape(1, TOKENS, WIDTH)
+
+
 @pytest.fixture(scope="module")
 def split():
-    return adaptation.split(trained((".*", METHODS["lora"]), seed=1, net=Net()))
+    return adaptation.split(trained((".*", METHODS["lora"]), seed=1, net=NET))
 
 
 def loss_of(graphdef, frozen, **options):
-    x = jnp.sin(jnp.arange(TOKENS * WIDTH)).reshape(1, TOKENS, WIDTH)
-
     def loss(adapters):
         blocks = nnx.merge(graphdef, adapters, frozen).blocks
-        y, sums = scan_depth(blocks, lambda block, x, _: (block(x), x.sum()), x, **options)
+        y, sums = scan_depth(blocks, lambda block, x, _: (block(x), x.sum()), X, **options)
         return (y**2).sum() + (sums * jnp.arange(DEPTH)).sum()
 
     return loss
@@ -60,7 +66,7 @@ def assert_close(actual, expected):
 
 def test_dropout_is_the_same_unrolled_and_scanned():
     """Each layer of the stack has its own key."""
-    model = trained((".*", LoRA(rank=4, dropout=0.5)), seed=1, net=Net())
+    model = trained((".*", LoRA(rank=4, dropout=0.5)), seed=1, net=NET)
     with_dropout = adaptation.with_dropout(model, jax.random.key(5))
     losses = []
     for net, unroll in ((model, False), (with_dropout, False), (with_dropout, True)):
@@ -126,36 +132,31 @@ def test_a_stack_without_trainable_parameters(unroll):
 
 def test_the_fused_kernel_runs_once_forward_and_once_backward():
     method = WithFusedKernel(rank=16, hidden_width=16)
-    blocks = stack(lambda rngs: Dense(WIDTH, WIDTH, method=method, rngs=rngs), DEPTH, nnx.Rngs(0))
+    make = lambda rngs: Dense(WIDTH, WIDTH, method=method, rngs=rngs)  # noqa: E731
+    blocks = nnx.eval_shape(lambda: stack(make, DEPTH, nnx.Rngs(0)))
     graphdef, adapters, frozen = adaptation.split(blocks)
 
-    def loss(adapters):
+    def loss(adapters, frozen):
         layer = lambda block, x, _: block(x, return_aux=True)  # noqa: E731
         blocks = nnx.merge(graphdef, adapters, frozen)
         return scan_depth(blocks, layer, jnp.ones((1, 16, WIDTH)), remat="products")[0].sum()
 
-    def calls(jaxpr):
-        nested = (getattr(value, "jaxpr", value) for e in jaxpr.eqns for value in e.params.values())
-        count = sum(e.primitive.name == "custom_vmap_call" for e in jaxpr.eqns)
-        return count + sum(calls(j) for j in nested if hasattr(j, "eqns"))
-
-    assert calls(jax.make_jaxpr(jax.grad(loss))(adapters).jaxpr) == 2
+    assert primitives(jax.grad(loss), adapters, frozen).count("custom_vmap_call") == 2
 
 
 def test_inputs_of_unstacked_layers_may_be_split_before():
     """In any part of a pytree."""
-    blocks = unstack(Net().blocks)
-    x = jnp.sin(jnp.arange(TOKENS * WIDTH)).reshape(1, TOKENS, WIDTH)
     scales, shifts = jnp.arange(1.0, 1 + DEPTH), {"by": [jnp.arange(2.0 * DEPTH).reshape(DEPTH, 2)]}
 
-    def run(per_layer):
+    @jax.jit
+    def run(scales, shifts):
         call = lambda block, x, inputs: (block(x) * inputs[0], inputs[1]["by"][0].sum())  # noqa: E731
-        return scan_depth(blocks, call, x, per_layer)
-
-    expected = run((scales, shifts, None))
-    for parts in ((True, False), (False, True), (True, True)):
-        split = [
-            ByLayer.of(value) if is_split else value
-            for value, is_split in zip((scales, shifts), parts, strict=True)
+        halves = {True: ByLayer.of, False: lambda value: value}
+        return [
+            scan_depth(unstack(NET.blocks), call, X, (halves[a](scales), halves[b](shifts), None))
+            for a, b in itertools.product((False, True), repeat=2)
         ]
-        jax.tree.map(np.testing.assert_array_equal, run((*split, None)), expected)
+
+    expected, *others = run(scales, shifts)
+    for found in others:
+        jax.tree.map(np.testing.assert_array_equal, found, expected)
