@@ -17,7 +17,7 @@ from lorasp_jax.models.observation import Observation
 def random_backbone(config: Any, seed: int = 0) -> Any:
     """Create a backbone with random parameters."""
     graphdef, parameters = _random_parameters(config, seed)
-    return nnx.merge(graphdef, jax.tree.map(jnp.array, parameters))
+    return nnx.merge(graphdef, jax.tree.map(lambda x: jax.device_put(x.copy()), parameters))
 
 
 @functools.lru_cache(maxsize=4)
