@@ -68,7 +68,7 @@ class Kinds(nnx.Module):
 
 
 NET = with_random_parameters(Net)
-X = jnp.asarray(np.random.default_rng(0).normal(size=(4, 3, 5)), jnp.float32)
+X = jax.device_put(np.random.default_rng(0).normal(size=(4, 3, 5)).astype("f"))
 
 
 @jax.jit

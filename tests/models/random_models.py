@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
@@ -25,7 +24,7 @@ def with_random_parameters(build: Callable[[], nnx.Module], seed: int = 0) -> An
 
     def draw(leaf: jax.ShapeDtypeStruct) -> jax.Array:
         fan_in = leaf.shape[-2] if len(leaf.shape) > 1 else 4
-        return jnp.asarray(rng.normal(size=leaf.shape) / fan_in**0.5, leaf.dtype)
+        return jax.device_put((rng.normal(size=leaf.shape) / fan_in**0.5).astype(leaf.dtype))
 
     graphdef, parameters = nnx.split(nnx.eval_shape(build))
     return nnx.merge(graphdef, jax.tree.map(draw, parameters))
@@ -35,17 +34,20 @@ def with_noise(tree: Any, scale: float, seed: int = 0) -> Any:
     """Add noise, as if after some training: at initialization half of the gradients vanish."""
     rng = np.random.default_rng(seed)
     noise = lambda x: scale * rng.normal(size=x.shape)  # noqa: E731
-    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x) + noise(x), x.dtype), tree)
+    return jax.tree.map(lambda x: jax.device_put((np.asarray(x) + noise(x)).astype(x.dtype)), tree)
 
 
 def observation(config: Any, batch: int) -> Observation:
     """A random observation; the second example lacks a camera, and both have padding."""
-    keys = jax.random.split(jax.random.key(0), 3)
-    shape = (batch, config.image_size, config.image_size, 3)
-    return Observation(
-        images={n: jax.random.uniform(keys[0], shape, minval=-1) for n in config.cameras},
-        image_masks={"side": jnp.ones(batch, bool), "wrist": jnp.array([True, False])},
-        tokens=jax.random.randint(keys[1], (batch, config.max_tokens), 0, config.vocabulary),
-        token_mask=jnp.arange(config.max_tokens) < jnp.array([[3], [5]]),
-        state=jax.random.normal(keys[2], (batch, config.action_dim)),
+    rng = np.random.default_rng(0)
+    size, dim = config.image_size, config.action_dim
+    image = rng.uniform(-1, 1, (batch, size, size, 3)).astype("f")
+    tokens = rng.integers(config.vocabulary, size=(batch, config.max_tokens), dtype="i4")
+    obs = Observation(
+        images=dict.fromkeys(config.cameras, image),
+        image_masks={"side": np.ones(batch, bool), "wrist": np.array([True, False])},
+        tokens=tokens,
+        token_mask=np.arange(config.max_tokens) < np.array([[3], [5]]),
+        state=rng.normal(size=(batch, dim)).astype("f"),
     )
+    return jax.device_put(obs)
