@@ -76,9 +76,9 @@ def call(model, x):
     return model(x)
 
 
-def trained(*rules, seed, net=NET, size=0.5):
+def trained(*rules, seed, net=NET, size=0.5, **options):
     """Adapt a model, with random adapters of this size; compiles nothing if it can."""
-    adapt = lambda: adaptation.adapt(net, rules, rngs=nnx.Rngs(seed))  # noqa: E731
+    adapt = lambda: adaptation.adapt(net, rules, rngs=nnx.Rngs(seed), **options)  # noqa: E731
     if any(method is not None and method.splits_kernel for _, method in rules):
         graphdef, adapters, frozen = adaptation.split(adapt())
         return nnx.merge(graphdef, with_noise(adapters, size, seed), frozen)
