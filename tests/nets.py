@@ -68,7 +68,7 @@ class Kinds(nnx.Module):
 
 
 NET = with_random_parameters(Net)
-X = jnp.asarray(np.random.default_rng(0).normal(size=(4, 3, 5)), jnp.float32)
+X = jax.device_put(np.random.default_rng(0).normal(size=(4, 3, 5)).astype("f"))
 
 
 @jax.jit
@@ -76,9 +76,9 @@ def call(model, x):
     return model(x)
 
 
-def trained(*rules, seed, net=NET, size=0.5):
+def trained(*rules, seed, net=NET, size=0.5, **options):
     """Adapt a model, with random adapters of this size; compiles nothing if it can."""
-    adapt = lambda: adaptation.adapt(net, rules, rngs=nnx.Rngs(seed))  # noqa: E731
+    adapt = lambda: adaptation.adapt(net, rules, rngs=nnx.Rngs(seed), **options)  # noqa: E731
     if any(method is not None and method.splits_kernel for _, method in rules):
         graphdef, adapters, frozen = adaptation.split(adapt())
         return nnx.merge(graphdef, with_noise(adapters, size, seed), frozen)
@@ -93,13 +93,13 @@ def assert_close(actual, expected):
     np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-5)
 
 
-def golden_model(golden, name, method):
+def golden_model(golden, base, name, method):
     layers = [n for n in range(3) if f"param/lin.{n}.lora_A.{name}.weight" in golden]
     pattern = "|".join(f"lin/{n}" for n in layers)
-    model = adaptation.adapt(peft_folder.Net(golden), [(pattern, method)], rngs=nnx.Rngs(0))
+    model = trained((pattern, method), seed=0, net=base)
     for n in layers:
         a, b = (golden[f"param/lin.{n}.lora_{side}.{name}.weight"].T for side in "AB")
-        model.lin[n].adapter.set_value({"lora_a": jnp.array(a), "lora_b": jnp.array(b)})
+        model.lin[n].adapter.set_value(jax.device_put({"lora_a": a, "lora_b": b}))
     return model
 
 
@@ -112,4 +112,5 @@ def golden_models():
         "b": LoRA(rank=6, alpha=5, rank_stabilized=True),
         "c": LoRA(rank=6, alpha=5),
     }
-    return golden, {name: golden_model(golden, name, method) for name, method in methods.items()}
+    base = peft_folder.reference_net(golden)
+    return golden, {name: golden_model(golden, base, name, m) for name, m in methods.items()}

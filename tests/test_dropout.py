@@ -21,20 +21,20 @@ from tests.test_scanned import EINSUMS, IDS, Llama
 
 RATE = 0.4
 KEY = jax.random.key(7)
-X = jax.random.normal(jax.random.key(0), (6, 5))
+X = jax.device_put(np.random.default_rng(0).normal(size=(6, 5)).astype("f"))
 WITH_DROPOUT = LoRA(rank=2, dropout=RATE)
 KINDS = with_random_parameters(nets.Kinds)
 
 
-def equal(a, b):
-    return bool(jnp.array_equal(a, b))
+equal = np.array_equal
+dropped = jax.jit(dropout, static_argnums=1)
 
 
 def test_dropped_fraction_is_zero_and_the_rest_is_rescaled():
-    dropped = dropout(jnp.ones((200, 100), jnp.bfloat16), 0.25, KEY)
-    assert dropped.dtype == jnp.bfloat16
-    np.testing.assert_allclose(jnp.unique(dropped), [0, 4 / 3], rtol=4e-3)
-    np.testing.assert_allclose((dropped == 0).mean(), 0.25, atol=0.01)
+    x = np.asarray(dropped(np.ones((200, 100), jnp.bfloat16), 0.25, KEY))
+    assert x.dtype == jnp.bfloat16
+    np.testing.assert_allclose(np.unique(x.astype("f")), [0, 4 / 3], rtol=4e-3)
+    np.testing.assert_allclose((x == 0).mean(), 0.25, atol=0.01)
 
 
 @pytest.mark.parametrize(
@@ -42,73 +42,76 @@ def test_dropped_fraction_is_zero_and_the_rest_is_rescaled():
 )
 def test_formula_matches_peft(method):
     """PEFT 0.21.2: lora_B(lora_A(dropout(x))); DoRA's magnitude rescales W dropout(x) (dora.py)."""
-    kernel = jax.random.normal(jax.random.key(1), (5, 4))
-    params = with_noise(method.init(jax.random.key(2), kernel)[0], 0.3)
-    dropped = dropout(X, RATE, KEY)
-    a, b = params["lora_a"], params["lora_b"]
+    kernel = np.random.default_rng(1).normal(size=(5, 4)).astype("f")
+    params = with_noise(jax.jit(method.init)(jax.random.key(2), kernel)[0], 0.3)
+    x = np.asarray(dropped(X, RATE, KEY))
+    a, b = np.asarray(params["lora_a"]), np.asarray(params["lora_b"])
     if isinstance(method, AdaLoRA):
-        a = a * params["lora_e"]
-    delta = method.scale * dropped @ a @ b
+        a = a * np.asarray(params["lora_e"])
+    delta = method.scale * x @ a @ b
     if isinstance(method, DoRA):
-        factor = column_factor(params["magnitude"], kernel + method.scale * a @ b)
-        delta = (factor - 1) * (dropped @ kernel) + factor * delta
-    y, aux = method.apply_with_dropout(params, X, kernel, KEY)
-    np.testing.assert_allclose(y, X @ kernel + delta, rtol=1e-4, atol=1e-5)
+        adapted = kernel + method.scale * a @ b
+        factor = np.asarray(jax.jit(column_factor)(params["magnitude"], adapted))
+        delta = (factor - 1) * (x @ kernel) + factor * delta
+
+    @jax.jit
+    def run(kernel):
+        apply = lambda kernel: method.apply_with_dropout(params, X, kernel, KEY)  # noqa: E731
+        return apply(kernel), jax.grad(lambda kernel: apply(kernel)[0].sum())(kernel)
+
+    (y, aux), kernel_gradient = run(kernel)
+    np.testing.assert_allclose(y, np.asarray(X) @ kernel + delta, rtol=1e-4, atol=1e-5)
     assert aux.active_rank.shape == X.shape[:-1]
-    kernel_gradient = jax.grad(
-        lambda kernel: method.apply_with_dropout(params, X, kernel, KEY)[0].sum()
-    )(kernel)
-    assert not kernel_gradient.any()  # the base is frozen, as without dropout
+    assert not np.any(kernel_gradient)  # the base is frozen, as without dropout
 
 
-def trained(base, rules, **options):
-    model = lorasp_jax.adapt(base, rules, rngs=nnx.Rngs(1), **options)
-    graphdef, adapters, frozen = lorasp_jax.split(model)
-    return nnx.merge(graphdef, with_noise(adapters, 0.3), frozen, copy=True)
+def trained(base, *rules, **options):
+    return nets.trained(*rules, seed=1, net=base, size=0.3, **options)
 
 
 @pytest.mark.parametrize("path", ["conv", "split", "experts", "join", "blocks", "out"])
 def test_every_layer_type(path):
     """Outputs depend on the key in training and are deterministic in evaluation."""
-    model = trained(KINDS, [(path, WITH_DROPOUT)])
-    ids = jnp.array([[1, 2, 3], [4, 5, 6]])
-
-    @jax.jit
-    def run(key):
-        return lorasp_jax.with_dropout(model, key)(ids)
-
-    first, second = run(KEY), run(jax.random.key(8))
-    assert not np.allclose(first, second)
-    assert equal(first, run(KEY))
+    model = trained(KINDS, (path, WITH_DROPOUT))
     without = nnx.clone(model)
     getattr(without, path).method = LoRA(rank=2)
-    assert equal(nets.call(model, ids), nets.call(without, ids))
+    ids = np.array([[1, 2, 3], [4, 5, 6]])
+
+    @jax.jit
+    def run(model, without, key):
+        return lorasp_jax.with_dropout(model, key)(ids), model(ids), without(ids)
+
+    keys = (KEY, jax.random.key(8), KEY)
+    (first, off, expected), (second, *_), (again, *_) = (run(model, without, key) for key in keys)
+    assert not np.allclose(first, second)
+    assert equal(first, again)
+    assert equal(off, expected)
 
 
 def test_embedding_ids_are_never_dropped():
-    model = trained(KINDS, [("embed", WITH_DROPOUT)])
-    ids = jnp.array([[1, 2, 3]])
-    assert equal(nets.call(lorasp_jax.with_dropout(model, KEY), ids), nets.call(model, ids))
+    model, ids = trained(KINDS, ("embed", WITH_DROPOUT)), np.array([[1, 2, 3]])
+    both = jax.jit(lambda model: (lorasp_jax.with_dropout(model, KEY)(ids), model(ids)))
+    assert equal(*both(model))
 
 
 def test_layers_experts_and_stacks_use_independent_masks():
-    model = lorasp_jax.with_dropout(trained(KINDS, [("out|join|blocks", WITH_DROPOUT)]), KEY)
+    model = lorasp_jax.with_dropout(trained(KINDS, ("out|join|blocks", WITH_DROPOUT)), KEY)
     keys = [model.out.dropout_key, model.join.dropout_key, *model.blocks.dropout_key]
     assert len({tuple(jax.random.key_data(key).tolist()) for key in keys}) == 5
-    layer = trained(KINDS, [("experts", WITH_DROPOUT)]).experts
-    x = jnp.ones((50, 2, 3))
-    equal_experts = jax.tree.map(lambda p: p.at[1].set(p[0]), layer.adapter.get_value())
-    layer.adapter.set_value(equal_experts)
-    layer.kernel.set_value(layer.kernel.get_value().at[1].set(layer.kernel.get_value()[0]))
-    layer.bias.set_value(jnp.zeros_like(layer.bias.get_value()))
-    y = lorasp_jax.with_dropout(layer, KEY)(x)
-    assert equal(layer(x)[:, 0], layer(x)[:, 1])
+    layer, x = trained(KINDS, ("experts", WITH_DROPOUT)).experts, np.ones((50, 2, 3), "f")
+    same = lambda leaf: np.stack([leaf[0]] * 2)  # noqa: E731
+    layer.adapter.set_value(jax.tree.map(same, jax.device_get(layer.adapter.get_value())))
+    layer.kernel.set_value(same(np.asarray(layer.kernel.get_value())))
+    layer.bias.set_value(np.zeros((2, 3), "f"))
+    both = jax.jit(lambda layer, x: (lorasp_jax.with_dropout(layer, KEY)(x), layer(x)))
+    y, off = map(np.asarray, both(layer, x))
+    assert equal(off[:, 0], off[:, 1])
     assert not np.allclose(y[:, 0], y[:, 1])
 
 
 def test_dropout_is_off_in_derived_models(tmp_path):
-    base = nnx.Linear(5, 4, rngs=nnx.Rngs(0))
-    model = trained(base, [("", WITH_DROPOUT)])
+    base = with_random_parameters(lambda: nnx.Linear(5, 4, rngs=nnx.Rngs(0)))
+    model = trained(base, ("", WITH_DROPOUT))
     training_model = lorasp_jax.with_dropout(model, KEY)
     assert not np.allclose(training_model(X), model(X))
     restored = nnx.merge(*lorasp_jax.split(training_model))
@@ -137,7 +140,7 @@ def test_program_without_dropout_is_unchanged():
 
         return text(False), text(True)
 
-    base = nnx.Linear(5, 4, rngs=nnx.Rngs(0))
+    base = with_random_parameters(lambda: nnx.Linear(5, 4, rngs=nnx.Rngs(0)))
     (expected, without), (evaluation, training) = program(base, 0.0), program(base, RATE)
     assert expected == without == evaluation
     assert "low_rank_matmul" in expected
@@ -147,18 +150,19 @@ def test_program_without_dropout_is_unchanged():
 @pytest.mark.parametrize("scanned", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_models_with_remat_and_scan(scanned):
     """Test the documented loss, which takes a key."""
-    rules = [("layers|head", WITH_DROPOUT)]
-    model = trained(Llama(remat=True, scanned=scanned), rules, einsums=EINSUMS)
+    base = with_random_parameters(lambda: Llama(remat=True, scanned=scanned))
+    model = trained(base, ("layers|head", WITH_DROPOUT), einsums=EINSUMS)
     graphdef, adapters, frozen = lorasp_jax.split(model)
 
     @jax.jit
+    @jax.value_and_grad
     def loss(adapters, key):
         model = nnx.merge(graphdef, adapters, frozen, copy=True)
         return jnp.square(lorasp_jax.with_dropout(model, key)(IDS)).mean()
 
-    value, gradient = jax.value_and_grad(loss)(adapters, KEY)
-    other, _ = jax.value_and_grad(loss)(adapters, jax.random.key(9))
-    assert value != other
+    value, gradient = loss(adapters, KEY)
+    other, _ = loss(adapters, jax.random.key(9))
+    assert float(value) != float(other)
     assert all(np.abs(g).max() > 0 for g in jax.tree.leaves(gradient))
 
 
@@ -182,30 +186,41 @@ class Linen(nn.Module):
         return nn.Conv(4, (2,), name="conv")(x)
 
 
-LINEN_IDS = jnp.array([[1, 2, 3], [4, 5, 6]])
+LINEN_IDS = np.array([[1, 2, 3], [4, 5, 6]])
+
+
+def random_variables(adapter):
+    shapes = jax.eval_shape(adapter.init, jax.random.key(0), LINEN_IDS)
+    return with_noise(jax.tree.map(lambda leaf: np.zeros(leaf.shape, "f"), shapes), 0.3)
 
 
 @pytest.mark.parametrize("path", ["blocks", "split", "conv"])
 def test_linen(path):
     adapter = lorasp_jax.LinenAdapter(Linen(), [(path, WITH_DROPOUT)])
-    variables = jax.jit(adapter.init)(jax.random.key(0), LINEN_IDS)
-    variables |= {"adapters": with_noise(variables["adapters"], 0.3)}
-    run = jax.jit(lambda key: adapter.apply(variables, LINEN_IDS, rngs={"dropout": key}))
-    assert not np.allclose(run(KEY), run(jax.random.key(8)))
-    assert equal(run(KEY), run(KEY))
+    variables = random_variables(adapter)
     off = dataclasses.replace(adapter, rules=[(path, LoRA(rank=2))])
-    expected = jax.jit(off.apply)(variables, LINEN_IDS)
-    assert equal(jax.jit(adapter.apply)(variables, LINEN_IDS), expected)
-    without = jax.jit(lambda v: off.apply(v, LINEN_IDS, rngs={"dropout": KEY}))
-    assert equal(without(variables), expected)
+
+    @jax.jit
+    def run(key):
+        apply = lambda adapter, **rngs: adapter.apply(variables, LINEN_IDS, **rngs)  # noqa: E731
+        with_key = [apply(one, rngs={"dropout": key}) for one in (adapter, off)]
+        return *with_key, apply(adapter), apply(off)
+
+    (first, *others), (second, *_) = run(KEY), run(jax.random.key(8))
+    assert not np.allclose(first, second)
+    assert equal(first, run(KEY)[0])
+    without_dropout, without_key, expected = others
+    assert equal(without_key, expected)
+    assert equal(without_dropout, expected)
 
 
 def test_linen_scan_without_split_rngs():
     adapter = lorasp_jax.LinenAdapter(Linen(streams=("params",)), [("blocks", WITH_DROPOUT)])
-    variables = jax.jit(adapter.init)(jax.random.key(0), LINEN_IDS)
+    variables = random_variables(adapter)
     jax.eval_shape(adapter.apply, variables, LINEN_IDS)
+    with_key = lambda variables: adapter.apply(variables, LINEN_IDS, rngs={"dropout": KEY})  # noqa: E731
     with pytest.raises(ValueError, match=r"blocks/dense .* split_rngs"):
-        adapter.apply(variables, LINEN_IDS, rngs={"dropout": KEY})
+        jax.eval_shape(with_key, variables)
 
 
 def test_linen_dense():

@@ -27,7 +27,12 @@ WEIGHTS = {"a": 0.6, "b": -0.3}
 NET = with_random_parameters(Kinds)
 KINDS = ["blocks", "conv", "embed", "experts", "join", "out", "split"]
 EINSUMS = ["blocks", "experts", "join", "split"]
-IDS = list(jnp.asarray(np.random.default_rng(0).integers(0, 7, (3, 4, 5))))
+IDS = jax.device_put(list(np.random.default_rng(0).integers(0, 7, (3, 4, 5), dtype="i4")))
+merge, unmerge = jax.jit(lorasp_jax.merge), jax.jit(lorasp_jax.unmerge)
+
+
+def combine(models):
+    return jax.jit(lambda: lorasp_jax.combine(models))()
 
 
 def kernels(model):
@@ -50,7 +55,7 @@ def models():
 
 @pytest.fixture(scope="module")
 def combined(models):
-    return lorasp_jax.combine(models)
+    return combine(models)
 
 
 def experts_and_dense_layers(method):
@@ -73,9 +78,14 @@ def apply_dense_layers(dense_layers, x):
 def test_moments_equal_a_direct_computation():
     moments = calibration.input_moments(NET, IDS)
     assert sorted(moments) == ["blocks", "experts", "join", "out", "split"]
-    x = np.concatenate([NET.conv(NET.embed(ids)) for ids in IDS])
-    heads = NET.split(x)
-    mixed = np.tanh(NET.experts(heads))
+
+    @jax.jit
+    def inputs(ids):
+        x = NET.conv(NET.embed(ids))
+        heads = NET.split(x)
+        return x, heads, jnp.tanh(NET.experts(heads))
+
+    x, heads, mixed = map(np.asarray, inputs(np.concatenate(IDS)))
     inputs_by_path = {"split": x, "join": mixed.reshape(*mixed.shape[:2], 6)}
     for path, inputs in inputs_by_path.items():
         rows = np.asarray(inputs, np.float64).reshape(-1, 6)
@@ -83,14 +93,10 @@ def test_moments_equal_a_direct_computation():
     by_expert = np.einsum("btni,btnj->nij", heads, heads)
     np.testing.assert_allclose(moments["experts"], by_expert, rtol=1e-4, atol=1e-4)
     assert moments["blocks"].shape == (3, 6, 6)
-    model = lorasp_jax.adapt(
-        NET,
-        [("experts|blocks", LoRA(rank=2, initialization="eva"))],
-        rngs=nnx.Rngs(0),
-        statistics=moments,
-    )
-    a = model.experts.adapter.get_value()["lora_a"][1]
-    right = np.linalg.svd(np.asarray(heads[:, :, 1]).reshape(-1, 3), full_matrices=False)[2][:2]
+    rules = [("experts|blocks", LoRA(rank=2, initialization="eva"))]
+    adapt = lambda: lorasp_jax.adapt(NET, rules, rngs=nnx.Rngs(0), statistics=moments)  # noqa: E731
+    a = np.asarray(jax.jit(adapt)().experts.adapter.get_value()["lora_a"])[1]
+    right = np.linalg.svd(heads[:, :, 1].reshape(-1, 3), full_matrices=False)[2][:2]
     np.testing.assert_allclose(np.abs(right @ a), np.eye(2), atol=1e-3)
 
 
@@ -156,33 +162,36 @@ def test_each_name_gives_the_outputs_of_its_model(models, combined):
 
 
 def test_adapters_per_example(models, combined):
-    y = call(lorasp_jax.choose(combined, ["b", None, "a", "b"]), IDS[0])
+    y = np.asarray(call(lorasp_jax.choose(combined, ["b", None, "a", "b"]), IDS[0]))
     expected = [(models["b"], 0), (NET, 1), (models["a"], 2), (models["b"], 3)]
     for model, row in expected:
-        assert_close(y[row], call(model, IDS[0])[row])
+        assert_close(y[row], np.asarray(call(model, IDS[0]))[row])
 
 
 def test_attend_of_an_embedding_with_two_adapters(models, combined):
-    query = jax.random.normal(jax.random.key(0), (4, 6))
-    attend = [lorasp_jax.choose(combined, one).embed.attend(query) for one in ("a", "b", None)]
+    query = np.random.default_rng(0).normal(size=(4, 6)).astype("f")
+    run = jax.jit(lambda embed: embed.attend(query))
+    choices = ("a", "b", None, WEIGHTS)
+    *attend, both = [np.asarray(run(lorasp_jax.choose(combined, c).embed)) for c in choices]
     for actual, model in zip(attend, [*models.values(), NET], strict=True):
-        assert_close(actual, model.embed.attend(query))
-    both = lorasp_jax.choose(combined, WEIGHTS).embed.attend(query)
+        assert_close(actual, run(model.embed))
     assert_close(both, attend[2] + 0.6 * (attend[0] - attend[2]) - 0.3 * (attend[1] - attend[2]))
 
 
 def test_weighted_sums_match_merged_kernels(models, combined):
     chosen = lorasp_jax.choose(combined, WEIGHTS)
     fused, errors = lorasp_jax.fuse(combined, WEIGHTS)
-    base, merged = kernels(NET), kernels(lorasp_jax.merge(chosen))
-    each = {name: kernels(lorasp_jax.merge(model)) for name, model in models.items()}
-    for path, kernel in kernels(lorasp_jax.merge(fused)).items():
+    base, merged = kernels(NET), kernels(merge(chosen))
+    each = {name: kernels(merge(model)) for name, model in models.items()}
+    for path, kernel in kernels(merge(fused)).items():
         sums = base[path] + sum(w * (each[name][path] - base[path]) for name, w in WEIGHTS.items())
         assert_close(merged[path], sums)
         assert_close(kernel, sums)
     assert errors == dict.fromkeys(KINDS, 0.0)
     assert_close(call(fused, IDS[0]), call(chosen, IDS[0]))
-    smaller, errors = lorasp_jax.fuse(combined, WEIGHTS, rank=3)
+    methods = {"a": LoRA(rank=2), "b": LoRA(rank=3, alpha=1)}
+    few = {n: trained(("experts|blocks", m), seed=3, net=NET) for n, m in methods.items()}
+    smaller, errors = lorasp_jax.fuse(combine(few), WEIGHTS, rank=3)
     assert smaller.experts.adapter.get_value()["lora_a"].shape == (2, 3, 3)
     assert 0 < errors["blocks"] < 1
 
@@ -199,8 +208,7 @@ def test_named_adapters_of_other_methods(models):
 
 
 def test_unmerging_restores_the_kernels(models):
-    merged = lorasp_jax.merge(models["a"])
-    unmerged = lorasp_jax.unmerge(merged, models["a"])
+    unmerged = unmerge(merge(models["a"]), models["a"])
     assert adaptation.methods(unmerged) == adaptation.methods(models["a"])
     for path, kernel in kernels(unmerged).items():
         np.testing.assert_allclose(kernel, kernels(NET)[path], rtol=1e-5, atol=1e-5)
@@ -208,11 +216,11 @@ def test_unmerging_restores_the_kernels(models):
 
 
 def test_unmerging_requires_the_same_layer_types(models):
-    merged = lorasp_jax.merge(models["a"])
-    merged.split = nnx.Linear(6, 6, rngs=nnx.Rngs(0))
+    merged = merge(models["a"])
+    merged.split = with_random_parameters(lambda: nnx.Linear(6, 6, rngs=nnx.Rngs(0)))
     message = "cannot unmerge split: the layer must be of class LinearGeneral, got Linear"
     with pytest.raises(ValueError, match=message):
-        lorasp_jax.unmerge(merged, models["a"])
+        unmerge(merged, models["a"])
 
 
 class Shared(nnx.Module):
@@ -227,14 +235,15 @@ class Shared(nnx.Module):
 
 
 def test_shared_layer_is_changed_once():
-    net, x = Shared(), jax.random.normal(jax.random.key(0), (5, 4))
+    net, x = with_random_parameters(Shared), np.sin(np.arange(20, dtype="f")).reshape(5, 4)
     model = trained((".*", LoRA(rank=2)), seed=1, net=net)
     merged = lorasp_jax.merge(model)
     assert merged.first is merged.second
-    assert_close(merged(x), model(x))
+    expected = call(model, x)
+    assert_close(call(merged, x), expected)
     unmerged = lorasp_jax.unmerge(merged, model)
-    assert_close(unmerged.first.kernel[...], net.first.kernel[...])
-    assert_close(unmerged(x), model(x))
+    assert_close(unmerged.first.kernel.get_value(), net.first.kernel.get_value())
+    assert_close(call(unmerged, x), expected)
     both = lorasp_jax.combine({"a": model, "b": net})
-    assert_close(lorasp_jax.extract(both, "a")(x), model(x))
-    assert_close(lorasp_jax.choose(both, None)(x), net(x))
+    assert_close(call(lorasp_jax.extract(both, "a"), x), expected)
+    assert_close(call(lorasp_jax.choose(both, None), x), call(net, x))

@@ -22,7 +22,7 @@ delta_of = jax.jit(lambda method, params, x: method.delta(params, x), static_arg
 
 
 def normal(seed, *shape):
-    return jnp.asarray(np.random.default_rng(seed).normal(size=shape), jnp.float32)
+    return np.random.default_rng(seed).normal(size=shape).astype("f")
 
 
 @pytest.fixture(scope="module")
@@ -53,12 +53,15 @@ def expert_deltas(params, x, rank=RANK):
 def test_losses_equal_hugging_face():
     """Hugging Face averages the balance loss over sequences (1.0865); we pool tokens (1.0253)."""
     with np.load(GOLDEN) as file:
-        logits, balance, z = jnp.asarray(file["logits"]), file["lb"], file["z"]
-    probabilities = jax.nn.softmax(logits)
-    ours = jnp.mean(jnp.stack([balance_loss(sequence, None) for sequence in probabilities]))
-    np.testing.assert_allclose(ours, balance, rtol=1e-5)
-    np.testing.assert_allclose(balance_loss(probabilities, None), 1.025313, rtol=1e-5)
-    np.testing.assert_allclose(z_loss(logits, None), z, rtol=1e-5)
+        logits, balance, z = (file[name] for name in ("logits", "lb", "z"))
+
+    @jax.jit
+    def losses(logits):
+        each = jax.nn.softmax(logits)
+        ours = [balance_loss(sequence, None) for sequence in each]
+        return jnp.stack(ours).mean(), balance_loss(each, None), z_loss(logits, None)
+
+    np.testing.assert_allclose(losses(logits), [balance, 1.025313, z], rtol=1e-5)
 
 
 def test_balance_loss_range_and_gradient():
@@ -95,8 +98,8 @@ def test_top1_uses_one_expert(method, x):
     delta, aux = delta_of(method, params, x)
     np.testing.assert_allclose(delta, method.scale * expected, rtol=1e-4, atol=1e-5)
     np.testing.assert_array_equal(aux.active_rank, RANK)
-    rows = np.asarray(x) @ np.asarray(method.down(params))
-    z, _ = jax.jit(method.bottleneck)(params, rows, None)
+    bottleneck = lambda params, x: method.bottleneck(params, x @ method.down(params), None)  # noqa: E731
+    z, _ = jax.jit(bottleneck)(params, x)
     used = (np.asarray(z) != 0).reshape(*x.shape[:-1], EXPERTS, RANK)
     np.testing.assert_array_equal(used.all(-1), used.any(-1))
     np.testing.assert_array_equal(used.any(-1).sum(-1), 1)
@@ -134,9 +137,9 @@ def test_one_expert_equals_lora(fields, x):
 def test_initial_paper_lora_sp_equals_weighted_moe(seed, x):
     """They are equal for η = 1 and the initial 0/1 matrix W2, for any bank and W1."""
     sp = LoRASP.paper(rank=EXPERTS * RANK, energy_target=1.0)
-    initial, _ = sp.init(jax.random.key(seed), jax.ShapeDtypeStruct((D_IN, D_OUT), jnp.float32))
+    initial, _ = jax.jit(sp.init)(jax.random.key(seed), np.zeros((D_IN, D_OUT), "f"))
     bank = initial["bank"] | {"u": normal(seed, sp.rank, D_OUT)}
-    w1 = initial["router"]["w1"] * 3.0**seed
+    w1 = np.asarray(initial["router"]["w1"]) * np.float32(3.0**seed)
     theirs, _ = delta_of(sp, {"bank": bank, "router": initial["router"] | {"w1": w1}}, x)
     params = {"lora_a": bank["v"], "lora_b": bank["u"], "router": w1}
     moe = LoRAMoE(EXPERTS, RANK)
@@ -146,24 +149,24 @@ def test_initial_paper_lora_sp_equals_weighted_moe(seed, x):
 
 def test_initialization():
     """A and the router uniform in ±1/√I, B zero."""
-    kernel = jax.ShapeDtypeStruct((400, 30), jnp.float32)
-    params, _ = LoRAMoE(EXPERTS, 8).init(jax.random.key(0), kernel)
+    kernel = np.zeros((400, 30), "f")
+    params, _ = jax.jit(LoRAMoE(EXPERTS, 8).init)(jax.random.key(0), kernel)
     for name in ("lora_a", "router"):
         assert np.abs(params[name]).max() == pytest.approx(1 / 20, rel=0.01)
         assert np.std(params[name]) == pytest.approx(1 / 20 / 3**0.5, rel=0.05)
-    assert not params["lora_b"].any()
+    assert not np.any(params["lora_b"])
 
 
 def test_padding_only(x):
     """Losses and their gradients are 0, not NaN."""
-    mask = jnp.zeros(x.shape[:-1], bool)
+    mask = np.zeros(x.shape[:-1], bool)
 
     def losses(params):
         return sum(ALL[0].delta(params, 1e3 * x, token_mask=mask)[1].losses.values())
 
     value, gradients = jax.jit(jax.value_and_grad(losses))(arrays())
     assert value == 0
-    assert all(not leaf.any() for leaf in jax.tree.leaves(gradients))
+    assert all(not np.any(leaf) for leaf in jax.tree.leaves(gradients))
 
 
 def test_logits_are_fp32_for_bfloat16_inputs(x):
@@ -171,12 +174,12 @@ def test_logits_are_fp32_for_bfloat16_inputs(x):
     low = x.astype(jnp.bfloat16)
     delta, aux = delta_of(ALL[0], arrays(), low)
     assert delta.dtype == jnp.bfloat16
-    router = arrays()["router"].astype(jnp.bfloat16).astype(jnp.float32)
-    logits = low.astype(jnp.float32) @ router
+    router = arrays()["router"].astype(jnp.bfloat16).astype("f")
+    logits = low.astype("f") @ router
     assert aux.losses["z"].dtype == jnp.float32
-    np.testing.assert_allclose(aux.losses["z"], z_loss(logits, None), rtol=1e-5)
-    expected = balance_loss(jax.nn.softmax(logits), None)
-    np.testing.assert_allclose(aux.losses["balance"], expected, rtol=1e-5)
+    exact = lambda x: (z_loss(x, None), balance_loss(jax.nn.softmax(x), None))  # noqa: E731
+    actual = aux.losses["z"], aux.losses["balance"]
+    np.testing.assert_allclose(actual, jax.jit(exact)(logits), rtol=1e-5)
     task = jax.grad(lambda params, x: TOP1[1].delta(params, x)[0].sum(), argnums=(0, 1))
     param_grads, x_grad = jax.eval_shape(task, arrays(), low)
     assert {leaf.dtype for leaf in jax.tree.leaves(param_grads)} == {jnp.dtype("float32")}
@@ -192,8 +195,8 @@ def test_softmax(experts):
         y, vjp = jax.vjp(f, x)
         return y, *vjp(weights)
 
-    run = jax.jit(value_and_gradient, static_argnums=0)
-    (y, gradient), (expected, d_expected) = run(softmax, logits), run(jax.nn.softmax, logits)
+    run = jax.jit(lambda x: [value_and_gradient(f, x) for f in (softmax, jax.nn.softmax)])
+    (y, gradient), (expected, d_expected) = run(logits)
     np.testing.assert_allclose(y, expected, rtol=1e-5, atol=1e-7)
     np.testing.assert_allclose(gradient, d_expected, rtol=1e-5, atol=1e-5)
     assert "reduce" not in str(jax.make_jaxpr(softmax)(logits))

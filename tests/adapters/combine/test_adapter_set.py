@@ -19,34 +19,38 @@ OTHERS = {
     "ada": peft.AdaLoRA(rank=3),
 }
 METHODS = LORAS | OTHERS
+WEIGHTS = np.random.default_rng(5).normal(size=(4, len(METHODS))).astype("f")
 SET = AdapterSet(tuple(METHODS), tuple(OTHERS.get(name) for name in METHODS))
 
 
 @pytest.fixture(scope="module")
 def kernel():
-    return jax.random.normal(jax.random.key(0), (D_IN, D_OUT))
+    return np.random.default_rng(0).normal(size=(D_IN, D_OUT)).astype("f")
 
 
 @pytest.fixture(scope="module")
 def x():
-    return jax.random.normal(jax.random.key(1), (4, 3, D_IN))
+    return np.random.default_rng(1).normal(size=(4, 3, D_IN)).astype("f")
 
 
 @pytest.fixture(scope="module")
 def members(kernel):
     """Parameters of each adapter, with noise added."""
-    return {
-        name: with_noise(method.init(jax.random.key(i), kernel)[0], 0.5, i)
-        for i, (name, method) in enumerate(METHODS.items())
-    }
+    init = lambda kernel: [m.init(jax.random.key(0), kernel)[0] for m in METHODS.values()]  # noqa: E731
+    params = dict(zip(METHODS, jax.jit(init)(kernel), strict=True))
+    return {name: with_noise(params[name], 0.5, i) for i, name in enumerate(METHODS)}
 
 
 @pytest.fixture(scope="module")
 def params(members):
-    bank = empty_bank(2, 4, (D_IN, D_OUT))
-    for slot, (name, method) in enumerate(LORAS.items()):
-        bank = set_slot(bank, slot, method, members[name])
-    return {"bank": bank, "others": {name: members[name] for name in OTHERS}}
+    @jax.jit
+    def bank(members):
+        bank = empty_bank(2, 4, (D_IN, D_OUT))
+        for slot, (name, method) in enumerate(LORAS.items()):
+            bank = set_slot(bank, slot, method, members[name])
+        return bank
+
+    return {"bank": bank(members), "others": {name: members[name] for name in OTHERS}}
 
 
 @jax.jit
@@ -54,57 +58,62 @@ def apply(params, choice, x, kernel):
     return SET.apply(params | {"choice": choice}, x, kernel)
 
 
+@jax.jit
+def separate(members, x, kernel):
+    return {name: method.apply(members[name], x, kernel) for name, method in METHODS.items()}
+
+
 @pytest.mark.parametrize("name", METHODS)
 def test_single_adapter_matches_its_own_method(params, members, x, kernel, name):
-    choice = jnp.array([float(other == name) for other in METHODS])
+    choice = np.array([float(other == name) for other in METHODS], "f")
     y, aux = apply(params, choice, x, kernel)
-    expected, report = METHODS[name].apply(members[name], x, kernel)
+    expected, report = separate(members, x, kernel)[name]
     np.testing.assert_allclose(y, expected, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(aux.active_rank, report.active_rank)
 
 
 def test_zero_weights_give_the_base(params, x, kernel):
-    y, aux = apply(params, jnp.zeros(len(METHODS)), x, kernel)
+    y, aux = apply(params, np.zeros(len(METHODS), "f"), x, kernel)
     np.testing.assert_allclose(y, x @ kernel, rtol=1e-5, atol=1e-5)
-    assert not aux.active_rank.any()
+    assert not np.any(aux.active_rank)
     assert not aux.losses
 
 
 def deltas(members, x, kernel):
-    return jnp.stack([m.apply(members[n], x, kernel)[0] - x @ kernel for n, m in METHODS.items()])
+    results = separate(members, x, kernel)
+    return np.stack([np.asarray(results[name][0]) - x @ kernel for name in METHODS])
 
 
 def test_weighted_sum(params, members, x, kernel):
-    weights = jnp.array([0.5, -1.0, 0.25, 2.0, 0.3, 1.0])
+    weights = np.array([0.5, -1.0, 0.25, 2.0, 0.3, 1.0], "f")
     y, _ = apply(params, weights, x, kernel)
-    expected = x @ kernel + jnp.tensordot(weights, deltas(members, x, kernel), 1)
+    expected = x @ kernel + np.tensordot(weights, deltas(members, x, kernel), 1)
     np.testing.assert_allclose(y, expected, rtol=1e-4, atol=1e-4)
 
 
 def test_choice_per_example(params, members, x, kernel):
-    weights = jax.random.normal(jax.random.key(5), (4, len(METHODS)))
-    y, aux = apply(params, weights, x, kernel)
-    expected = x @ kernel + jnp.einsum("ba,abto->bto", weights, deltas(members, x, kernel))
+    y, aux = apply(params, WEIGHTS, x, kernel)
+    expected = x @ kernel + np.einsum("ba,abto->bto", WEIGHTS, deltas(members, x, kernel))
     np.testing.assert_allclose(y, expected, rtol=1e-4, atol=1e-4)
     assert aux.active_rank.shape == (4, 3)
 
 
 def test_rows_of_an_example_are_contiguous(params, x, kernel):
     """Fold [B, T, I] into [B T, I], as a vision tower does with its cameras."""
-    weights = jax.random.normal(jax.random.key(5), (4, len(METHODS)))
-    y, _ = apply(params, weights, x, kernel)
-    folded, _ = apply(params, weights, x.reshape(12, D_IN), kernel)
-    np.testing.assert_allclose(folded.reshape(y.shape), y, rtol=1e-5, atol=1e-5)
+    y, _ = apply(params, WEIGHTS, x, kernel)
+    folded, _ = apply(params, WEIGHTS, x.reshape(12, D_IN), kernel)
+    np.testing.assert_allclose(np.reshape(folded, y.shape), y, rtol=1e-5, atol=1e-5)
     with pytest.raises(ValueError, match=r"4 examples .* 3 rows"):
-        apply(params, weights, x[:3], kernel)
+        apply(params, WEIGHTS, x[:3], kernel)
 
 
 def test_without_a_bank(members, x, kernel):
     method = AdapterSet(("sp", "dora"), (OTHERS["sp"], OTHERS["dora"]))
     others = {name: members[name] for name in ("sp", "dora")}
-    params = {"bank": empty_bank(0, 0, (D_IN, D_OUT)), "others": others}
-    y, _ = method.apply(params | {"choice": jnp.array([1.0, 0.0])}, x, kernel)
-    expected, _ = OTHERS["sp"].apply(members["sp"], x, kernel)
+    bank = jax.tree.map(np.asarray, empty_bank(0, 0, (D_IN, D_OUT)))
+    params = {"bank": bank, "others": others, "choice": np.array([1.0, 0.0], "f")}
+    y, _ = jax.jit(method.apply)(params, x, kernel)
+    expected, _ = separate(members, x, kernel)["sp"]
     np.testing.assert_allclose(y, expected, rtol=1e-4, atol=1e-5)
 
 
@@ -113,23 +122,24 @@ def test_merge(params, members, x, kernel):
     mergeable = [name for name in METHODS if name not in ("sp", "moe")]
     method = AdapterSet(tuple(mergeable), tuple(OTHERS.get(name) for name in mergeable))
     own = {"bank": params["bank"], "others": {name: members[name] for name in ("dora", "ada")}}
-    own["choice"] = jnp.array([0.5, -1.0, 1.5, 0.7])
-    expected, _ = method.apply(own, x, kernel)
-    np.testing.assert_allclose(x @ method.merge(own, kernel), expected, rtol=1e-4, atol=1e-4)
-    assert method.merge(own, kernel.astype(jnp.bfloat16)).dtype == jnp.bfloat16
+    own["choice"] = np.array([0.5, -1.0, 1.5, 0.7], "f")
+    both = jax.jit(lambda own: (method.apply(own, x, kernel)[0], method.merge(own, kernel)))
+    expected, merged = map(np.asarray, both(own))
+    np.testing.assert_allclose(x @ merged, expected, rtol=1e-4, atol=1e-4)
+    assert jax.eval_shape(method.merge, own, kernel.astype(jnp.bfloat16)).dtype == jnp.bfloat16
     with pytest.raises(ValueError, match="per example"):
-        method.merge(own | {"choice": jnp.ones((2, 4))}, kernel)
+        method.merge(own | {"choice": np.ones((2, 4), "f")}, kernel)
     with pytest.raises(ValueError, match="LoRA-SP"):
-        SET.merge(params | {"choice": jnp.ones(len(METHODS))}, kernel)
+        jax.eval_shape(SET.merge, params | {"choice": WEIGHTS[0]}, kernel)
 
 
 def test_low_precision(params, x, kernel):
     low = jnp.bfloat16
-    choice = jnp.full(len(METHODS), 0.3)
+    choice = np.full(len(METHODS), 0.3, "f")
     y, _ = apply(params, choice, x.astype(low), kernel.astype(low))
     expected, _ = apply(params, choice, x, kernel)
     assert y.dtype == low
-    np.testing.assert_allclose(y.astype(jnp.float32), expected, atol=0.05 * jnp.abs(expected).max())
+    np.testing.assert_allclose(np.asarray(y, "f"), expected, atol=0.05 * np.abs(expected).max())
 
 
 @pytest.mark.slow

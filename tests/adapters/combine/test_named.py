@@ -16,9 +16,10 @@ from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE
 from tests.models.random_models import observation, with_random_parameters
-from tests.nets import NET, SP, Net, X, assert_close, call, golden_models, trained
+from tests.nets import NET, SP, Net, X, assert_close, golden_models, trained
 
 NAMES = ("pour", "press", "open", "pick")
+TRACES = []
 WEIGHTS = {"pour": 0.5, "press": -0.7}
 
 
@@ -29,12 +30,20 @@ def models():
         "press": trained(("", LoRA(rank=4, alpha=5, rank_stabilized=True)), seed=2),
         "open": trained(("inp", SP), ("blocks", DoRA(rank=2)), seed=3),
         "pick": trained(("inp", AdaLoRA(rank=3)), ("blocks", LoRAMoE(experts=2, rank=2)), seed=4),
+        "spare": NET,
     }
 
 
 @functools.cache
 def combined():
-    return lorasp_jax.combine(models())
+    separate = models()
+    return jax.jit(lambda: lorasp_jax.combine(separate, rank=6))()
+
+
+@jax.jit
+def call(model, x):
+    TRACES.append(model)
+    return model(x)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -45,58 +54,47 @@ def test_each_adapter(name):
 def test_base_and_initial_choice():
     assert_close(call(lorasp_jax.choose(combined(), None), X), call(NET, X))
     assert_close(call(combined(), X), call(models()["pour"], X))
-    assert named.names(combined()) == NAMES
+    assert named.names(combined()) == (*NAMES, "spare")
 
 
 def test_choice_per_example():
     chosen = ["press", "open", None, "pour"]
     y = call(lorasp_jax.choose(combined(), chosen), X)
-    alone = [call(models()[n] if n else NET, X)[i] for i, n in enumerate(chosen)]
-    assert_close(y, jnp.stack(alone))
+    alone = [np.asarray(call(models()[n or "spare"], X))[i] for i, n in enumerate(chosen)]
+    assert_close(y, np.stack(alone))
 
 
 def test_choices_do_not_recompile():
     """Change names and weights, by a new model or by an array inside jit."""
-    traces = []
+    arrays = []
 
     @jax.jit
-    def run(model, x):
-        traces.append("model")
-        return model(x)
-
-    @jax.jit
-    def run_weights(model, weights, x):
-        traces.append("array")
+    def call_with_array(model, weights, x):
+        arrays.append(weights)
         return lorasp_jax.choose(model, weights)(x)
 
-    for choice in ("pour", "open", None, WEIGHTS):
-        y = run(lorasp_jax.choose(combined(), choice), X)
-        assert_close(run_weights(combined(), named.weights(combined(), choice), X), y)
-    assert traces == ["model", "array"]
-    for choices in (["pour", None, "open", WEIGHTS], ["press"] * 4):
-        y = run(lorasp_jax.choose(combined(), choices), X)
-        assert_close(run_weights(combined(), named.weights(combined(), choices), X), y)
-    assert traces == ["model", "array"] * 2
+    for choices in (
+        ["pour", "open", None, WEIGHTS],
+        [["pour", None, "open", WEIGHTS], ["press"] * 4],
+    ):
+        call(lorasp_jax.choose(combined(), choices[0]), X)
+        traces = len(TRACES), len(arrays) + 1
+        for choice in choices:
+            y = call(lorasp_jax.choose(combined(), choice), X)
+            assert_close(call_with_array(combined(), named.weights(combined(), choice), X), y)
+        assert (len(TRACES), len(arrays)) == traces
 
 
 def test_swap_does_not_recompile():
-    model = lorasp_jax.combine({"a": models()["pour"], "spare": NET}, rank=6)
     other = trained(("inp|blocks", LoRA(rank=6, alpha=2.5)), seed=8)
-    traces = []
-
-    @jax.jit
-    def run(model, x):
-        traces.append(0)
-        return model(x)
-
-    model = lorasp_jax.choose(model, "spare")
-    assert_close(run(model, X), call(NET, X))
-    assert_close(run(lorasp_jax.swap(model, "spare", other), X), call(other, X))
-    assert_close(
-        run(lorasp_jax.swap(model, "spare", models()["pour"]), X), call(models()["pour"], X)
-    )
-    assert_close(run(model, X), call(NET, X))
-    assert len(traces) == 1
+    expected = [call(other, X), call(models()["pour"], X), call(NET, X)]
+    model = lorasp_jax.choose(combined(), "spare")
+    assert_close(call(model, X), expected[2])
+    traces = len(TRACES)
+    swapped = [lorasp_jax.swap(model, "spare", one) for one in (other, models()["pour"])]
+    for one, y in zip([*swapped, model], expected, strict=True):
+        assert_close(call(one, X), y)
+    assert len(TRACES) == traces
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -118,7 +116,15 @@ def test_extracting_the_base():
 
 def test_combined_model_is_frozen_and_shares_the_base():
     assert not jax.tree.leaves(nnx.state(combined(), AdapterParam))
-    assert combined().blocks.kernel.get_value() is NET.blocks.kernel.get_value()
+
+    separate = models()
+
+    def combine():
+        model = lorasp_jax.combine(separate)
+        assert model.blocks.kernel.get_value() is NET.blocks.kernel.get_value()
+        return model
+
+    jax.eval_shape(combine)
     assert models()["pour"].blocks.method == LoRA(rank=3)
     models_by_choice = (lorasp_jax.choose(combined(), name) for name in ("pour", "open"))
     assert not np.array_equal(
@@ -135,24 +141,26 @@ def test_unknown_names():
         lorasp_jax.extract(combined(), "prss")
     with pytest.raises(ValueError, match="no named adapters"):
         lorasp_jax.choose(NET, "pour")
-    for bad in (jnp.ones(3), [], np.ones((2, 2, 4))):
-        with pytest.raises(ValueError, match=r"\[4\] or \[B, 4\]"):
+    for bad in (jnp.ones(3), [], np.ones((2, 2, 5))):
+        with pytest.raises(ValueError, match=r"\[5\] or \[B, 5\]"):
             lorasp_jax.choose(combined(), bad)
 
 
 def test_combine_errors():
     other = with_random_parameters(Net)
-    other.inp.kernel.set_value(other.inp.kernel.get_value() + 1)
+    other.inp.kernel.set_value(np.asarray(other.inp.kernel.get_value()) + 1)
     with pytest.raises(ValueError, match=r"pour and b .*'inp/kernel'"):
         lorasp_jax.combine({"pour": models()["pour"], "b": other})
     with pytest.raises(ValueError, match=r"full .* out/(kernel|bias)"):
         lorasp_jax.combine({"full": trained(("out", FullFineTuning()), seed=0)})
+    split = [("inp", LoRA(2, initialization="pissa"))]
+    adapt = lambda: adaptation.adapt(NET, split, rngs=nnx.Rngs(0))  # noqa: E731
     with pytest.raises(ValueError, match="inp split"):
-        lorasp_jax.combine({"a": trained(("inp", LoRA(2, initialization="pissa")), seed=0)})
+        jax.eval_shape(lambda: lorasp_jax.combine({"a": adapt()}))
     with pytest.raises(ValueError, match="already a combined"):
         lorasp_jax.combine({"a": combined()})
     with pytest.raises(ValueError, match="rank 4 exceeds 3"):
-        lorasp_jax.combine(models(), rank=3)
+        jax.eval_shape(functools.partial(lorasp_jax.combine, models(), rank=3))
     with pytest.raises(ValueError, match="models"):
         lorasp_jax.combine({})
 
@@ -162,9 +170,16 @@ def test_swap_errors():
         lorasp_jax.swap(combined(), "open", trained(("inp", SP), seed=0))
     with pytest.raises(ValueError, match=r"pour at blocks .* LoRA"):
         lorasp_jax.swap(combined(), "pour", models()["open"])
-    few = lorasp_jax.combine({"open": models()["open"], "pour": models()["pour"]})
+    few = {name: models()[name] for name in ("open", "pour")}
+    few = jax.jit(functools.partial(lorasp_jax.combine, few))()
     with pytest.raises(ValueError, match="pour adapts out"):
         lorasp_jax.swap(few, "pour", models()["press"])
+
+
+@functools.cache
+def golden_case():
+    golden, models = golden_models()
+    return golden, jax.jit(lambda: lorasp_jax.combine(models))()
 
 
 @pytest.mark.parametrize(
@@ -180,11 +195,11 @@ def test_swap_errors():
 )
 def test_hugging_face(case, choice):
     """PEFT 0.21.2: one, none or two adapters, a mixed batch, a weighted sum; tolerance 1e-5."""
-    golden, models = golden_models()
-    model = lorasp_jax.choose(lorasp_jax.combine(models), choice)
+    golden, combined = golden_case()
+    model = lorasp_jax.choose(combined, choice)
     expected = golden[f"y/{case}"]
     atol = 1e-5 * np.abs(expected).max()
-    np.testing.assert_allclose(model(golden["x"]), expected, rtol=0, atol=atol)
+    np.testing.assert_allclose(call(model, golden["x"]), expected, rtol=0, atol=atol)
 
 
 @pytest.mark.slow

@@ -19,24 +19,29 @@ SIZES = (24, 40, 24, 16)
 
 
 class Net(nnx.Module):
-    """The reference net that PEFT adapted; randomly initialized if arrays is None."""
+    """The reference net that PEFT adapted, randomly initialized; `reference_net` has its arrays."""
 
-    def __init__(self, arrays=None):
+    def __init__(self):
         self.lin = nnx.List(
             [
                 nnx.Linear(i, o, rngs=nnx.Rngs(n))
                 for n, (i, o) in enumerate(itertools.pairwise(SIZES))
             ]
         )
-        for n, layer in enumerate(self.lin if arrays is not None else []):
-            layer.kernel.set_value(jnp.array(arrays[f"base/lin.{n}.weight"].T))
-            layer.bias.set_value(jnp.array(arrays[f"base/lin.{n}.bias"]))
 
     def __call__(self, x):
         for n, layer in enumerate(self.lin):
             x = layer(x)
             x = jnp.tanh(x) if n < 2 else x
         return x
+
+
+def reference_net(arrays):
+    model = nnx.eval_shape(Net)
+    for n, layer in enumerate(model.lin):
+        layer.kernel.set_value(jax.device_put(arrays[f"base/lin.{n}.weight"].T))
+        layer.bias.set_value(jax.device_put(arrays[f"base/lin.{n}.bias"]))
+    return model
 
 
 class Stack(nnx.Module):

@@ -20,6 +20,7 @@ from tests.adapters.io.peft_folder import (
     adapted,
     edit_config,
     edit_tensors,
+    reference_net,
     trained,
 )
 
@@ -33,7 +34,7 @@ X = jax.random.normal(jax.random.key(9), (4, 24))
 
 def test_outputs_match_peft():
     arrays = dict(np.load(GOLDEN / "adapter_lora_io.npz"))
-    model = hugging_face.load_peft(FOLDER, Net(arrays))
+    model = hugging_face.load_peft(FOLDER, reference_net(arrays))
     np.testing.assert_allclose(model(arrays["x"]), arrays["y"], rtol=0, atol=1e-5)
     expected = LoRA(rank=4, alpha=8)
     assert adaptation.methods(model) == {"lin/0": expected, "lin/2": expected}
@@ -43,7 +44,7 @@ def test_outputs_match_peft():
 def test_outputs_of_trained_folders_match_peft(name):
     """DoRA, rsLoRA and AdaLoRA, trained 20 SGD steps in PEFT 0.21.2; ranks and α by pattern."""
     arrays = dict(np.load(GOLDEN / "adapter_trained_io.npz"))
-    model = hugging_face.load_peft(GOLDEN / f"adapter_{name}", Net(arrays))
+    model = hugging_face.load_peft(GOLDEN / f"adapter_{name}", reference_net(arrays))
     np.testing.assert_allclose(model(arrays["x"]), arrays[f"y/{name}"], rtol=0, atol=1e-5)
 
 

@@ -15,7 +15,7 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io import hugging_face
 from lorasp_jax.peft import FullFineTuning, LoRA
 from tests import GOLDEN
-from tests.adapters.io.peft_folder import FOLDER, Net, edit_config, edit_tensors
+from tests.adapters.io.peft_folder import FOLDER, Net, edit_config, edit_tensors, reference_net
 from tests.models.random_models import with_noise
 
 
@@ -30,7 +30,7 @@ from tests.models.random_models import with_noise
 def test_fully_trained_parameters_of_peft(name, trained):
     """bias "all" and "lora_only", modules_to_save; PEFT 0.21.2, dropout 0.1, 20 steps of SGD."""
     arrays = dict(np.load(GOLDEN / "adapter_more_io.npz"))
-    model = hugging_face.load_peft(GOLDEN / f"adapter_{name}", Net(arrays))
+    model = hugging_face.load_peft(GOLDEN / f"adapter_{name}", reference_net(arrays))
     np.testing.assert_allclose(model(arrays["x"]), arrays[f"y/{name}"], rtol=0, atol=1e-5)
     methods = adaptation.methods(model)
     assert methods.pop("lin/0") == LoRA(rank=4, alpha=8, dropout=0.1)
@@ -41,7 +41,7 @@ def test_fully_trained_parameters_of_peft(name, trained):
 def test_fully_trained_parameters_are_saved(name, tmp_path):
     folder = GOLDEN / f"adapter_{name}"
     arrays = dict(np.load(GOLDEN / "adapter_more_io.npz"))
-    hugging_face.save_peft(tmp_path, hugging_face.load_peft(folder, Net(arrays)))
+    hugging_face.save_peft(tmp_path, hugging_face.load_peft(folder, reference_net(arrays)))
     folders = (tmp_path, folder)
     ours, theirs = (safetensors.numpy.load_file(f / hugging_face.TENSORS) for f in folders)
     assert ours.keys() == theirs.keys()

@@ -13,7 +13,7 @@ from lorasp_jax.adapters.io import hugging_face
 from lorasp_jax.dense import AdaptedLayer
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA
 from tests import ROOT, foreign
-from tests.adapters.io.peft_folder import Net, trained
+from tests.adapters.io.peft_folder import reference_net, trained
 
 pytestmark = pytest.mark.slow
 
@@ -75,7 +75,7 @@ def arrays(file):
 
 
 def base(folder):
-    return Net(arrays(folder / "base.npz"))
+    return reference_net(arrays(folder / "base.npz"))
 
 
 def adapted(net, name):
