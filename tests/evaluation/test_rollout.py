@@ -20,7 +20,7 @@ from tests.runs import CONFIG, make_run
 @pytest.mark.parametrize(
     ("platform", "kind", "gate"),
     [
-        pytest.param("cpu", "cpu", "bisection", marks=pytest.mark.slow),
+        pytest.param("cpu", "cpu", "pairwise", marks=pytest.mark.slow),
         ("cuda", "NVIDIA H200", "pallas"),
         pytest.param("tpu", "TPU v5e", "bisection", marks=pytest.mark.slow),
     ],

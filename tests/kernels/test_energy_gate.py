@@ -39,7 +39,7 @@ def random_scores(shape, seed=0):
 
 @pytest.mark.parametrize(
     ("implementation", "max_misses"),
-    [("bisection", 0), ("flags", 0), ("pallas", 0), ("sort", 1)],
+    [("pairwise", 0), ("bisection", 0), ("flags", 0), ("pallas", 0), ("sort", 1)],
 )
 @pytest.mark.parametrize("eta", mostly_slow([0.5, 0.7, 0.8, 0.9, 0.99], quick=[0.5, 0.9, 0.99]))
 def test_equals_exact_arithmetic(golden, implementation, max_misses, eta):
@@ -63,7 +63,7 @@ def test_target_of_one_keeps_every_positive_score(golden):
     np.testing.assert_allclose(kept_energy, 1, rtol=1e-5)  # the order of summation may differ
 
 
-@pytest.mark.parametrize("implementation", ["sort", "bisection", "pallas"])
+@pytest.mark.parametrize("implementation", ["pairwise", "sort", "bisection", "pallas"])
 def test_special_rows(implementation):
     rows = np.array([[0] * 4, [3e38] * 4, [0, 0, 0, 2e-38], [1] * 4, [0, 1e-20, 1, 1e-20]])
     run = jax.jit(lambda s: energy_gate(s, 0.5, implementation))
@@ -85,7 +85,7 @@ EXTREME = [
 ]
 
 
-@pytest.mark.parametrize("implementation", ["sort", "bisection", "flags", "pallas"])
+@pytest.mark.parametrize("implementation", ["pairwise", "sort", "bisection", "flags", "pallas"])
 @pytest.mark.parametrize(
     ("eta", "expected"),
     [
@@ -107,7 +107,7 @@ def test_limits_of_fp32(implementation, eta, expected):
     assert np.isnan(kept[-1])
 
 
-@pytest.mark.parametrize("implementation", ["bisection", "flags", "pallas"])
+@pytest.mark.parametrize("implementation", ["pairwise", "bisection", "flags", "pallas"])
 def test_nan_with_a_maximum_that_ignores_it(monkeypatch, implementation):
     """Triton's maximum ignores NaN; emulate it with a patched `jnp.max`."""
     largest = jnp.max
@@ -142,7 +142,7 @@ def test_pallas_takes_any_shape(shape):
     np.testing.assert_array_equal(pallas, bisected)
 
 
-@pytest.mark.parametrize("implementation", ["sort", "bisection"])
+@pytest.mark.parametrize("implementation", ["pairwise", "sort", "bisection"])
 def test_transformations_agree(implementation):
     @jax.jit
     def all_ways(scores):
@@ -188,7 +188,7 @@ def test_invalid_target(eta):
 
 
 def test_unknown_implementation():
-    with pytest.raises(ValueError, match="one of sort, bisection, pallas"):
+    with pytest.raises(ValueError, match="one of pairwise, sort, bisection, pallas"):
         gate.energy_gate(jnp.ones(3), 0.9, implementation="argsort")
 
 
@@ -198,7 +198,7 @@ def test_unknown_implementation():
     [
         ("cuda", "NVIDIA H200", "pallas", "__gpu$xla.gpu.triton"),
         ("tpu", "TPU v5e", "bisection", ""),
-        ("cpu", "cpu", "bisection", ""),
+        ("cpu", "cpu", "pairwise", ""),
     ],
 )
 def test_lowers_without_the_device(platform, kind, implementation, call):

@@ -100,7 +100,7 @@ class LoRASP(BankMethod):
     def implementation(self, params: Params) -> Bottleneck:
         """A fused kernel on an NVIDIA GPU, for the default router and sizes that it supports."""
         num_scores = params["router"]["w2"].shape[-1]
-        if self.router != "gelu" or default_implementation() != "pallas":
+        if self.router != "gelu" or default_implementation(num_scores) != "pallas":
             return self
         sizes = self.rank, num_scores, self.hidden_width
         if any(size != supported_size(size) for size in sizes):
