@@ -23,7 +23,9 @@ class Demonstrator:
         """Plan for the world's present layout."""
         self._clock, self._start = clock, None
         self._dt = world.env.control_dt
-        self.actions = np.asarray(_actions(world.env, world.state, jax.random.key(seed)))
+        self.actions: np.ndarray = np.asarray(
+            _actions(world.env, world.state, jax.random.key(seed))
+        )
 
     def __call__(self, observation: Observation) -> np.ndarray:  # noqa: ARG002
         """Return actions [C, 7], counted from the first question."""
