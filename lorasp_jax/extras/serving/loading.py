@@ -81,10 +81,11 @@ def load_checkpoint(
         ValueError: something is missing or does not fit; see `models.load`, `statistics_files.read`
             and `Processor.of`.
     """
-    config = sized("pi0", size) if size else lorasp_jax.models.load_config(where)
+    folder = hub.local(where)  # once: asking a hub again could give another revision
+    config = sized("pi0", size) if size else lorasp_jax.models.load_config(folder)
     if dtype:
         config = dataclasses.replace(config, dtype=dtype, param_dtype=dtype)
-    moments = statistics_files.read(statistics or where, dataset=dataset)
+    moments = statistics_files.read(statistics or folder, dataset=dataset)
     if not joints and moments.dim == config.action_dim:
         raise ValueError(
             f"the statistics of {where} do not show the robot's number of joints: pass --joints"
@@ -94,7 +95,7 @@ def load_checkpoint(
     prompts = PromptTable.of(words, ["press the button"], config, num_joints=joints)
     prompts = dataclasses.replace(prompts, instructions=())
     processor = Processor.of(config, moments, prompts, num_joints=joints, cameras=cameras or None)
-    model = lorasp_jax.models.load(where, config)
+    model = lorasp_jax.models.load(folder, config)
     models = {UNADAPTED: model}
     for name, path in (adapters or {}).items():
         models[name] = lorasp_jax.load_adapters(path, model)
