@@ -1,18 +1,14 @@
 """A connected arm, its fake other end and their clock, for tests."""
 
-import copy
 import itertools
 import types
 from dataclasses import dataclass
-
-from can.interfaces import virtual
 
 from lorasp_jax.extras.piper.arm import PiperArm
 from lorasp_jax.extras.piper.fake import frames
 from lorasp_jax.extras.piper.fake.firmware import PERIOD, FakePiper
 from lorasp_jax.extras.piper.fake.timing import Lockstep
 
-virtual.deepcopy = copy.copy  # nobody changes a frame; deep copies take a sixth of a session
 _CHANNELS = (f"bench{i}" for i in itertools.count())  # the SDK keeps one interface per name
 
 
