@@ -43,7 +43,7 @@ def inspect(options: argparse.Namespace, console: Console) -> None:
         raise ValueError(f"{options.out} already exists: add --overwrite or choose another --out")
     path = options.out or inspection.default_path(options.path)
     inspection.report(source, console)
-    inspection.write_contact_sheet(source, path)
+    inspection.write_contact_sheet(source, path, options.augment)
     console.print(f"contact sheet: {path}", soft_wrap=True, highlight=False, markup=False)
 
 
@@ -85,6 +85,9 @@ def parser(program: str) -> argparse.ArgumentParser:
         help="output .png file (default: one per dataset in ~/.cache/lorasp_jax)",
     )
     sub.add_argument("--overwrite", action="store_true", help="replace an existing .png file")
+    text = "show what training makes of a frame, by this recipe (default: %(const)s)"
+    recipes = {"nargs": "?", "const": "openpi", "choices": ("openpi", "lerobot")}
+    sub.add_argument("--augment", default="none", help=text, **recipes)
     _add_keys(sub)
 
     text = convert.__doc__

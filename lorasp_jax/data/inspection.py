@@ -7,6 +7,7 @@ import math
 import os
 from pathlib import Path
 
+import jax
 import numpy as np
 from PIL import Image, ImageDraw
 from rich.console import Console
@@ -16,6 +17,8 @@ from rich.table import Table
 from envs.datasets.episodes import Episodes
 from envs.rendering.video import side_by_side
 from lorasp_jax.base.writing import atomic_file
+from lorasp_jax.config import AugmentConfig
+from lorasp_jax.data.augmentation import WRIST, recipe
 from lorasp_jax.data.lerobot import LeRobot
 from lorasp_jax.data.source import Source
 from lorasp_jax.data.video import downscale
@@ -132,13 +135,16 @@ def _value_table(summary: Summary) -> Table:
     return table
 
 
-def contact_sheet(source: Source) -> np.ndarray:
+def contact_sheet(source: Source, preset: str = "none") -> np.ndarray:
     """Draw up to `EPISODES` episodes, one per row: frames over time, cameras side by side.
+
+    With the preset of an `AugmentConfig`, a row shows one frame instead, followed by what training
+    may make of it.
 
     Returns:
         uint8 `[H, W, 3]`.
     """
-    rows = [_row(source, number) for number in _spread(len(source), EPISODES)]
+    rows = [_row(source, number, preset) for number in _spread(len(source), EPISODES)]
     width = max(row.shape[1] for row in rows)
     padded = [np.pad(row, [(0, 0), (0, width - row.shape[1]), (0, 0)]) for row in rows]
     return np.concatenate(padded)
@@ -156,20 +162,23 @@ def default_path(dataset: str) -> Path:
     return cache / "lorasp_jax" / "inspect" / f"{path.name}-{digest}.png"
 
 
-def write_contact_sheet(source: Source, path: Path) -> None:
+def write_contact_sheet(source: Source, path: Path, preset: str = "none") -> None:
     """Write `contact_sheet` to a PNG file atomically."""
-    sheet = Image.fromarray(contact_sheet(source))
+    sheet = Image.fromarray(contact_sheet(source, preset))
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(path) as temporary:
         sheet.save(temporary, format="png")
 
 
-def _row(source: Source, number: int) -> np.ndarray:
+def _row(source: Source, number: int, preset: str) -> np.ndarray:
     """Draw frames of one episode, with its instruction as caption."""
     episode = source.episode(number)
     frames = []
-    for step in _spread(episode.num_steps, FRAMES):
+    steps = _spread(episode.num_steps, FRAMES)
+    for column, step in enumerate(steps if preset == "none" else FRAMES * [steps[0]]):
         tiles = {name: downscale(np.asarray(x[0, step]), TILE) for name, x in episode.image.items()}
+        if preset != "none" and column:
+            tiles = {name: changed(x, name, preset, column) for name, x in tiles.items()}
         height = max(tile.shape[0] for tile in tiles.values())
         padded = {
             name: np.pad(tile, [(0, height - tile.shape[0]), (0, 0), (0, 0)])
@@ -183,6 +192,13 @@ def _row(source: Source, number: int) -> np.ndarray:
     printable = text.encode("latin-1", "replace").decode("latin-1")  # the font has no others
     ImageDraw.Draw(caption).text((2, 1), printable, fill="white")
     return np.concatenate([np.asarray(caption), images])
+
+
+def changed(image: np.ndarray, camera: str, preset: str, seed: int) -> np.ndarray:
+    """Return one of the images `[H, W, 3]` uint8 that training makes of a camera's."""
+    change = jax.jit(recipe(AugmentConfig(preset), wrist=WRIST in camera))  # type: ignore[arg-type]
+    unit = change(jax.random.key(seed), np.float32(image / 255))
+    return np.asarray(255 * unit).round().astype(np.uint8)
 
 
 def _spread(count: int, number: int) -> list[int]:

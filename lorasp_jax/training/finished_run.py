@@ -6,6 +6,7 @@ from typing import Any
 
 from lorasp_jax import peft
 from lorasp_jax.config import (
+    AugmentConfig,
     AuxiliaryConfig,
     Config,
     DataConfig,
@@ -47,6 +48,9 @@ def recorded_config(run: Path) -> Config:
 def _from_json(recorded: Mapping[str, Any], tasks: tuple[str, ...]) -> Config:
     """Undo `run_folder.to_json`."""
     fields = {name: value for name, value in recorded.items() if name not in ("scene", "digest")}
+    data = dict(fields["data"])
+    absent = {"preset": "none" if data["source"] else "auto"}
+    fields["data"] = data | {"augment": AugmentConfig(**data.get("augment", absent))}
     for name, group in _GROUPS.items():
         fields[name] = group(**fields[name])
     settings = fields["peft"]

@@ -1,5 +1,6 @@
 """The training program: many steps in one compiled call."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -9,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from lorasp_jax.base import messages
+from lorasp_jax.data.augmentation import augment
 from lorasp_jax.data.batches import RawBatch, encode
 from lorasp_jax.policies.processor import Processor
 from lorasp_jax.training import compilation
@@ -58,6 +60,9 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
         keys = StepKeys.of(key, state.step)
         noise = optim.state_noise
         batch = encode(keys.state_noise, raw, frozen.processor, state_noise=noise)
+        if recipe := run.augmentation:
+            images = augment(keys.images, batch.observation, frozen.processor, recipe)
+            batch = dataclasses.replace(batch, observation=images)
         batch = jax.lax.with_sharding_constraint(batch, meshes.batch_sharding(mesh))
         return step(state, frozen.parameters, batch, keys.loss)
 
@@ -71,7 +76,7 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
     def scan(frozen: Frozen, batches: RawBatch, state: TrainState, key: jax.Array) -> Any:
         return jax.lax.scan(lambda state, raw: body(state, raw, frozen, key), state, batches)
 
-    inputs = optim, run.config.auxiliary, graphdef, *jax.tree.leaves(shardings)
+    inputs = optim, run.config.auxiliary, run.augmentation, graphdef, *jax.tree.leaves(shardings)
     return run.programs.setdefault(inputs, scan)
 
 

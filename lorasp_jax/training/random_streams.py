@@ -30,15 +30,18 @@ class RandomStream(enum.IntEnum):
 
 
 class StepKeys(NamedTuple):
-    """Keys of one training step: for the windows to draw, the noise of the state, and the loss."""
+    """Keys of one training step: for its windows, the noise of the state, the loss, the images."""
 
     windows: jax.Array
     state_noise: jax.Array
     loss: jax.Array
+    images: jax.Array
 
     @classmethod
     def of(cls, key: jax.Array, step: jax.Array) -> "StepKeys":
         """Derive the keys of step `step`, `[]` int32, from the key of `RandomStream.TRAINING`."""
-        batch, loss = jax.random.split(jax.random.fold_in(key, step))
+        key = jax.random.fold_in(key, step)
+        batch, loss = jax.random.split(key)
         windows, state_noise = jax.random.split(batch)
-        return cls(windows, state_noise, loss)
+        images = jax.random.fold_in(key, 2)  # with 0 and 1 it would be a key of the split
+        return cls(windows, state_noise, loss, images)

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from envs.datasets.episodes import Episodes
 from lorasp_jax.adapters import adaptation
-from lorasp_jax.config import Config
+from lorasp_jax.config import AugmentConfig, Config
 from lorasp_jax.data.batches import Steps, flatten
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training import records
@@ -59,6 +59,11 @@ class Run:
     def steps(self) -> Steps:
         """All steps to train on."""
         return self.dataset or flatten(list(self.episodes.values()))
+
+    @property
+    def augmentation(self) -> AugmentConfig | None:
+        """How training images are changed; None: not at all."""
+        return self.config.data.augment.chosen(simulated=self.simulated)
 
     @property
     def parameters(self) -> tuple[int, int]:

@@ -25,7 +25,7 @@ from lorasp_jax.base.files import as_value_error, check_only_files, read_bytes
 from lorasp_jax.base.json_values import check
 from lorasp_jax.base.locks import acquire
 from lorasp_jax.base.writing import TEMPORARY_SUFFIX, write_text
-from lorasp_jax.config import Config
+from lorasp_jax.config import AugmentConfig, Config
 from lorasp_jax.peft.settings import without_removed
 from lorasp_jax.training import records
 from lorasp_jax.training.distributed import processes
@@ -52,6 +52,11 @@ def to_json(config: Config) -> dict[str, Any]:
     for group, name in _OPTIONAL:
         if not fields[group][name]:
             del fields[group][name]
+    augment, data = config.data.augment, fields["data"]
+    if augment == AugmentConfig("auto" if not config.data.source else "none"):
+        del data["augment"]  # as in runs from before there was augmentation
+    else:
+        data["augment"] = {"preset": augment.preset, **augment.given}
     scene = fields.pop("scene")
     if changed := config.scene.changed():
         fields["scene"] = {name: scene[name] for name in changed}
