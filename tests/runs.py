@@ -78,7 +78,9 @@ class Miniature(nnx.Module):
         if noise is None:
             noise, flow_time = flow_matching.draw(key, actions)
         noisy, velocity = flow_matching.interpolate(noise, actions, flow_time)
-        hidden, first = self.inp(noisy + observation.state[:, None], return_aux=True)
+        seen = sum(image.mean((1, 2, 3)) for image in observation.images.values())
+        inputs = noisy + (observation.state + seen[:, None])[:, None]
+        hidden, first = self.inp(inputs, return_aux=True)
         predicted, second = self.out(jnp.tanh(hidden), return_aux=True)
         return (predicted - velocity) ** 2, {"action": {"inp": first, "out": second}}
 

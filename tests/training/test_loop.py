@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from lorasp_jax.adapters import adaptation
+from lorasp_jax.config import AugmentConfig, DataConfig
 from lorasp_jax.data.batches import flatten
 from lorasp_jax.peft import LoRA
 from lorasp_jax.training.loop import RunError, train
@@ -22,7 +23,8 @@ def quick_run(folder, *, ema=0.5, streams=False):
     optim = dataclasses.replace(CONFIG.optim, accumulate=2, ema=ema)
     config = dataclasses.replace(CONFIG, optim=optim, targets=("inp", "out"))
     if streams:  # the method does not matter: one that compiles faster
-        config = dataclasses.replace(config, peft=LoRA(rank=4))
+        data = DataConfig(augment=AugmentConfig("openpi"))
+        config = dataclasses.replace(config, peft=LoRA(rank=4), data=data)
     run = make_run(folder, config, Miniature())
     run.programs = PROGRAMS
     if streams:
