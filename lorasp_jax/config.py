@@ -177,6 +177,9 @@ class DataConfig:
     noise-free."""
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     """Random changes of training images."""
+    validation: tuple[str, ...] = ("auto",)
+    """Episodes to measure on instead of training: a share such as 0.1, a number, or names such as
+    episode_3; auto: a tenth of recordings with at least 10 episodes, none of simulated ones."""
     fresh_every: int = 0
     """Replace all demonstrations every N steps with new ones, which the device collects while it
     trains; a multiple of log_every. 0: never."""
@@ -185,6 +188,8 @@ class DataConfig:
         fields.check_fields(self)
         _at_least(1, self, "episodes", "num_envs")
         _at_least(0, self, "action_noise", "fresh_every")
+        if not self.source and self.validation not in (("auto",), ("0",)):
+            raise ValueError("data.validation holds episodes of a dataset out: add data.source")
         if self.fresh_every and self.source:
             raise ValueError("data.fresh_every cannot be combined with data.source: drop one")
 
@@ -272,6 +277,8 @@ class EvaluationConfig:
     """Euler steps of the flow-matching sampler."""
     before: bool = True
     """Evaluate the base before training."""
+    validate_every: int = 500
+    """Steps between measurements on held-out episodes, rounded up to the next log step."""
     every: int = 0
     """Steps between evaluations during training, rounded up to the next log step; each runs
     num_envs episodes per task. 0: do not evaluate during training."""
@@ -284,6 +291,7 @@ class EvaluationConfig:
     def __post_init__(self) -> None:
         fields.check_fields(self)
         _at_least(1, self, "episodes", "num_envs", "execute_steps", "denoise_steps")
+        _at_least(1, self, "validate_every")
         _at_least(0, self, "every")
         counts = f"{self.episodes} and {self.num_envs}"
         rule = "episodes must be a multiple of num_envs"
@@ -327,6 +335,9 @@ class Config:
     fsdp: int = 1
     """Devices per FSDP group, over which large arrays (base, trainable parameters, optimizer state)
     are sharded; the rest of the mesh is data parallel."""
+    keep: Literal["best", "last"] = "best"
+    """Which adapters to evaluate and export after the last step: those with the least error on
+    held-out episodes, if there are any, or the last."""
     log_every: int = 50
     """Steps per compiled call and between log entries."""
     checkpoint_every: int = 1000
@@ -341,8 +352,14 @@ class Config:
 
     def evaluates(self, step: int) -> bool:
         """Whether to evaluate when logging `step`; the final evaluation is separate."""
-        every, previous = self.evaluation.every, step - self.log_every
-        return bool(every) and step // every > previous // every and step < self.optim.steps
+        return step < self.optim.steps and self._due(step, self.evaluation.every)
+
+    def validates(self, step: int) -> bool:
+        """Whether to measure on held-out episodes when logging `step`."""
+        return step == self.optim.steps or self._due(step, self.evaluation.validate_every)
+
+    def _due(self, step: int, every: int) -> bool:
+        return bool(every) and step // every > (step - self.log_every) // every
 
     def __post_init__(self) -> None:
         fields.check_fields(self)

@@ -12,6 +12,10 @@ import lorasp_jax
 
 COMMANDS = {
     "train": ("lorasp_jax.cli.train", "adapt a policy to a robot"),
+    "evaluate": (
+        "lorasp_jax.evaluation.__main__",
+        "measure a run on recorded episodes, without a simulator",
+    ),
     "study": (
         "lorasp_jax.extras.study.__main__",
         "run many experiments",

@@ -90,6 +90,7 @@ def run(command: "Command", folder: Path, console: Console, started: float) -> N
     import jax
 
     from lorasp_jax.evaluation.callback import Evaluation, NoEvaluation
+    from lorasp_jax.evaluation.validation import Validation
     from lorasp_jax.report.callback import Report
     from lorasp_jax.training import early, loop, setup
     from lorasp_jax.training.distributed import processes
@@ -107,7 +108,7 @@ def run(command: "Command", folder: Path, console: Console, started: float) -> N
         meanwhile = () if several else (early.compile_training, evaluation.compile_early)
         training_run = setup.prepare(command.config, folder, console, started, meanwhile=meanwhile)
         judge = evaluation if training_run.simulated else NoEvaluation()
-        callbacks = [Export(), judge, Report(), *callbacks]
+        callbacks = [Validation(), Export(), judge, Report(), *callbacks]
         first = processes.is_first()
         loop.train(training_run, callbacks if first else [], resume=bool(command.resume))
     processes.barrier("ended")  # after uploads, which may take longer than JAX waits at exit

@@ -36,7 +36,7 @@ def inspect(options: argparse.Namespace, console: Console) -> None:
     from lorasp_jax.data import inspection
     from lorasp_jax.data.opening import open_source
 
-    source = open_source(options.path, _keys(options))
+    source = open_source(options.path, keys_of(options))
     if options.out:
         check_local(options.out)
     if options.out and options.out.exists() and not options.overwrite:
@@ -52,7 +52,7 @@ def convert(options: argparse.Namespace, console: Console) -> None:
     from lorasp_jax.data import cache, lerobot_export, rlds_export
     from lorasp_jax.data.opening import open_source
 
-    keys = _keys(options)
+    keys = keys_of(options)
     sources = [open_source(path, keys) for path in options.paths]
     if options.to != "cache" and len(sources) > 1:
         raise ValueError(f"--to {options.to} converts exactly one dataset, got {len(sources)}")
@@ -88,7 +88,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     text = "show what training makes of a frame, by this recipe (default: %(const)s)"
     recipes = {"nargs": "?", "const": "openpi", "choices": ("openpi", "lerobot")}
     sub.add_argument("--augment", default="none", help=text, **recipes)
-    _add_keys(sub)
+    add_keys(sub)
 
     text = convert.__doc__
     sub = subparsers.add_parser("convert", help=text, description=text)
@@ -97,11 +97,11 @@ def parser(program: str) -> argparse.ArgumentParser:
     sub.add_argument("--out", type=Path, required=True, help="folder to create")
     text = "output format (default: %(default)s)"
     sub.add_argument("--to", choices=("cache", "rlds", "lerobot"), default="cache", help=text)
-    _add_keys(sub)
+    add_keys(sub)
     return parser
 
 
-def _add_keys(parser: argparse.ArgumentParser) -> None:
+def add_keys(parser: argparse.ArgumentParser) -> None:
     """Add one option per field of `Keys`."""
     add = parser.add_argument_group("LeRobot datasets").add_argument
     default = "(default: %(default)s)"
@@ -122,7 +122,8 @@ def _add_keys(parser: argparse.ArgumentParser) -> None:
     add("--image-size", type=int, default=224, help=text)
 
 
-def _keys(options: argparse.Namespace) -> Keys:
+def keys_of(options: argparse.Namespace) -> Keys:
+    """Return the values of the options of `add_keys`."""
     values: dict[str, Any] = {
         field.name: getattr(options, field.name) for field in dataclasses.fields(Keys)
     }

@@ -103,9 +103,7 @@ def _gray(image: jax.Array) -> jax.Array:
 
 def _smooth(image: jax.Array) -> jax.Array:
     """Return torchvision's smooth image: a 3 x 3 mean whose center counts five times, inside."""
-    around = sum(
-        jnp.roll(image, (y, x), (0, 1)) for y in (-1, 0, 1) for x in (-1, 0, 1)
-    )
+    around = sum(jnp.roll(image, (y, x), (0, 1)) for y in (-1, 0, 1) for x in (-1, 0, 1))
     inside = jnp.zeros(image.shape[:2], bool).at[1:-1, 1:-1].set(True)
     return jnp.where(inside[..., None], (around + 4 * image) / 13, image)
 

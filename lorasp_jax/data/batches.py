@@ -46,6 +46,7 @@ class Steps:
         action: `[N, J+1]` joint targets [rad] and gripper opening [m].
         end: `[N]` int32, index just past the last step of the episode.
         instruction: `[N]` int32, row of the processor's token table.
+        starts: `[S]` int32, the steps at which a window may start; None: all.
     """
 
     image: dict[str, Array]
@@ -53,6 +54,12 @@ class Steps:
     action: Array
     end: Array
     instruction: Array
+    starts: Array | None = None
+
+    @property
+    def num_starts(self) -> int:
+        """Number of windows."""
+        return len(self.end if self.starts is None else self.starts)
 
 
 @jax.tree_util.register_dataclass
@@ -146,8 +153,8 @@ def gather(steps: Steps, start: Array, chunk: int) -> RawBatch:
 
 def draw(key: jax.Array, steps: Steps, *, batch_size: int, chunk: int) -> RawBatch:
     """Gather `batch_size` windows that start at uniformly random steps."""
-    start = jax.random.randint(key, (batch_size,), 0, steps.end.shape[0])
-    return gather(steps, start, chunk)
+    start = jax.random.randint(key, (batch_size,), 0, steps.num_starts)
+    return gather(steps, start if steps.starts is None else steps.starts[start], chunk)
 
 
 def encode(key: jax.Array, raw: RawBatch, processor: Processor, *, state_noise: float) -> Batch:

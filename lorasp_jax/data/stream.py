@@ -52,10 +52,11 @@ class Stream:
         share = batch_size // count
         rows = slice(index * share, (index + 1) * share)
 
-        def read(start: np.ndarray) -> RawBatch:
-            return gather(steps, start[rows], chunk)
+        def read(window: np.ndarray) -> RawBatch:
+            start = window[rows] if steps.starts is None else steps.starts[window[rows]]
+            return gather(steps, start, chunk)
 
-        order: Any = grain.MapDataset.range(len(steps.end)).seed(seed).shuffle().repeat()
+        order: Any = grain.MapDataset.range(steps.num_starts).seed(seed).shuffle().repeat()
         batches = order.batch(batch_size).map(read)
         options = grain.ReadOptions(num_threads=_THREADS, prefetch_buffer_size=_PREFETCH)
         self._iterator: Any = iter(batches.to_iter_dataset(options))

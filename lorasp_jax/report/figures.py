@@ -73,6 +73,27 @@ def losses(rows: Rows) -> Figure:
 
 
 @mpl.rc_context(_STYLE)
+def held_out(rows: Rows) -> Figure:
+    """Plot losses and action errors on held-out episodes over steps."""
+    figure = Figure(figsize=(9, 3), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _line(left, rows, "task", COLORS["before"], "training")
+    _line(left, rows, "validation/loss", COLORS["vision"], "held out")
+    left.set_yscale("log")
+    left.set_title("flow-matching loss", loc="left")
+    _line(right, rows, "validation/action_error", COLORS["vision"], "policy")
+    _line(right, rows, "validation/hold_still/action_error", COLORS["before"], "hold still")
+    name = "validation/repeat/action_error"
+    _line(right, rows, name, COLORS["language"], "repeat the previous action")
+    right.set_ylim(0)
+    right.set_title("action error [standard deviations]", loc="left")
+    for axes in (left, right):
+        axes.set_xlabel("step")
+        axes.legend(frameon=False)
+    return figure
+
+
+@mpl.rc_context(_STYLE)
 def success_over_steps(rows: Rows) -> Figure:
     """Plot the success of each task during training."""
     names = sorted({name for row in rows for name in row if name.startswith("success/")})

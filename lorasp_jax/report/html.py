@@ -12,12 +12,14 @@ from matplotlib.figure import Figure
 
 from lorasp_jax.base.files import join_inside, read_bytes
 from lorasp_jax.base.writing import write_text
+from lorasp_jax.evaluation.held_out import COLUMNS
 from lorasp_jax.report import figures
 from lorasp_jax.training import records
 from lorasp_jax.training.run_folder import (
     CONFIG_FILE,
     STOPPED,
     TIMES_FILE,
+    VALIDATION,
     read_json,
     read_metrics,
 )
@@ -71,6 +73,7 @@ def write_report(folder: Path) -> Path:
         *_success(results),
         "<h2>Training</h2>",
         *_training(rows),
+        *_held_out(folder, rows),
         *_active_rank(results, rows, config["peft"].get("rank")),
         *_media(folder, [t for t in results["tasks"] if finished or _video(folder, t).exists()]),
         "<h2>Time</h2>",
@@ -133,6 +136,40 @@ def _training(rows: figures.Rows) -> Iterable[str]:
         yield _image(figures.success_over_steps(rows))
     if summary := speed(rows):
         yield _table(("run statistics", ""), summary.items())
+
+
+def _held_out(folder: Path, rows: figures.Rows) -> Iterable[str]:
+    """Show errors on held-out episodes, if there are any."""
+    measured = [row for row in rows if "validation/action_error" in row]
+    if not measured:
+        return
+    yield "<h2>Held-out episodes</h2>"
+    yield _image(figures.held_out(rows))
+    yield f"<p>{held_out_verdict(measured)}</p>"
+    if found := read_json(folder / VALIDATION, records.VALIDATION):
+        header = (f"mean error at step {found['kept']}", *COLUMNS)
+        errors = found["errors"].items()
+        yield _table(header, ((k, *(f"{x:.2f}" for x in v)) for k, v in errors))
+    for picture in sorted(folder.glob("held_out_*.png")):
+        data = base64.b64encode(read_bytes(picture, folder)).decode()
+        yield f'<img alt="recorded and predicted joints" src="data:image/png;base64,{data}">'
+
+
+def held_out_verdict(rows: figures.Rows) -> str:
+    """Say at which step the held-out error was least, and whether training then only overfits.
+
+    A rise by 5 % from the least error to the last counts as overfitting.
+    """
+    name = "validation/action_error"
+    best, last = min(rows, key=lambda row: row[name]), rows[-1]
+    floors = [last[f"validation/{floor}/action_error"] for floor in ("hold_still", "repeat")]
+    text = f"The action error was least at step {best['step']:.0f}: {best[name]:.3f}"
+    if best[name] > min(floors):
+        return f"{text}, more than that of a policy that does nothing ({min(floors):.3f})."
+    if last[name] > 1.05 * best[name]:
+        rise = 100 * (last[name] / best[name] - 1)
+        return f"{text}; it then rose by {rise:.0f} %, so that further steps only overfit."
+    return f"{text}."
 
 
 def _subtitle(config: dict[str, Any], results: dict[str, Any]) -> str:

@@ -1,6 +1,7 @@
 """Open the dataset of a run, convert it to a cache once, and group its episodes by task."""
 
 import dataclasses
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from envs.datasets.episodes import Episodes, concatenate
 from envs.names import names
 from lorasp_jax.config import Config
 from lorasp_jax.data import cache
+from lorasp_jax.data.batches import Steps
 from lorasp_jax.data.cache import Cache
 from lorasp_jax.data.lerobot import Keys
 from lorasp_jax.data.opening import open_source
@@ -67,12 +69,15 @@ def as_cache(source: Source, folder: Path, progress: Progress) -> Cache:
     return Cache(folder / CACHE)
 
 
-def outline(dataset: Cache) -> dict[str, Episodes]:
-    """Return the episodes of each task; one image per camera stands in for all others."""
-    episodes = [dataset.episode(index, ()) for index in range(len(dataset))]
+def outline(dataset: Cache, held_out: Collection[int] = ()) -> dict[str, Episodes]:
+    """Return the episodes of each task; one image per camera stands in for all others.
+
+    Those that are held out are left out.
+    """
+    episodes = {n: dataset.episode(n, ()) for n in range(len(dataset)) if n not in held_out}
     groups: dict[str, Episodes] = {}
     for task in dataset.metadata["tasks"]:
-        indices = [index for index, episode in enumerate(episodes) if episode.task == task]
+        indices = [index for index, episode in episodes.items() if episode.task == task]
         group = concatenate([episodes[index] for index in indices])
         image = {
             name: np.broadcast_to(x[0, 0], (*group.state.shape[:2], *x.shape[2:]))
@@ -80,6 +85,15 @@ def outline(dataset: Cache) -> dict[str, Episodes]:
         }
         groups[task] = dataclasses.replace(group, image=image)
     return groups
+
+
+def without(steps: Steps, held_out: Collection[int]) -> Steps:
+    """Return steps whose windows start in none of the episodes that are held out."""
+    if not held_out:
+        return steps
+    episode = np.unique(steps.end, return_inverse=True)[1]
+    starts = np.flatnonzero(~np.isin(episode, [*held_out])).astype(np.int32)
+    return dataclasses.replace(steps, starts=starts)
 
 
 def is_simulated(dataset: Cache) -> bool:

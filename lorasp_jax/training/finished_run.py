@@ -49,8 +49,10 @@ def _from_json(recorded: Mapping[str, Any], tasks: tuple[str, ...]) -> Config:
     """Undo `run_folder.to_json`."""
     fields = {name: value for name, value in recorded.items() if name not in ("scene", "digest")}
     data = dict(fields["data"])
-    absent = {"preset": "none" if data["source"] else "auto"}
-    fields["data"] = data | {"augment": AugmentConfig(**data.get("augment", absent))}
+    augment, validation = ("none", "0") if data["source"] else ("auto", "auto")
+    data["augment"] = AugmentConfig(**data.get("augment", {"preset": augment}))
+    data["validation"] = tuple(data.get("validation", [validation]))
+    fields["data"] = data
     for name, group in _GROUPS.items():
         fields[name] = group(**fields[name])
     settings = fields["peft"]

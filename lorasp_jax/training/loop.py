@@ -112,7 +112,8 @@ def _call_on_log(
 ) -> dict[str, float]:
     """Return `values` with the scalars that callbacks add; a callback may evaluate the policy."""
     local_policy = _local_policy(run, f"evaluated at step {done}")
-    with local_policy if run.config.evaluates(done) else contextlib.nullcontext():
+    needed = run.config.evaluates(done) or (run.held_out and run.config.validates(done))
+    with local_policy if needed else contextlib.nullcontext():
         for callback in callbacks:
             values = values | (callback.on_log(run, done, values) or {})
     return values
@@ -120,10 +121,14 @@ def _call_on_log(
 
 @contextlib.contextmanager
 def _local_policy(run: Run, name: str) -> Iterator[None]:
-    """Keep the run's policy on a local device in this block, then wait for all processes."""
-    sharded, run.policy = run.policy, processes.to_local(run.policy)
+    """Keep the run's policy on a local device in this block, then wait for all processes.
+
+    A policy that a callback puts in its place stays.
+    """
+    sharded, local = run.policy, processes.to_local(run.policy)
+    run.policy = local
     yield
-    run.policy = sharded
+    run.policy = sharded if run.policy is local else run.policy
     processes.barrier(name)
 
 

@@ -21,6 +21,8 @@ RESULTS: Schema = {
 }
 ROW: Schema = {"step": float, str: float}
 DATASET: Schema = {"facts": {}, "streams": bool}
+BEST: Schema = {"step": int, "error": float, "weights": str}
+VALIDATION: Schema = {"episodes": [int], "kept": int, "errors": {str: [float]}, "horizon": [float]}
 STOPPED: Schema = {"reason": str}
 CONFIG: Schema = {
     "name": str,

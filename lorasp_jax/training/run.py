@@ -26,6 +26,7 @@ class Run:
     Attributes:
         episodes: demonstrations per task; those of a dataset repeat one image per camera.
         dataset: all steps of a dataset, stored on disk; None: train on `episodes`.
+        held_out: numbers of the dataset's episodes that are not trained on.
         streams: whether batches are read from disk because the dataset does not fit on the device.
         devices: devices to train on; None: all.
         simulated: whether the tasks can be evaluated in simulation.
@@ -43,6 +44,7 @@ class Run:
     started: float = field(default_factory=time.perf_counter)
     episodes: dict[str, Episodes] = field(default_factory=dict)
     dataset: Steps | None = None
+    held_out: Sequence[int] = ()
     streams: bool = False
     devices: Sequence[Any] | None = None
     simulated: bool = True

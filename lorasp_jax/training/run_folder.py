@@ -34,6 +34,8 @@ CONFIG_FILE, TIMES_FILE, DATASET_FILE = "config.json", "seconds.json", "dataset.
 """Files that a run may leave behind if it fails before producing any results."""
 WILDCARDS = frozenset("*?[\\")
 """Not allowed in a run's path: Orbax treats paths as glob patterns and would find no checkpoint."""
+VALIDATION = "validation.json"
+"""File with the final measurements on held-out episodes."""
 STOPPED = "stopped.json"
 """File with the reason why training stopped; removed when training continues."""
 
@@ -57,6 +59,8 @@ def to_json(config: Config) -> dict[str, Any]:
         del data["augment"]  # as in runs from before there was augmentation
     else:
         data["augment"] = {"preset": augment.preset, **augment.given}
+    if config.data.validation == ("0",) or not config.data.source:  # likewise
+        del data["validation"], fields["keep"], fields["evaluation"]["validate_every"]
     scene = fields.pop("scene")
     if changed := config.scene.changed():
         fields["scene"] = {name: scene[name] for name in changed}

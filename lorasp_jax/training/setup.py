@@ -24,6 +24,7 @@ from lorasp_jax.base.bars import bars
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Batch, encode, flatten, sample_batch, windows
 from lorasp_jax.data.source import Source
+from lorasp_jax.data.split import held_out
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.models import presets
 from lorasp_jax.models.backbone import Backbone
@@ -34,7 +35,7 @@ from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Tokenizer, load_tokenizer
 from lorasp_jax.training.base import base_model, quantized, with_config
 from lorasp_jax.training.cost import preflight
-from lorasp_jax.training.dataset import as_cache, is_simulated, open_dataset, outline
+from lorasp_jax.training.dataset import as_cache, is_simulated, open_dataset, outline, without
 from lorasp_jax.training.demonstrations import Demonstrations, Progress, demonstrations, in_thread
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.distributed import processes
@@ -313,8 +314,13 @@ def _load_dataset(run: Run, source: Source, free_bytes: float) -> None:
             cache.verify_images()
         progress.update(bar, completed=cache.num_steps, total=cache.num_steps)
     metadata = cache.metadata
-    run.dataset, run.episodes, run.simulated = cache.steps, outline(cache), is_simulated(cache)
+    run.simulated = is_simulated(cache)
+    tasks = [cache.episode(number, ()).task for number in range(len(cache))]
+    run.held_out = held_out(run.config.data.validation, tasks, recorded=not run.simulated)
+    run.dataset, run.episodes = without(cache.steps, run.held_out), outline(cache, run.held_out)
     identity = {name: metadata[name] for name in ("crc32", "instructions")}
+    if run.held_out:
+        identity["held_out"] = run.held_out
     streams = sum(x.nbytes for x in jax.tree.leaves(run.dataset)) > free_bytes
     run.streams = record_dataset(run.folder, identity, streams=streams)
     run.config = dataclasses.replace(
@@ -322,6 +328,11 @@ def _load_dataset(run: Run, source: Source, free_bytes: float) -> None:
     )
     location = "streamed from disk" if run.streams else "held on the device"
     run.console.print(f"{cache.num_steps} steps in {len(cache)} episodes, {location}")
+    if run.held_out:
+        names = ", ".join(map(str, run.held_out))
+        run.console.print(f"held out of training: {len(run.held_out)} episodes ({names})")
+    if recipe := run.augmentation:
+        run.console.print(f"images change while training, by the recipe of {recipe.preset}")
 
 
 def _collect(run: Run, instructions: Sequence[str], collect: Collect) -> Demonstrations:

@@ -104,17 +104,15 @@ def test_default_recipe():
 
 
 @pytest.mark.parametrize(
-    ("settings", "words"),
+    ("settings", "named"),
     [
-        ({"preset": "openpi", "sharpness": 0.5}, ("sharpness", "openpi", "crop")),
-        ({"preset": "none", "crop": 0.9}, ("crop", "none")),
-        ({"crop": 1.5}, ("crop", "1.5")),
-        ({"hue": -0.1}, ("hue", "-0.1")),
-        ({"preset": "fast"}, ("preset", "openpi", "lerobot")),
+        ({"preset": "openpi", "sharpness": 0.5}, "sharpness.*openpi.*crop"),
+        ({"preset": "none", "crop": 0.9}, "crop.*none"),
+        ({"crop": 1.5}, r"crop.*1\.5"),
+        ({"hue": -0.1}, r"hue.*-0\.1"),
+        ({"preset": "fast"}, "preset.*openpi.*lerobot"),
     ],
 )
-def test_impossible_settings(settings, words):
-    with pytest.raises(ValueError) as caught:
+def test_impossible_settings(settings, named):
+    with pytest.raises(ValueError, match=named):
         AugmentConfig(**settings)
-    for word in words:
-        assert word in str(caught.value)

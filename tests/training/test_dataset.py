@@ -24,7 +24,7 @@ from tests.models.random_models import random_backbone
 from tests.runs import CONFIG, Miniature, make_run, random_episodes
 
 
-def prepare(folder, monkeypatch, source, available=2**40, model_config=None):
+def prepare(folder, monkeypatch, source, available=2**40, model_config=None, config=None):
     model = random_backbone(model_config or Pi0Config.dummy())
     monkeypatch.setattr(preflight, "available_bytes", lambda: available)
     remat = "none", preflight.Memory(*6 * [0.0])
@@ -34,7 +34,8 @@ def prepare(folder, monkeypatch, source, available=2**40, model_config=None):
         DataConfig(source=str(source)),
         {"peft": LoRA(rank=4), "targets": ("action_out",)},
     )
-    config = dataclasses.replace(CONFIG, data=data, evaluation=evaluation, **method)
+    config = config or dataclasses.replace(CONFIG, data=data, evaluation=evaluation)
+    config = dataclasses.replace(config, **method)
     console = Console(file=io.StringIO(), width=200)
     monkeypatch.setattr(setup, "base_model", lambda *_, **__: (model, ""))
     return setup.prepare(config, folder, console, time.perf_counter())

@@ -1,0 +1,76 @@
+"""Hold episodes of a dataset out of training."""
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+SHARE, MINIMUM = 0.1, 10
+"""Share of a user's recordings that is held out by default, if they have this many episodes."""
+_EPISODE = re.compile(r"episode_(\d+)")
+
+
+def held_out(choice: Sequence[str], tasks: Sequence[str], *, recorded: bool) -> list[int]:
+    """Return the numbers of the episodes to hold out, in ascending order.
+
+    A share or a number of episodes is spread over the tasks, and within a task over the time in
+    which its episodes were recorded; every task keeps an episode to learn from.
+
+    Args:
+        choice: `DataConfig.validation`.
+        tasks: the task of each episode.
+        recorded: whether the episodes were recorded rather than simulated, see "auto".
+
+    Raises:
+        ValueError: the choice is none of what `DataConfig.validation` describes, names an episode
+            that does not exist, or leaves none to learn from.
+    """
+    if [*choice] == ["auto"]:
+        choice = [str(SHARE if recorded and len(tasks) >= MINIMUM else 0)]
+    if named := [_EPISODE.fullmatch(name) for name in choice if not _is_number(name)]:
+        return _named(choice, named, tasks)
+    if len(choice) != 1:
+        raise ValueError(f"data.validation must be one number or episodes' names, got {choice}")
+    number = float(choice[0])
+    count = round(number if number >= 1 else max(number * len(tasks), number > 0))
+    if number < 0 or (number % 1 and number > 1) or count >= len(tasks):
+        raise ValueError(
+            f"data.validation must be a share below 1 or a number of episodes below {len(tasks)}, "
+            f"which is how many there are, got {choice[0]}"
+        )
+    return _spread(count, tasks)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return np.isfinite(float(text))
+    except ValueError:
+        return False
+
+
+def _named(
+    choice: Sequence[str], found: Sequence[re.Match[str] | None], tasks: Sequence[str]
+) -> list[int]:
+    """Return the numbers in names such as episode_000012, as LeRobot names its files."""
+    numbers = sorted({int(match[1]) for match in found if match})
+    valid = f"episode_0 to episode_{len(tasks) - 1}"
+    if None in found or len(found) < len(choice) or numbers[-1] >= len(tasks):
+        raise ValueError(
+            f"data.validation must be a share, a number of episodes, or names from {valid}, got "
+            f"{' '.join(choice)}"
+        )
+    if left := set(tasks) - {t for number, t in enumerate(tasks) if number not in numbers}:
+        raise ValueError(f"data.validation leaves no episode of {sorted(left)[0]!r} to learn from")
+    return numbers
+
+
+def _spread(count: int, tasks: Sequence[str]) -> list[int]:
+    """Choose `count` episodes, evenly over tasks and over the episodes of each."""
+    chosen: list[int] = []
+    before = 0
+    for task in dict.fromkeys(tasks):
+        episodes = [number for number, name in enumerate(tasks) if name == task]
+        first, before = round(count * before / len(tasks)), before + len(episodes)
+        share = min(round(count * before / len(tasks)) - first, len(episodes) - 1)
+        chosen += [episodes[int((i + 0.5) * len(episodes) / share)] for i in range(share)]
+    return sorted(chosen)

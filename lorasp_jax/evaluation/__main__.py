@@ -1,0 +1,98 @@
+"""Measure a finished run on recorded episodes: `lorasp-jax evaluate --help`."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from lorasp_jax.base.errors import run_command
+from lorasp_jax.data.__main__ import add_keys, keys_of
+
+_DT_TOLERANCE = 0.01  # relative, as in training
+
+
+def main(arguments: Sequence[str], program: str = "lorasp-jax evaluate") -> int:
+    """Run the command and return its exit code: 0, or one of `lorasp_jax.base.errors`."""
+    options = parser(program).parse_args(arguments)
+    return run_command(lambda: evaluate(options, Console()), Console(stderr=True))
+
+
+def parser(program: str) -> argparse.ArgumentParser:
+    """Define the command's options."""
+    parser = argparse.ArgumentParser(
+        prog=program,
+        description="Compare the actions of a run's policy with recorded ones: errors by joint, "
+        "beside those of holding still and of repeating the previous action, and a picture per "
+        "task. Nothing is simulated.",
+    )
+    parser.add_argument("run", type=Path, help="folder of the run, such as runs/multitask")
+    text = "LeRobot dataset (folder or hf://owner/name), RLDS dataset or cache"
+    parser.add_argument("--data", required=True, metavar="DATASET", help=text)
+    text = "numbers of the episodes (default: all)"
+    parser.add_argument("--episodes", nargs="+", type=int, metavar="N", help=text)
+    text = "flow-matching steps per chunk (default: %(default)s)"
+    parser.add_argument("--denoise-steps", type=int, default=10, metavar="N", help=text)
+    text = "folder for the pictures (default: a folder of the run, named after the dataset)"
+    parser.add_argument("--out", type=Path, help=text)
+    add_keys(parser)
+    return parser
+
+
+def evaluate(options: argparse.Namespace, console: Console) -> None:
+    """Print the errors of a run on a dataset, and draw an episode of each task.
+
+    Raises:
+        ValueError: there is no such run, dataset or episode, or they do not fit together.
+    """
+    from lorasp_jax.base import compilation_cache as cache
+    from lorasp_jax.data.opening import open_source
+    from lorasp_jax.evaluation import held_out, held_out_figure
+    from lorasp_jax.training import export
+
+    cache.enable()
+    source = open_source(options.data, keys_of(options))
+    period = export.describe(options.run)["control_dt"]
+    if abs(source.control_dt / period - 1) > _DT_TOLERANCE:
+        raise ValueError(
+            f"{options.data} has a control period of {source.control_dt:.4g} s, but {options.run} "
+            f"was trained with {period:.4g} s: pass --every N to keep every N-th frame"
+        )
+    numbers = options.episodes or [*range(len(source))]
+    if wrong := [number for number in numbers if not 0 <= number < len(source)]:
+        raise ValueError(f"--episodes must be 0 to {len(source) - 1}, got {wrong[0]}")
+    policy = export.load_policy(options.run)
+    found = held_out.measure(
+        policy, held_out.windows(source, numbers, policy), num_steps=options.denoise_steps
+    )
+    console.print(_table(found))
+    errors = (found.policy.mean, found.hold.mean, found.repeat.mean)
+    console.print(
+        "action error {:.3f}, holding still {:.3f}, repeating the previous action {:.3f} (standard "
+        "deviations of the recorded actions)".format(*errors),
+        soft_wrap=True,
+        highlight=False,
+    )
+    folder = options.out or options.run / f"evaluate_{Path(options.data).name}"
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in held_out_figure.write(folder, policy, source, numbers):
+        console.print(f"picture: {path}", soft_wrap=True, highlight=False, markup=False)
+
+
+def _table(found: "held_out.HeldOut") -> Table:  # noqa: F821
+    from lorasp_jax.evaluation import held_out
+
+    table = Table(box=None, padding=(0, 2, 0, 0))
+    table.add_column("mean error")
+    for title in held_out.COLUMNS:
+        table.add_column(title, justify="right")
+    for name, values in held_out.table(found).items():
+        table.add_row(escape(name), *(f"{value:.2f}" for value in values))
+    return table
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

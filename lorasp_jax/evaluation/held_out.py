@@ -1,0 +1,215 @@
+"""Measure a policy on recorded episodes that it was not trained on, without a simulator."""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lorasp_jax.data.batches import RawBatch, encode, flatten, gather
+from lorasp_jax.data.source import Source
+from lorasp_jax.policies.policy import Policy
+
+MAX_WINDOWS = 256
+"""Largest number of windows that are measured, over all tasks."""
+_BATCH = 16  # windows per call
+_NOISES = 4  # draws of noise and flow time per window, for the loss
+
+
+@dataclass(frozen=True)
+class Windows:
+    """N windows of recorded episodes: what the robot saw, did before, and did next.
+
+    Attributes:
+        raw: the windows, in host memory.
+        previous: f32 `[N, J+1]`, the action before each window, or at the start of an episode its
+            state [rad, m].
+        task: the task of each window.
+        episode, step: int `[N]`, where each window starts.
+        control_dt: time between two actions [s].
+    """
+
+    raw: RawBatch
+    previous: np.ndarray
+    task: tuple[str, ...]
+    episode: np.ndarray
+    step: np.ndarray
+    control_dt: float
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Mean distance between some actions and the recorded ones.
+
+    Attributes:
+        action: over the chunk, by dimension, `[J+1]` [rad, m].
+        first: of the first action, by dimension, `[J+1]` [rad, m].
+        horizon: by step of the chunk, `[C]`, in standard deviations of the recorded actions.
+        mean: over the chunk and all dimensions, in standard deviations of the recorded actions.
+    """
+
+    action: np.ndarray
+    first: np.ndarray
+    horizon: np.ndarray
+    mean: float
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """A policy on held-out windows.
+
+    Attributes:
+        loss: flow-matching loss at fixed noise and times.
+        policy: errors of the sampled chunks.
+        hold, repeat: errors of holding still and of repeating the previous action.
+        actions: f32 `[N, C, J+1]`, the sampled chunks [rad, m].
+    """
+
+    loss: float
+    policy: Errors
+    hold: Errors
+    repeat: Errors
+    actions: np.ndarray
+
+    @property
+    def scalars(self) -> dict[str, float]:
+        """What is logged: joints in degrees, the gripper in mm."""
+        errors = {"": self.policy, "hold_still/": self.hold, "repeat/": self.repeat}
+        values = {"validation/loss": self.loss}
+        for name, error in errors.items():
+            degrees, millimetres = in_degrees(error.action)
+            values |= {
+                f"validation/{name}action_error": error.mean,
+                f"validation/{name}joints_deg": float(degrees.mean()),
+                f"validation/{name}gripper_mm": millimetres,
+            }
+        degrees, _ = in_degrees(self.policy.action)
+        return values | {f"validation/joint_{i}_deg": float(x) for i, x in enumerate(degrees, 1)}
+
+
+def in_degrees(action: np.ndarray) -> tuple[np.ndarray, float]:
+    """Convert J joints [rad] and a gripper [m] to degrees and mm."""
+    return np.rad2deg(action[:-1]), float(1000 * action[-1])
+
+
+def windows(
+    source: Source, episodes: Sequence[int], policy: Policy, *, every: int | None = None
+) -> Windows:
+    """Choose windows of some episodes: evenly spaced, equally many per episode.
+
+    Args:
+        source: the dataset.
+        episodes: their numbers; if there are more than `MAX_WINDOWS`, only some are used.
+        policy: gives the length of the chunk and the prompts.
+        every: take the windows this many steps apart instead.
+
+    Raises:
+        ValueError: the policy has no prompt for an instruction, or an episode is damaged.
+    """
+    chunk, chosen = policy.model.config.chunk, _evenly([*episodes], MAX_WINDOWS)
+    share = MAX_WINDOWS // len(chosen)
+    parts, previous, where = [], [], []
+    for number in chosen:
+        episode = source.episode(number)
+        steps = flatten([episode])
+        rows = policy.processor.prompts.rows(episode.instructions)
+        steps = dataclasses.replace(steps, instruction=rows[steps.instruction])
+        all_starts = [*range(0, len(steps.end), every or 1)]
+        starts = np.array(_evenly(all_starts, MAX_WINDOWS if every else share), np.int32)
+        parts.append(gather(steps, starts, chunk))
+        before = np.where(starts[:, None] > 0, steps.action[starts - 1], steps.state[starts])
+        previous.append(before.astype(np.float32))
+        where += [(episode.task, number, int(start)) for start in starts]
+    raw = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    task, number, start = zip(*where, strict=True)
+    numbers = np.array(number), np.array(start)
+    return Windows(raw, np.concatenate(previous), task, *numbers, source.control_dt)
+
+
+def _evenly(values: Sequence[int], count: int) -> list[int]:
+    """Return up to `count` of the values, evenly spaced, the first included."""
+    count = min(count, len(values))
+    return [values[i * len(values) // count] for i in range(count)]
+
+
+def measure(policy: Policy, found: Windows, *, num_steps: int = 10) -> HeldOut:
+    """Measure a policy on windows; the same policy and windows give the same values.
+
+    Args:
+        policy: policy with its training model, not its sampler.
+        found: from `windows`.
+        num_steps: Euler steps of the flow-matching sampler.
+    """
+    sampling, key = policy.with_sampler(), jax.random.key(0)
+    count = len(found.task)
+    losses, valid, actions = 0.0, 0.0, []
+    for first in range(0, count, _BATCH):
+        rows = np.arange(first, first + _BATCH) % count  # the last batch begins again
+        raw = jax.tree.map(lambda x, rows=rows: x[rows], found.raw)
+        fresh = np.arange(first, first + _BATCH) < count
+        keys = jax.random.split(jax.random.fold_in(key, first), 2)
+        loss, number = _loss(policy, raw, fresh, keys[0])
+        losses, valid = losses + float(loss), valid + float(number)
+        actions.append(np.asarray(_actions(sampling, raw, keys[1], num_steps=num_steps))[fresh])
+    chunks = np.concatenate(actions)
+    hold, repeat = found.raw.state[:, None], found.previous[:, None]
+    return HeldOut(
+        losses / valid, *(_errors(x, found.raw) for x in (chunks, hold, repeat)), actions=chunks
+    )
+
+
+@jax.jit
+def _loss(
+    policy: Policy, raw: RawBatch, fresh: jax.Array, key: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Return the sum of the flow-matching loss over valid elements, and their number."""
+    batch = encode(key, raw, policy.processor, state_noise=0.0)
+    mask = batch.action_mask & jnp.asarray(fresh)[:, None, None]
+
+    def one(key: jax.Array) -> jax.Array:
+        observed, actions = batch.observation, batch.actions
+        loss, _ = policy.model.loss(key, observed, actions, action_mask=batch.action_mask)
+        return jnp.sum(loss * mask)
+
+    return jax.lax.map(one, jax.random.split(key, _NOISES)).sum(), _NOISES * mask.sum()
+
+
+@functools.partial(jax.jit, static_argnames="num_steps")
+def _actions(policy: Policy, raw: RawBatch, key: jax.Array, *, num_steps: int) -> jax.Array:
+    observed: Any = {"image": raw.image, "state": raw.state}
+    observed = jax.tree.map(jnp.asarray, observed)
+    return policy.sample(key, observed, jnp.asarray(raw.instruction), num_steps=num_steps)
+
+
+def _errors(actions: np.ndarray, raw: RawBatch) -> Errors:
+    """Compare actions `[N, C, J+1]` (or broadcast to it) with the recorded ones."""
+    inside = np.asarray(raw.inside)[..., None]
+    recorded = np.asarray(raw.actions, np.float64)
+    distance = np.abs(actions - recorded) * inside
+    rows = recorded[np.asarray(raw.inside)]
+    spread = rows.std(0)
+    moving = spread > 1e-6  # a joint that never moved has no scale
+    by_step = distance.sum(0) / np.maximum(inside.sum(0), 1)
+    relative = by_step[:, moving] / spread[moving]
+    action = distance.sum((0, 1)) / inside.sum()
+    mean = float((action[moving] / spread[moving]).mean()) if moving.any() else 0.0
+    return Errors(action, distance[:, 0].mean(0), relative.mean(-1), mean)
+
+
+COLUMNS = ("first action", "chunk", "hold still", "repeat previous")
+"""Columns of `table`: errors of the policy's first action and chunk, and of two that do nothing."""
+
+
+def table(found: HeldOut) -> dict[str, list[float]]:
+    """Return the errors by joint [degrees] and of the gripper [mm], in `COLUMNS`."""
+    errors = (found.policy.first, found.policy.action, found.hold.action, found.repeat.action)
+    joints, gripper = zip(*map(in_degrees, errors), strict=True)
+    rows = {
+        f"joint {i} [°]": [float(x) for x in row]
+        for i, row in enumerate(zip(*joints, strict=True), 1)
+    }
+    return {**rows, "gripper [mm]": [*gripper]}

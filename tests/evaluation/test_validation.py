@@ -1,0 +1,189 @@
+"""Held-out episodes: never trained on, measured repeatably, and the best adapters are kept."""
+
+import dataclasses
+import re
+
+import jax
+import numpy as np
+import pytest
+
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.config import DataConfig
+from lorasp_jax.data.batches import RawBatch, draw
+from lorasp_jax.data.lerobot import LeRobot
+from lorasp_jax.evaluation import held_out, validation
+from lorasp_jax.evaluation.__main__ import main
+from lorasp_jax.evaluation.held_out import measure, windows
+from lorasp_jax.evaluation.validation import Validation
+from lorasp_jax.report.html import held_out_verdict, write_report
+from lorasp_jax.training import export, run_folder
+from lorasp_jax.training.loop import train
+from lorasp_jax.training.run import Callback
+from lorasp_jax.training.run_folder import read_json, read_metrics, to_json, write_json
+from tests.data.lerobots import golden
+from tests.runs import CONFIG, Terminate, leaves
+from tests.training.test_dataset import prepare
+
+OUT = (1, 2)
+DATA = DataConfig(source=str(golden("v3")), validation=("episode_1", "episode_2"))
+CONFIG = dataclasses.replace(
+    CONFIG,
+    data=DATA,
+    model=dataclasses.replace(CONFIG.model, max_tokens=16),
+    evaluation=dataclasses.replace(CONFIG.evaluation, validate_every=2, execute_steps=1),
+)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A run on two of the four golden episodes, with the dummy backbone."""
+    folder = tmp_path_factory.mktemp("recorded")
+    with pytest.MonkeyPatch.context() as patch:
+        run = prepare(folder, patch, DATA.source, config=CONFIG)
+    write_json(folder / "config.json", to_json(run.config))
+    return run
+
+
+def test_held_out_episodes_are_not_trained_on(recorded):
+    source = LeRobot(golden("v3"))
+    learned = [source.episode(n, ()) for n in range(4) if n not in OUT]
+    actions = np.concatenate([episode.action[0] for episode in learned])
+    slots = np.array(recorded.policy.processor.robot_slots)
+    known = recorded.policy.processor.statistics.action["mean"][slots]
+    np.testing.assert_allclose(known, actions.mean(0), atol=1e-6)
+    drawn = draw(jax.random.key(0), jax.device_put(recorded.steps), batch_size=512, chunk=1)
+    states = {row.tobytes() for episode in learned for row in np.asarray(episode.state[0])}
+    seen = {row.tobytes() for row in np.asarray(drawn.state)}
+    assert seen <= states
+    assert len(seen) > 0.9 * len(states)
+
+
+def test_errors_by_hand():
+    """Two windows of two actions, the last of which lies past the end of its episode."""
+    recorded = np.array([[[0.0, 0.0], [2.0, 0.1]], [[4.0, 0.2], [9.0, 9.0]]], np.float32)
+    inside = np.array([[True, True], [True, False]])
+    raw = RawBatch({}, np.zeros((2, 2)), recorded, inside, np.zeros(2, np.int32))
+    found = held_out._errors(np.array([[[1.0, 0.0], [2.0, 0.0]], [[4.0, 0.0], [0.0, 0.0]]]), raw)
+    np.testing.assert_allclose(found.action, [1 / 3, 0.1], rtol=1e-6)
+    np.testing.assert_allclose(found.first, [0.5, 0.1], rtol=1e-6)
+    spread = np.std([0, 2, 4]), np.std([0, 0.1, 0.2])
+    expected = [(0.5 / spread[0] + 0.1 / spread[1]) / 2, (0.1 / spread[1]) / 2]
+    np.testing.assert_allclose(found.horizon, expected, rtol=1e-6)
+    assert found.mean == pytest.approx((1 / 3 / spread[0] + 0.1 / spread[1]) / 2)
+
+
+def test_windows(recorded):
+    """Evenly spaced; an episode's first window has its state as the previous action."""
+    source = LeRobot(golden("v3"))
+    found = windows(source, OUT, recorded.policy, every=10)
+    assert found.step.tolist() == [0, 10, 20, 30, 0, 10, 20, 30]
+    assert found.episode.tolist() == 4 * [1] + 4 * [2]
+    episode = source.episode(1, ())
+    np.testing.assert_array_equal(found.raw.state[1], episode.state[0, 10])
+    np.testing.assert_array_equal(found.previous[1], episode.action[0, 9])
+    np.testing.assert_array_equal(found.previous[0], episode.state[0, 0])
+    np.testing.assert_array_equal(found.raw.actions[1, 0], episode.action[0, 10])
+    assert len(windows(source, range(4), recorded.policy).task) == source.num_steps
+
+
+class Watcher(Callback):
+    """Keeps the adapters of every log step."""
+
+    def __init__(self):
+        self.seen = []
+
+    def on_log(self, run, step, metrics):
+        self.seen.append(leaves(_adapters(run)))
+
+
+def test_a_run_measures_keeps_the_best_and_resumes(recorded, tmp_path, monkeypatch):
+    """The error rises after step 2: its adapters are evaluated and exported, also on a resume."""
+    errors = iter([0.5, 0.9, 0.5, 0.9, 0.9, 0.9])
+    real = validation.measure
+
+    def fake(policy, found, **options):
+        result = real(policy, found, **options)
+        return dataclasses.replace(
+            result, policy=dataclasses.replace(result.policy, mean=next(errors))
+        )
+
+    monkeypatch.setattr(validation, "measure", fake)
+    kept = []
+    for name in ("whole", "halved"):
+        folder = tmp_path / name
+        (folder / "cache").mkdir(parents=True)
+        (folder / "cache" / "steps").symlink_to(recorded.folder / "cache" / "steps")
+        run = dataclasses.replace(recorded, folder=folder)
+        run.policy = recorded.policy
+        write_json(folder / "config.json", to_json(run.config))
+        if name == "whole":
+            watcher = Watcher()
+            train(run, [Validation(), watcher])
+            first = watcher.seen[0]
+        else:
+            watcher = Terminate()
+            with pytest.raises(KeyboardInterrupt):
+                train(run, [Validation(), watcher])
+            train(run, [Validation(), watcher], resume=True)
+        kept.append(leaves(_adapters(run)))
+        assert read_json(folder / "validation.json")["kept"] == 2
+        row = read_metrics(folder)[-1]
+        assert row["validation/action_error"] == 0.9
+        assert {"validation/loss", "validation/joint_6_deg", "validation/gripper_mm"} <= row.keys()
+        page = write_report(folder).read_text()
+        assert "Held-out episodes" in page
+        assert page.count('alt="recorded and predicted joints"') == 1
+    for name, value in first.items():
+        np.testing.assert_array_equal(kept[0][name], value)
+        np.testing.assert_array_equal(kept[1][name], value)
+
+
+def _adapters(run):
+    return adaptation.split(run.policy.model)[1]
+
+
+def test_the_same_policy_gives_the_same_values(recorded):
+    found = windows(LeRobot(golden("v3")), OUT, recorded.policy, every=10)
+    first, again = (measure(recorded.policy, found, num_steps=2) for _ in range(2))
+    assert first.scalars == again.scalars
+    assert first.actions.shape == (8, recorded.policy.model.config.chunk, 7)
+
+
+@pytest.mark.parametrize(
+    ("errors", "named"),
+    [
+        ((0.9, 0.5, 0.4), "step 3"),
+        ((0.9, 0.5, 0.8), "step 2.*overfit"),
+        ((2.0, 1.5, 1.2), "step 3.*nothing"),
+    ],
+)
+def test_verdict(errors, named):
+    floors = {f"validation/{name}/action_error": 1.0 for name in ("hold_still", "repeat")}
+    rows = [{"step": n, "validation/action_error": x, **floors} for n, x in enumerate(errors, 1)]
+    assert re.search(named, held_out_verdict(rows))
+
+
+def test_runs_without_held_out_episodes_have_the_settings_of_before():
+    plain = dataclasses.replace(CONFIG, data=DataConfig())
+    assert not {"keep", "validation"} & (to_json(plain).keys() | to_json(plain)["data"].keys())
+    assert run_folder.changed_settings(
+        to_json(dataclasses.replace(CONFIG, data=DataConfig(source="x", validation=("0",)))),
+        to_json(dataclasses.replace(CONFIG, data=DataConfig(source="x"))),
+    )
+    with pytest.raises(ValueError, match=r"data\.source"):
+        DataConfig(validation=("0.1",))
+
+
+def test_evaluate_on_another_dataset(recorded, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(export, "load_policy", lambda _: recorded.policy)
+    monkeypatch.setattr(export, "describe", lambda _: {"control_dt": 0.1})
+    run = str(recorded.folder)
+    arguments = [run, "--data", str(golden("v21")), "--out", str(tmp_path / "out")]
+    assert main([*arguments, "--episodes", "0", "3", "--denoise-steps", "2"]) == 0
+    assert "hold still" in capsys.readouterr().out
+    assert len(list((tmp_path / "out").glob("*.png"))) == 1
+    assert main([*arguments, "--episodes", "4"]) == 2
+    assert "0 to 3" in capsys.readouterr().err
+    monkeypatch.setattr(export, "describe", lambda _: {"control_dt": 0.2})
+    assert main(arguments) == 2
+    assert "--every" in capsys.readouterr().err
