@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from lorasp_jax.config import AugmentConfig
-from lorasp_jax.models.observation import Observation
+from lorasp_jax.policies.policy import Observation
 from lorasp_jax.policies.processor import Processor
 
 WRIST = "wrist"
@@ -68,7 +68,8 @@ def _openpi(
     strengths = {name: numbers[name] for name in ("brightness", "contrast", "hue")}
     # With a saturation, augmax has a random key for each of the others, even if some are 0.
     jitter = augmax.ColorJitter(**strengths, saturation=1.0)
-    return augmax.Chain(*([] if wrist else moves), jitter)(key, image)
+    chain: Any = augmax.Chain(*([] if wrist else moves), jitter)
+    return chain(key, image)
 
 
 def _lerobot(numbers: Mapping[str, float], key: jax.Array, image: jax.Array) -> jax.Array:

@@ -4,6 +4,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.markup import escape
@@ -11,6 +12,9 @@ from rich.table import Table
 
 from lorasp_jax.base.errors import run_command
 from lorasp_jax.data.__main__ import add_keys, keys_of
+
+if TYPE_CHECKING:
+    from lorasp_jax.evaluation.held_out import HeldOut
 
 _DT_TOLERANCE = 0.01  # relative, as in training
 
@@ -78,11 +82,12 @@ def evaluate(options: argparse.Namespace, console: Console) -> None:
     )
     folder = options.out or options.run / f"evaluate_{Path(options.data).name}"
     folder.mkdir(parents=True, exist_ok=True)
-    for path in held_out_figure.write(folder, policy, source, numbers):
+    steps = {"num_steps": options.denoise_steps}
+    for path in held_out_figure.write(folder, policy, source, numbers, **steps):
         console.print(f"picture: {path}", soft_wrap=True, highlight=False, markup=False)
 
 
-def _table(found: "held_out.HeldOut") -> Table:  # noqa: F821
+def _table(found: "HeldOut") -> Table:
     from lorasp_jax.evaluation import held_out
 
     table = Table(box=None, padding=(0, 2, 0, 0))

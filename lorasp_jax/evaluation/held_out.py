@@ -156,7 +156,7 @@ def measure(policy: Policy, found: Windows, *, num_steps: int = 10) -> HeldOut:
         losses, valid = losses + float(loss), valid + float(number)
         actions.append(np.asarray(_actions(sampling, raw, keys[1], num_steps=num_steps))[fresh])
     chunks = np.concatenate(actions)
-    hold, repeat = found.raw.state[:, None], found.previous[:, None]
+    hold, repeat = np.asarray(found.raw.state)[:, None], found.previous[:, None]
     return HeldOut(
         losses / valid, *(_errors(x, found.raw) for x in (chunks, hold, repeat)), actions=chunks
     )

@@ -25,7 +25,9 @@ def path(folder: Path, task: str) -> Path:
     return join_inside(folder, f"held_out_{task.replace('/', '_')}.png")
 
 
-def write(folder: Path, policy: Policy, source: Source, episodes: Sequence[int]) -> list[Path]:
+def write(
+    folder: Path, policy: Policy, source: Source, episodes: Sequence[int], *, num_steps: int = 10
+) -> list[Path]:
     """Draw the first of these episodes of each task; return the files."""
     first: dict[str, int] = {}
     for number in episodes:
@@ -34,7 +36,7 @@ def write(folder: Path, policy: Policy, source: Source, episodes: Sequence[int])
     for task, number in first.items():
         every = max(policy.model.config.chunk // 2, 1)
         found = windows(source, [number], policy, every=every)
-        figure = draw(found, measure(policy, found).actions)
+        figure = draw(found, measure(policy, found, num_steps=num_steps).actions)
         paths.append(path(folder, task))
         with atomic_file(paths[-1]) as unfinished:
             figure.savefig(unfinished, format="png", dpi=100)
