@@ -315,8 +315,13 @@ class Config:
     tasks: tuple[str, ...] = ("open_pot", "pour", "press", "pick_place")
     """Tasks trained jointly; default: the paper's four."""
     targets: tuple[str, ...] = (".*",)
-    """Layers to adapt: presets (paper, all-linear, openpi, expert-only, vision, language, action)
-    and regular expressions over layer paths."""
+    """Layers to adapt: presets (paper, all-linear, openpi, expert-only, vision, language, action,
+    projections) and regular expressions over layer paths."""
+    adapt: tuple[str, ...] = ()
+    """Methods by rule, the first match wins; replaces targets. A rule is TARGET=METHOD[:RANK], such
+    as language=lora:16, with one target and a method or none; or a recipe (paper, openpi-lora,
+    vlm-lora+expert-full, expert-only). Rules of the method in peft have its settings, others the
+    defaults."""
     image_size: int = 64
     """Height and width of simulated camera images [pixels]; the backbone resizes them."""
     scene: Randomization = field(default_factory=Randomization)
@@ -369,8 +374,6 @@ class Config:
         _at_least(1, self, "fsdp", "log_every", "checkpoint_every", "image_size")
         _require(self.control_dt > 0, "control_dt must be above 0", self.control_dt)
         _require(0 <= self.seed < 2**32, "seed must lie in [0, 2**32)", self.seed)
-        if self.model.base_dtype and self.peft.trains_base:
-            raise ValueError("model.base_dtype must be empty for full, which trains the base")
         self.scene.check(self.control_dt)
         every, rule = self.data.fresh_every, "data.fresh_every must be a multiple of log_every"
         _require(every % self.log_every == 0, rule, f"{every} and {self.log_every}")

@@ -25,6 +25,7 @@ from lorasp_jax.policies import tokenizer
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.training.run import Callback, Run
+from lorasp_jax.training.rules import rules
 from lorasp_jax.training.run_folder import MetricsLog, read_metrics, to_json, write_json
 from lorasp_jax.training.setup import processor
 from tests.models.random_models import random_backbone
@@ -125,9 +126,7 @@ def make_run(
     """Make a run; the default, the dummy backbone on one device, compiles four times faster."""
     folder.mkdir(exist_ok=True)
     model = model or random_backbone(Pi0Config.dummy())
-    model = adaptation.adapt(
-        model, [(path, config.peft) for path in config.targets], rngs=nnx.Rngs(1)
-    )
+    model = adaptation.adapt(model, rules(config), rngs=nnx.Rngs(1))
     run = Run(config, folder, Console(file=io.StringIO()), "hash of the base")
     run.devices = jax.devices()[:devices]
     run.episodes = {task: random_episodes(task, i) for i, task in enumerate(config.tasks)}

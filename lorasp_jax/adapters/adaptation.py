@@ -9,6 +9,7 @@ the paths of the layers themselves, so another rule can adapt them.
 """
 
 import math
+import re
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
@@ -138,18 +139,27 @@ def methods(model: nnx.Module) -> dict[str, Method]:
     return methods_by_path
 
 
-def merge(model: Model) -> Model:
+def merge(model: Model, pattern: str = ".*") -> Model:
     """Fold the adapters into the kernels; the result has no adapters and is entirely frozen.
+
+    With a `pattern`, only layers and trained parameters whose path it matches, as in `adapt`, are
+    merged; the others keep their adapters.
 
     An embedding's adapter affects only lookups and `attend`, but merging changes the table for all
     code that reads it. A quantized kernel with an adapter is dequantized.
 
     Raises:
-        ValueError: a method's delta depends on the input, or the model has shapes without values.
+        ValueError: a method's delta depends on the input, the model has shapes without values, or
+            the pattern matches nothing that is trained.
     """
+    paths.check_method_rules([(pattern, None)])
     root = _wrapped_copy(validate.with_values(model))
-    paths.replace(paths.locate(root, AdaptedLayer), _merged)
-    _convert_variables(paths.locate(root, AdapterParam), nnx.Param)
+    trained = [location.path for location in paths.locate(root, AdapterParam)]
+    if trained and not any(re.search(pattern, path) for path in trained):
+        raise ValueError(paths.no_match_message(pattern, trained, {}))
+    chosen = lambda kind: [x for x in paths.locate(root, kind) if re.search(pattern, x.path)]  # noqa: E731
+    paths.replace(chosen(AdaptedLayer), _merged)
+    _convert_variables([p for p in chosen(AdapterParam) if p.name != "adapter"], nnx.Param)
     return root[0]
 
 

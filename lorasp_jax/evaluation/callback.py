@@ -25,10 +25,9 @@ from lorasp_jax.training import early, records
 from lorasp_jax.training.demonstrations import map_threads
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Callback, Run
-from lorasp_jax.training.run_folder import read_json, write_json
+from lorasp_jax.training.rules import TOWERS, by_rule
+from lorasp_jax.training.run_folder import read_json, read_metrics, write_json
 from lorasp_jax.training.setup import RunSetup
-
-TOWERS = ("vision", "language", "action")
 
 
 class Evaluation(Callback):
@@ -192,7 +191,10 @@ def summarize(run: Run, after: dict[str, Result]) -> dict[str, Any]:
         values = [v for linears in layers.values() for v in linears.values()]
         modules["mean"] = float(np.mean(np.concatenate(values)))
     trainable, total = run.parameters
+    rows = read_metrics(run.folder)[-1:] if run.config.adapt else []
+    rules = {"rules": by_rule(run.config, run.policy.model, *rows)} if run.config.adapt else {}
     return {
+        **rules,
         "scale": run.config.scale,
         "seconds": run.seconds,
         "tasks": {

@@ -13,8 +13,10 @@ from matplotlib.figure import Figure
 from lorasp_jax.base.files import join_inside, read_bytes
 from lorasp_jax.base.writing import write_text
 from lorasp_jax.evaluation.held_out import COLUMNS
+from lorasp_jax.models import presets
 from lorasp_jax.report import figures
 from lorasp_jax.training import records
+from lorasp_jax.training.finished_run import recorded_method
 from lorasp_jax.training.run_folder import (
     CONFIG_FILE,
     STOPPED,
@@ -59,9 +61,7 @@ def write_report(folder: Path) -> Path:
         ValueError: the folder contains no run, or its files are damaged.
     """
     rows = read_metrics(folder)
-    config = read_json(
-        folder / CONFIG_FILE, records.WITH_RANK if _has_rank(rows) else records.CONFIG
-    )
+    config = read_json(folder / CONFIG_FILE, records.CONFIG)
     if not config:
         raise ValueError(f"no run in {folder}: {CONFIG_FILE} is missing")
     finished = read_json(folder / "results.json", records.RESULTS)
@@ -74,7 +74,8 @@ def write_report(folder: Path) -> Path:
         "<h2>Training</h2>",
         *_training(rows),
         *_held_out(folder, rows),
-        *_active_rank(results, rows, config["peft"].get("rank")),
+        *_rules(results),
+        *_active_rank(results, rows, folder, config),
         *_media(folder, [t for t in results["tasks"] if finished or _video(folder, t).exists()]),
         "<h2>Time</h2>",
         _table(
@@ -175,7 +176,8 @@ def held_out_verdict(rows: figures.Rows) -> str:
 def _subtitle(config: dict[str, Any], results: dict[str, Any]) -> str:
     """Describe the run on one line, with parameter counts if it is finished."""
     line = (
-        f"{config['peft']['method']} on {config['model']['backbone']} {config['model']['size']}, "
+        f"{' '.join(config.get('adapt', ())) or config['peft']['method']} on "
+        f"{config['model']['backbone']} {config['model']['size']}, "
         f"robot {config['robot']}"
     )
     if "total_parameters" in results:
@@ -232,10 +234,35 @@ def _has_rank(rows: figures.Rows) -> bool:
     return any(name.startswith("active_rank/") for row in rows for name in row)
 
 
-def _active_rank(results: dict[str, Any], rows: figures.Rows, rank: Any) -> Iterable[str]:
-    """Show active rank in training and in closed loop, if the method has one."""
+def _rules(results: dict[str, Any]) -> Iterable[str]:
+    """Show what each rule of `adapt` trains, if the run is finished."""
+    if "rules" not in results:
+        return
+    yield "<h2>Rules</h2>"
+    header = ("rule", "layers", "trainable parameters", "active rank in training")
+    yield _table(header, ((rule, *_rule_cells(row)) for rule, row in results["rules"].items()))
+
+
+def _rule_cells(row: dict[str, Any]) -> tuple[str, ...]:
+    rank = f"{row['active_rank']:.1f}" if "active_rank" in row else "-"
+    return f"{row['layers']:,}", f"{row['parameters']:,}", rank
+
+
+def _largest_rank(folder: Path, config: dict[str, Any]) -> int:
+    """Return the largest rank of the run's methods."""
+    if "adapt" not in config:
+        return read_json(folder / CONFIG_FILE, records.WITH_RANK)["peft"]["rank"]
+    named = presets.parse(config["adapt"], recorded_method(config["peft"]))
+    return max(getattr(method, "rank", 0) for _, method in named.values())
+
+
+def _active_rank(
+    results: dict[str, Any], rows: figures.Rows, folder: Path, config: dict[str, Any]
+) -> Iterable[str]:
+    """Show active rank in training and in closed loop, if a method has one."""
     if not _has_rank(rows):
         return
+    rank = _largest_rank(folder, config)
     yield "<h2>Active rank</h2>"
     yield _image(figures.active_rank(rows, rank))
     if not results["layer_active_rank"]:  # not evaluated

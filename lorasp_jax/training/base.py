@@ -1,6 +1,7 @@
 """The frozen base of a run: loaded from a checkpoint or randomly initialized."""
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,10 +11,11 @@ from flax import nnx
 
 import envs
 from lorasp_jax import models
-from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.compress import quantization
 from lorasp_jax.base import hub
 from lorasp_jax.config import Config
+from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models import backbone
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.checkpoints import loading
@@ -80,8 +82,16 @@ def with_config(model: Backbone, **changes: Any) -> Backbone:
 
 
 def quantized(model: Any, kind: quantization.Kind | Literal[""] | None) -> Any:
-    """Return the model with the layers of its three towers quantized, or unchanged if no `kind`."""
-    return quantization.quantize(model, [(_TOWERS, kind)]).model if kind else model
+    """Return the model with the layers of its three towers quantized, or unchanged if no `kind`.
+
+    Layers that are trained in full stay as they are.
+    """
+    if not kind:
+        return model
+    trained = paths.locate(nnx.List([model]), AdapterParam)
+    kept = [location.path.rpartition("/")[0] for location in trained if location.name == "kernel"]
+    rules = [(f"^{re.escape(path)}$", None) for path in kept]
+    return quantization.quantize(model, [*rules, (_TOWERS, kind)]).model
 
 
 def in_bf16(model: Any) -> Any:

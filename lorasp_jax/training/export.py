@@ -22,6 +22,7 @@ from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.statistics import Statistics
+from lorasp_jax.training import rules
 from lorasp_jax.training.base import TRAINING, quantized
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import read_json, write_json
@@ -41,9 +42,12 @@ class Export(Callback):
 
 
 def write(run: Run) -> None:
-    """Write adapter.safetensors and adapter.json, or the folder `base` after full fine-tuning."""
+    """Write adapter.safetensors and adapter.json, or the folder `base` after full fine-tuning.
+
+    Where some layers have adapters and others are trained in full, the former hold both.
+    """
     config, metadata = run.config, _metadata(run)
-    if config.peft.trains_base:
+    if rules.trains_base(config):
         _write_base(run.folder, run.policy, metadata)
         return
     metadata = {"base": hub.portable_path(config.model.source), **metadata}

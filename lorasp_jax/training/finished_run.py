@@ -55,9 +55,14 @@ def _from_json(recorded: Mapping[str, Any], tasks: tuple[str, ...]) -> Config:
     fields["data"] = data
     for name, group in _GROUPS.items():
         fields[name] = group(**fields[name])
-    settings = fields["peft"]
-    names = (name for name in peft.names() if peft.find(name).__name__ == settings["method"])
-    fields["peft"] = peft.from_settings({**settings, "method": next(names, "")})
+    fields["peft"] = recorded_method(fields["peft"])
     if scene := recorded_ranges(recorded):
         fields["scene"] = scene
-    return Config(**fields | {"tasks": tasks, "targets": tuple(fields["targets"])})
+    lists = {name: tuple(fields.get(name, ())) for name in ("targets", "adapt")}
+    return Config(**fields | {"tasks": tasks, **lists})
+
+
+def recorded_method(settings: Mapping[str, Any]) -> peft.Method:
+    """Return the method of a recorded config, which names its class."""
+    names = (name for name in peft.names() if peft.find(name).__name__ == settings["method"])
+    return peft.from_settings({**settings, "method": next(names, "")})

@@ -13,7 +13,7 @@ from envs.names import check
 from lorasp_jax import peft
 from lorasp_jax.config import SCALES, Config
 from lorasp_jax.peft import LoRASP
-from lorasp_jax.training import experiment_file
+from lorasp_jax.training import experiment_file, rules
 
 HELP = {"-h", "--help"}
 
@@ -69,6 +69,7 @@ def parse(arguments: Sequence[str], program: str = "python train.py") -> Command
     if known.resume and known.dry_run:
         raise ValueError("--resume and --dry-run cannot be combined")
     config = override(config, rest, program)
+    _check_rules(config, ["--method"] * bool(known.method) + rest)
     _check_simulated(config)
     return Command(config, known.resume, known.dry_run, known.wandb)
 
@@ -148,6 +149,22 @@ def override(config: Config, arguments: Sequence[str], program: str = "") -> Con
     )
     names = (field.name for field in dataclasses.fields(Config))
     return Config(**{name: getattr(parsed, name) for name in names})
+
+
+def _check_rules(config: Config, arguments: Sequence[str]) -> None:
+    """Raise ValueError for invalid rules or targets, and for options that `adapt` would ignore."""
+    rules.named_rules(config)
+    if not config.adapt:
+        return
+    if any(text.startswith("--targets") for text in arguments):
+        raise ValueError("--targets cannot be combined with --adapt, whose rules name layers")
+    used = {text.rpartition("=")[2].partition(":")[0] for text in config.adapt}
+    given = [text for text in arguments if text.startswith(("--method", "--peft."))]
+    if given and config.peft.name not in used:
+        raise ValueError(
+            f"{given[0]} sets {config.peft.name}, but no rule TARGET={config.peft.name} of --adapt "
+            "takes its settings: drop it"
+        )
 
 
 def _check_simulated(config: Config) -> None:

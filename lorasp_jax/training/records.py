@@ -18,6 +18,7 @@ RESULTS: Schema = {
     "active_rank_histogram": {str: [int]},
     "trainable_parameters": int,
     "total_parameters": int,
+    "rules?": {str: {"layers": int, "parameters": int, "active_rank?": float}},
 }
 ROW: Schema = {"step": float, str: float}
 DATASET: Schema = {"facts": {}, "streams": bool}
@@ -32,5 +33,6 @@ CONFIG: Schema = {
     "model": {"backbone": str, "size": str},
     "optim": {"steps": int},
     "scene?": {str: (float, float)},
+    "adapt?": [str],
 }
 WITH_RANK: Schema = CONFIG | {"peft": {"method": str, "rank": int}}

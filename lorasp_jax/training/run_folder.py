@@ -41,8 +41,8 @@ STOPPED = "stopped.json"
 
 
 _OPTIONAL = (("model", "base_dtype"), ("model", "chunk"), ("optim", "rtc_max_delay"))
-"""Settings that `to_json` omits at their defaults, which are 0 or empty: results files of studies
-do not have them."""
+"""Settings that `to_json` omits at their defaults, which are 0 or empty, as it omits `adapt`:
+results files of studies do not have them."""
 
 
 def to_json(config: Config) -> dict[str, Any]:
@@ -61,6 +61,8 @@ def to_json(config: Config) -> dict[str, Any]:
         data["augment"] = {"preset": augment.preset, **augment.given}
     if config.data.validation == ("0",) or not config.data.source:  # likewise
         del data["validation"], fields["keep"], fields["evaluation"]["validate_every"]
+    if not config.adapt:
+        del fields["adapt"]
     scene = fields.pop("scene")
     if changed := config.scene.changed():
         fields["scene"] = {name: scene[name] for name in changed}

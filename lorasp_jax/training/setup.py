@@ -1,6 +1,7 @@
 """Build a run from a config: base, adapters, demonstrations and processor."""
 
 import dataclasses
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -17,7 +18,7 @@ import envs
 from envs.datasets.episodes import Episodes
 from envs.env import Env
 from lorasp_jax import peft
-from lorasp_jax.adapters import adaptation, summary
+from lorasp_jax.adapters import adaptation, paths, summary
 from lorasp_jax.adapters.compress import calibration
 from lorasp_jax.base import hub
 from lorasp_jax.base.bars import bars
@@ -26,13 +27,13 @@ from lorasp_jax.data.batches import Batch, encode, flatten, sample_batch, window
 from lorasp_jax.data.source import Source
 from lorasp_jax.data.split import held_out
 from lorasp_jax.data.stream import Stream
-from lorasp_jax.models import presets
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor, Statistics, check_delta, robot_slots, to_delta
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Tokenizer, load_tokenizer
+from lorasp_jax.training import rules
 from lorasp_jax.training.base import base_model, quantized, with_config
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.dataset import as_cache, is_simulated, open_dataset, outline, without
@@ -115,7 +116,7 @@ def build(config: Config, folder: Path, *, abstract: bool = False) -> RunSetup:
     model = (
         preflight.abstract_model(config, base.config)
         if abstract
-        else _adapt(config, base, config.peft.as_saved)
+        else _adapt(config, base, rules.rules(config, as_saved=True))
     )
     return RunSetup(
         base, base_hash, model, prompts, joints, environments, source, memory, available
@@ -150,8 +151,8 @@ def prepare(
     _load_or_collect(run, built, collect, meanwhile)
     relative = config.model.relative_actions
     inputs = processor([*run.episodes.values()], model.config, built.prompts, relative=relative)
-    if config.peft.needs_statistics:
-        model = _adapt(config, base, config.peft, input_moments(run, base, inputs))
+    if any(method.needs_statistics for method in rules.methods(config)):
+        model = _adapt(config, base, rules.rules(config), input_moments(run, base, inputs))
     if built.source:
         cameras = [f"{name} -> {slot}" for slot, name in inputs.cameras if name]
         size = f"{inputs.image_size} x {inputs.image_size}"
@@ -177,11 +178,16 @@ def _load_or_collect(
 
 
 def headline(config: Config, model: Backbone) -> str:
-    """Summarize scale, method, backbone and trainable parameters on one line."""
-    return (
-        f"scale {config.scale}: {type(config.peft).__name__} on {config.model.backbone} "
+    """Summarize scale, method, backbone and trainable parameters; `adapt` adds a line per rule."""
+    parts = rules.by_rule(config, model).items() if config.adapt else ()
+    first = (
+        f"scale {config.scale}: {rules.describe(config)} on {config.model.backbone} "
         f"{config.model.size}, {summary.trained_share(model)}"
     )
+    counted = [
+        f"  {rule}: {n['layers']} layers, {n['parameters']:,} parameters" for rule, n in parts
+    ]
+    return "\n".join([first, *counted])
 
 
 def _prompts_and_joints(
@@ -226,7 +232,7 @@ def _check_sizes(config: Config, chunk: int) -> None:
         )
     if jax.process_count() > 1 and config.data.fresh_every:
         raise ValueError("data.fresh_every cannot be combined with --distributed: drop one")
-    if optim.ema and isinstance(config.peft, peft.AdaLoRA):
+    if optim.ema and any(isinstance(method, peft.AdaLoRA) for method in rules.methods(config)):
         raise ValueError(
             "--optim.ema cannot be combined with ada_lora: averaging breaks its rank budget"
         )
@@ -235,26 +241,32 @@ def _check_sizes(config: Config, chunk: int) -> None:
 def _adapt(
     config: Config,
     model: Backbone,
-    method: peft.Method,
+    adapter_rules: paths.Rules,
     statistics: Mapping[str, jax.Array] = MappingProxyType({}),
 ) -> Backbone:
-    """Add the method's adapters, initialized from the run's seed, and quantize the base."""
+    """Add adapters by rule, initialized from the run's seed, and quantize the base."""
     rngs = nnx.Rngs(RandomStream.ADAPTERS.key(config.seed))
-    rules = presets.rules(config.targets, method)
-    adapted = adaptation.adapt(model, rules, rngs=rngs, statistics=statistics)
+    adapted = adaptation.adapt(model, adapter_rules, rngs=rngs, statistics=statistics)
     return quantized(adapted, config.model.base_dtype)
 
 
 def input_moments(run: Run, model: Backbone, processor: Processor) -> dict[str, jax.Array]:
-    """Return `calibration.input_moments` of the run's targets over training batches."""
+    """Return `calibration.input_moments` of the layers that need them, over training batches."""
     config, sample = run.config, _batch_sampler(run, processor, model.config.chunk)
 
     def forward(model: Backbone, sampled: tuple[jax.Array, Batch]) -> Any:
         key, batch = sampled
         return model.loss(key, batch.observation, batch.actions, action_mask=batch.action_mask)
 
+    pairs = rules.rules(config)
+
+    def needs(path: str) -> bool:
+        method = None if (i := paths.find_rule(pairs, path)) is None else pairs[i][1]
+        return method is not None and method.needs_statistics
+
     keys = jax.random.split(RandomStream.STATISTICS.key(config.seed), STATISTICS_BATCHES)
-    pattern = "|".join(f"(?:{path})" for path in presets.patterns(config.targets))
+    layers = [layer.path for layer in paths.locate_matmul_layers(nnx.List([model]))]
+    pattern = "|".join(f"^{re.escape(path)}$" for path in layers if needs(path))
     batches = ((key, sample(key)) for key in keys)
     return calibration.input_moments(model, batches, pattern, forward)
 

@@ -23,7 +23,7 @@ def prune(
     batches: Sequence[Any],
     tolerance: float = 0.0,
     *,
-    rank: int | None = None,
+    rank: float | None = None,
     for_kernel: bool = False,
     forward: Forward = calibration.call,
 ) -> tuple[adaptation.Model, compaction.Compaction]:
@@ -40,16 +40,18 @@ def prune(
         batches: calibration set.
         tolerance: in [0, 1). With 0, outputs on the calibration set do not change.
         rank: number of directions to keep in each layer, the most used ones, instead of a
-            tolerance; at least 1. A smaller bank keeps all of its directions.
+            tolerance, or below 1 the fraction of each bank. A smaller bank keeps all of its
+            directions, and a layer at least one.
         for_kernel: keep more directions, 16, 32, 64, ... in all, as the fused kernel on NVIDIA GPUs
             needs; without it, a smaller bank can be slower.
         forward: how to call the model on a batch; see `lorasp_jax.adapters.compress.calibration`.
 
     Raises:
-        ValueError: tolerance is outside [0, 1), rank is not a positive integer or given together
-            with a tolerance, or the model has no LoRA-SP layers.
+        ValueError: tolerance is outside [0, 1), rank is neither a positive integer nor a fraction,
+            both are given, or the model has no LoRA-SP layers.
     """
-    if not 0 <= tolerance < 1 or (rank is not None and (rank < 1 or tolerance)):
+    is_rank = rank is None or 0 < rank < 1 or (rank >= 1 and rank == int(rank))
+    if not 0 <= tolerance < 1 or not is_rank or (rank is not None and tolerance):
         raise ValueError(f"set a tolerance in [0, 1) or a rank > 0, got {tolerance} and {rank}")
     layers = compaction.lora_sp_layers(model)
     sums = calibration.observe(model, batches, dict.fromkeys(layers, _usage), forward)
@@ -58,7 +60,8 @@ def prune(
     for path, layer in layers.items():
         usage = np.asarray(sums[path]["usage"] / jnp.maximum(sums[path]["tokens"][..., None], 1))
         in_use = np.asarray((usage > tolerance).sum(-1))
-        kept = max(int(in_use.max()), 1) if rank is None else rank
+        fixed = rank if rank is None or rank >= 1 else rank * layer.method.rank
+        kept = max(int(in_use.max() if fixed is None else fixed), 1)
         if for_kernel:
             kept = supported_size(kept)
         kept = min(kept, layer.method.rank)

@@ -11,7 +11,7 @@ import lorasp_jax
 from lorasp_jax.base import compilation_cache as cache
 from lorasp_jax.base.files import check_local
 from lorasp_jax.extras.study.held_out import held_out_demonstrations
-from lorasp_jax.training import export
+from lorasp_jax.training import export, rules
 from lorasp_jax.training.base import in_bf16, quantized
 from lorasp_jax.training.demonstrations import Demonstrations
 from lorasp_jax.training.finished_run import recorded_config
@@ -34,9 +34,7 @@ def _pruned(model: nnx.Module, batches: Batches) -> nnx.Module:
 
 
 def _half(model: nnx.Module, batches: Batches) -> nnx.Module:
-    methods: Any = (getattr(module, "method", None) for _, module in nnx.iter_modules(model))
-    (rank,) = {method.rank for method in methods if is_bank(method)}
-    return lorasp_jax.prune(model, batches, rank=max(rank // 2, 1), forward=forward)[0]
+    return lorasp_jax.prune(model, batches, rank=0.5, forward=forward)[0]
 
 
 def _merged(model: nnx.Module, batches: Batches) -> nnx.Module:
@@ -107,10 +105,10 @@ def on_base(policy: lorasp_jax.policies.Policy, base: str) -> lorasp_jax.policie
 
 
 def check_run(run: Path) -> None:
-    """Raise ValueError unless a run is finished, can be simulated, and was trained with LoRA-SP."""
-    method = recorded_config(run).peft
-    if not is_bank(method):
-        name = type(method).__name__
+    """Raise ValueError unless a run is finished, can be simulated, and has LoRA-SP layers."""
+    config = recorded_config(run)
+    if not any(map(is_bank, rules.methods(config))):
+        name = rules.describe(config)
         raise ValueError(f"{run} was trained with {name}: only LoRA-SP runs have variants")
 
 

@@ -18,10 +18,10 @@ from flax import nnx
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Batch, nbytes
-from lorasp_jax.models import presets
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.observation import abstract_observation
+from lorasp_jax.training import rules
 from lorasp_jax.training.base import quantized
 from lorasp_jax.training.cost import flops
 from lorasp_jax.training.distributed import mesh as meshes
@@ -88,7 +88,7 @@ def estimate_memory(config: Config, backbone: BackboneConfig) -> Memory:
     local_batch = max(1, config.optim.batch_size // jax.device_count())
     micro_batch = max(1, local_batch // config.optim.accumulate)
     _, (shapes, frozen, _) = abstract_step(config, backbone, micro_batch)
-    optimizer = make_optimizer(config.optim, {config.peft.as_saved})
+    optimizer = make_optimizer(config.optim, rules.methods(config))
     init = functools.partial(init_state, optimizer=optimizer, ema=config.optim.ema > 0)
     local_bytes = functools.partial(meshes.bytes_on_device, fsdp=config.fsdp)
     adapters = local_bytes(shapes)
@@ -131,8 +131,8 @@ def _saved_bytes(config: Config, backbone: BackboneConfig, *, size: int) -> int:
 def adapted_model(config: Config, backbone: BackboneConfig, key: jax.Array) -> Backbone:
     """Create a random model with the run's adapters; works under `nnx.eval_shape`."""
     base, adapters = (nnx.Rngs(k) for k in jax.random.split(key))
-    rules = presets.rules(config.targets, config.peft.as_saved)
-    adapted = adaptation.adapt(backbone.create(base), rules, rngs=adapters)
+    pairs = rules.rules(config, as_saved=True)
+    adapted = adaptation.adapt(backbone.create(base), pairs, rngs=adapters)
     return quantized(adapted, config.model.base_dtype)
 
 

@@ -9,6 +9,7 @@ from flax import nnx
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.peft.lora_sp.bank import BankMethod
 from lorasp_jax.policies.policy import Policy
+from lorasp_jax.training import rules
 from lorasp_jax.training.base import base_model
 from lorasp_jax.training.demonstrations import Demonstrations
 from lorasp_jax.training.fixed_batches import keyed_batches, sampler
@@ -24,7 +25,7 @@ def measure(run: Run, episodes: Demonstrations, source: Policy | None) -> dict[s
     config, policy = run.config, run.policy
     if source:
         return {"measures": measures(policy, episodes, source=source)}
-    base = base_model(config)[0] if config.peft.trains_base else None
+    base = base_model(config)[0] if rules.trains_base(config) else None
     return {
         "speed": cost.training_cost(run.folder, config, policy.model.config),
         "measures": measures(policy, episodes, base=base),

@@ -15,8 +15,8 @@ from lorasp_jax.config import AuxiliaryConfig
 from lorasp_jax.data.batches import Batch
 from lorasp_jax.training.fixed_batches import Sample
 from lorasp_jax.training.optim import auxiliary_weights
+from lorasp_jax.training.rules import tower
 from lorasp_jax.training.step import loss_fn
-from studies.paper.measures import layers
 
 Pair = tuple[str, str]
 
@@ -90,7 +90,7 @@ def _products(a: Any, b: Any) -> dict[str, jax.Array]:
     products: dict[str, jax.Array] = {}
     flat = (jax.tree_util.tree_leaves_with_path(tree) for tree in (a, b))
     for (path, x), (_, y) in zip(*flat, strict=True):
-        tower = layers.tower(path[0].key)
+        name = tower(path[0].key)
         three = jnp.stack([dot(x, y), dot(x, x), dot(y, y)])
-        products[tower] = products.get(tower, jnp.zeros(3)) + three
+        products[name] = products.get(name, jnp.zeros(3)) + three
     return products

@@ -7,18 +7,7 @@ from flax import nnx
 
 from lorasp_jax.adapters import paths
 from lorasp_jax.adapters.layers import nnx_layers
-from lorasp_jax.evaluation.callback import TOWERS
-
-
-def tower(path: str) -> str:
-    """Return the tower of a parameter path; layers outside the towers belong to "action"."""
-    first = path.partition("/")[0]
-    return first if first in TOWERS else "action"
-
-
-def short_name(path: str) -> str:
-    """Return a layer's path in its tower, as active ranks name it, such as "q_proj"."""
-    return path.removeprefix(f"{tower(path)}/").removeprefix("blocks/")
+from lorasp_jax.training.rules import short_name, tower
 
 
 def by_tower(values: dict[str, Any]) -> dict[str, dict[str, Any]]:
