@@ -24,8 +24,8 @@ from lorasp_jax.peft import LoRASP
 from lorasp_jax.policies import tokenizer
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.prompt_table import PromptTable
-from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.rules import rules
+from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import MetricsLog, read_metrics, to_json, write_json
 from lorasp_jax.training.setup import processor
 from tests.models.random_models import random_backbone

@@ -76,6 +76,9 @@ def adapt(
     for i, (pattern, _) in enumerate(rules):
         if i not in used:
             known = [location.path for location in paths.locate_layers(root, einsums)]
+            if taken := [path for path in known if re.search(pattern, path)]:
+                first = ", ".join(taken[:3])
+                raise ValueError(f"rule {pattern!r} applies to nothing: earlier rules take {first}")
             others = paths.locate_other_matrices(root, einsums)
             classes = {p.path.rpartition("/")[0]: type(p.parent).__name__ for p in others}
             raise ValueError(paths.no_match_message(pattern, known, classes))

@@ -24,8 +24,8 @@ from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training import early, records
 from lorasp_jax.training.demonstrations import map_threads
 from lorasp_jax.training.random_streams import RandomStream
-from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.rules import TOWERS, by_rule
+from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import read_json, read_metrics, write_json
 from lorasp_jax.training.setup import RunSetup
 

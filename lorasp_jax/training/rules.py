@@ -23,10 +23,11 @@ def named_rules(config: Config) -> presets.NamedRules:
     Raises:
         ValueError: a rule or target is invalid, or only full fine-tuning trains a quantized base.
     """
+    found: presets.NamedRules
     if config.adapt:
         found = presets.parse(config.adapt, config.peft)
     else:
-        found = {pattern: (pattern, config.peft) for pattern in presets.patterns(config.targets)}
+        found = {p: (p, config.peft) for p in presets.patterns(config.targets)}
     if config.model.base_dtype and all(not m or m.trains_base for _, m in found.values()):
         raise ValueError("model.base_dtype must be empty for full, which trains the base")
     return found

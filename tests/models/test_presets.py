@@ -45,6 +45,7 @@ def test_layers_of_each_preset(backbone):
         "vision": PATCH | VISION,
         "language": LANGUAGE,
         "action": action,
+        "projections": PROJECTIONS,
     }
     assert expected.keys() == presets.PRESETS.keys()
     root = nnx.List([nnx.eval_shape(lambda: backbone.Config.dummy().create(nnx.Rngs(0)))])

@@ -25,7 +25,7 @@ from lorasp_jax.peft import FullFineTuning, LoRA
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Offline
-from lorasp_jax.training import base, export, setup
+from lorasp_jax.training import base, export, rules, setup
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.overrides import override
@@ -212,7 +212,7 @@ def test_a_quantized_base_on_the_command_line_trains_and_acts(config, tmp_path, 
     for name, value in loaded.items():
         np.testing.assert_array_equal(value, expected[name], err_msg=name)
     with pytest.raises(ValueError, match=r"model\.base_dtype must be empty for full"):
-        dataclasses.replace(config, peft=FullFineTuning())
+        rules.named_rules(dataclasses.replace(config, peft=FullFineTuning()))
 
 
 def test_eva_uses_the_demonstrations(config, tmp_path, monkeypatch):
