@@ -105,7 +105,9 @@ def parse(texts: Iterable[str], method: Method | None = None) -> NamedRules:
         target, equals, right = text.rpartition("=")
         if text in RECIPES:
             for target, chosen in RECIPES[text]:
-                found.setdefault(_rule_text(target, chosen), (_joined(target), chosen))
+                rank = getattr(chosen, "rank", None)
+                label = f"{target}={chosen.name}" + (f":{rank}" if rank else "")
+                found.setdefault(label, (_joined(target), chosen))
         elif target and equals:
             found.setdefault(text, (_joined(target), _method(text, right, method)))
         else:
@@ -121,11 +123,6 @@ def parse(texts: Iterable[str], method: Method | None = None) -> NamedRules:
 def _joined(target: str) -> str:
     """Join the regular expressions of a target, so that it remains one rule."""
     return "|".join(patterns(target))
-
-
-def _rule_text(target: str, method: Method) -> str:
-    rank = getattr(method, "rank", None)
-    return f"{target}={method.name}" + (f":{rank}" if rank else "")
 
 
 def _method(text: str, right: str, current: Method | None) -> Method | None:

@@ -245,10 +245,10 @@ def test_a_mixed_run_resumes_to_the_bit_and_loads(trained):
     whole, run = trained
     assert repeatable(run.folder) == repeatable(whole.folder)
     assert_equal(run.policy.model, whole.policy.model)
-    before, after = models.load(run.config.model.checkpoint), run.policy.model
-    moved = before.action.blocks.q_proj.kernel != after.action.blocks.q_proj.kernel
-    assert moved.any()
-    assert (before.vision.blocks.q_proj.kernel == after.vision.blocks.q_proj.kernel).all()
+    before = leaves(nnx.state(models.load(run.config.model.checkpoint), nnx.Param))
+    after = leaves(nnx.state(run.policy.model, nnx.Param))
+    moved = {name for name, value in before.items() if (value != after[name]).any()}
+    assert moved == {name for name in before if name.startswith("['action']")}
     loaded = export.load_policy(run.folder).model
     assert adaptation.methods(loaded) == adaptation.methods(run.policy.model)
     assert_equal(loaded, run.policy.model)
@@ -262,7 +262,7 @@ def test_a_mixed_run_is_reported_by_rule(trained):
     assert sum(row["parameters"] for row in recorded.values()) == run.parameters[0]
     language, vision, action = recorded.values()
     assert language["active_rank"] == 4
-    assert 0 < vision["active_rank"] < CONFIG.peft.rank
+    assert 0 < vision["active_rank"] <= CONFIG.peft.rank
     assert "active_rank" not in action
     page = write_report(run.folder).read_text()
     assert f"{' '.join(MIXED)} on pi0" in page
@@ -288,8 +288,9 @@ def test_a_mixed_run_is_merged_pruned_and_deployed(trained, tmp_path):
     assert not adaptation.methods(distilled)
     with pytest.raises(ValueError, match="lora_sp, which Hugging Face PEFT does not support"):
         lorasp_jax.save_peft(tmp_path / "peft", model, names=lambda path, i: f"{path}{i}")
-    write_json(run.folder / "results.json", RESULTS)
-    variants.check_run(run.folder)
+    write_json(tmp_path / "config.json", to_json(run.config))
+    write_json(tmp_path / "results.json", RESULTS)
+    variants.check_run(tmp_path)
     for form in ("half", "pruned"):
         policy = variants.in_form(run.policy, form, {"press": random_episodes("press", 0)})
         methods = adaptation.methods(policy.model)

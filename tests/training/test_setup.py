@@ -234,6 +234,17 @@ def test_eva_uses_the_demonstrations(config, tmp_path, monkeypatch):
         np.testing.assert_allclose(captured, best, rtol=1e-3)  # no other 4 directions capture more
 
 
+def test_eva_measures_only_the_layers_of_its_rules(config, tmp_path, monkeypatch):
+    measured, measure = [], setup.input_moments
+    record = lambda *arguments: measured.append(measure(*arguments)) or measured[0]  # noqa: E731
+    monkeypatch.setattr(setup, "input_moments", record)
+    config = dataclasses.replace(config, adapt=("q_proj=lora:2", "language=lora_sp:2"))
+    run = prepare(config, tmp_path)
+    found = adaptation.methods(run.policy.model)
+    assert found["language/blocks/q_proj"] == dataclasses.replace(config.peft, rank=2)
+    assert set(measured[0]) == {path for path in found if path.endswith("q_proj")}
+
+
 def test_eva_uses_a_streamed_dataset(config, tmp_path):
     run = prepare(override(config, ["--peft.initialization", "kaiming"]), tmp_path)
     table = run.policy.processor

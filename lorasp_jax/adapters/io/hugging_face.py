@@ -179,7 +179,8 @@ def save_peft(
     """
     folder, names = validate.folder(folder), checked_names(names)
     validate.with_values(model)
-    layers = _supported_layers(model)
+    if not (layers := _supported_layers(model)):
+        raise ValueError("a PEFT folder needs a layer with LoRA, but the model has none")
     settings = {(isinstance(x.method, DoRA), dropout_rate(x.method)) for x in layers.values()}
     if len(settings) != 1:
         raise ValueError(f"PEFT needs one use_dora and lora_dropout, got {sorted(settings)}")

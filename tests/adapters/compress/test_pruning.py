@@ -159,6 +159,19 @@ def test_a_rank_keeps_the_most_used_directions(batches):
     assert report.output_error < 1e-5
 
 
+def test_a_fraction_shrinks_banks_of_any_size(batches):
+    large, small = VARIANTS[0], dataclasses.replace(VARIANTS[0], rank=4)
+    rules = [("blocks", large), ("heads", small)]
+    model = perturbed(adaptation.adapt(Net(nnx.Rngs(0)), rules, rngs=nnx.Rngs(1)), size=0.1)
+    for rank, kept in ((0.5, (RANK // 2, 2)), (0.1, (1, 1))):
+        smaller, _ = lorasp_jax.prune(model, batches, rank=rank, forward=forward)
+        methods = adaptation.methods(smaller)
+        for name, number in zip(("blocks", "heads"), kept, strict=True):
+            assert {m.rank for path, m in methods.items() if path.startswith(name)} == {number}
+    with pytest.raises(ValueError, match="rank"):
+        lorasp_jax.prune(model, batches, rank=2.5, forward=forward)
+
+
 @pytest.mark.parametrize(("rank", "kept"), [(1, 16), (16, 16), (17, 32), (33, 40)])
 def test_kernels_get_16_32_64_directions(batches, rank, kept):
     model = lora_sp_model(dataclasses.replace(VARIANTS[0], rank=40))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lorasp_jax.adapters.io import hugging_face
-from lorasp_jax.peft import DoRA, LoRA, LoRASP
+from lorasp_jax.peft import DoRA, FullFineTuning, LoRA, LoRASP
 from tests.adapters.io.peft_folder import Net, adapted, edit_config, edit_tensors
 
 
@@ -70,7 +70,10 @@ def test_invalid_tensors(copy, change, message):
         ([("lin/0", LoRASP(rank=4))], "lin/0 uses lora_sp"),
         ([("lin/0", LoRA(rank=2, initialization="pissa"))], "lin/0 split"),
         ([("lin/0", LoRA(rank=2)), ("lin/1", DoRA(rank=2))], "use_dora"),
-        ([], "lora_dropout"),
+        ([("lin/0", LoRA(rank=2)), ("lin/1", LoRA(rank=2, dropout=0.1))], "lora_dropout"),
+        ([("lin/0", LoRA(rank=2)), ("lin/1", LoRASP(rank=4))], "lin/1 uses lora_sp"),
+        ([("lin/0", FullFineTuning())], "needs a layer with LoRA"),
+        ([], "needs a layer with LoRA"),
     ],
 )
 def test_unsupported_adapters_are_not_saved(rules, message, tmp_path):
