@@ -128,19 +128,18 @@ def _joined(target: str) -> str:
 def _method(text: str, right: str, current: Method | None) -> Method | None:
     """Return the method of the rule `text`, whose right side is METHOD[:RANK]."""
     name, colon, rank = right.partition(":")
-    if right == "none":
-        return None
-    if name not in (names := peft.names()):
-        valid = ", ".join((*names, "none"))
-        raise ValueError(f"unknown method {name!r} in rule {text!r}: choose one of {valid}")
-    method = current if current and current.name == name else peft.create(name)
+    if name not in (valid := (*peft.names(), "none")):
+        listed = ", ".join(valid)
+        raise ValueError(f"unknown method {name!r} in rule {text!r}: choose one of {listed}")
+    if current is None or current.name != name:
+        current = None if name == "none" else peft.create(name)
     if not colon:
-        return method
-    if not hasattr(method, "rank"):
+        return current
+    if not hasattr(current, "rank"):
         raise ValueError(f"{name} has no rank: write {text.removesuffix(f':{rank}')!r}")
     if not rank.isdecimal():
         raise ValueError(f"the rank in rule {text!r} must be a whole number, got {rank!r}")
     try:
-        return dataclasses.replace(method, rank=int(rank))  # type: ignore[call-arg]
+        return dataclasses.replace(current, rank=int(rank))  # type: ignore[call-arg]
     except ValueError as error:
         raise ValueError(f"rule {text!r}: {error}") from error

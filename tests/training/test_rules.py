@@ -72,6 +72,7 @@ def test_settings_come_from_the_config_for_its_method_only():
         (["=lora"], ["'=lora' is no rule"]),
         (["a=lorra"], ["'lorra'", "lora_sp", "none"]),
         (["a=full:3"], ["full has no rank", "'a=full'"]),
+        (["a=none:3", "b=lora"], ["none has no rank", "'a=none'"]),
         (["a=lora:x"], ["'a=lora:x'", "whole number"]),
         (["a=lora:0"], ["'a=lora:0'", "rank must be at least 1"]),
         (["a=none"], ["no rule has a method", "lora_sp"]),
