@@ -79,9 +79,8 @@ def adapt(
             if taken := [path for path in known if re.search(pattern, path)]:
                 first = ", ".join(taken[:3])
                 raise ValueError(f"rule {pattern!r} applies to nothing: earlier rules take {first}")
-            others = paths.locate_other_matrices(root, einsums)
-            classes = {p.path.rpartition("/")[0]: type(p.parent).__name__ for p in others}
-            raise ValueError(paths.no_match_message(pattern, known, classes))
+            others = paths.unsupported_classes(root, einsums)
+            raise ValueError(paths.no_match_message(pattern, known, others))
     return root[0]
 
 

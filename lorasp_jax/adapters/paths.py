@@ -140,17 +140,29 @@ def locate_other_matrices(
     ]
 
 
-def no_match_message(pattern: str, layers: Sequence[str], others: Mapping[str, str]) -> str:
-    """Error message for a rule that applies to nothing.
+def unsupported_classes(
+    root: nnx.List[Any], einsums: nnx_layers.Einsums = MappingProxyType({})
+) -> dict[str, str]:
+    """Class names of the modules with matrices that adapters do not support, by path."""
+    others = locate_other_matrices(root, einsums)
+    return {other.path.rpartition("/")[0]: type(other.parent).__name__ for other in others}
 
-    `layers` are the paths of supported layers. `others` maps the paths of other modules with
+
+def no_match_message(pattern: str, layers: Sequence[str], others: Mapping[str, str]) -> str:
+    """Error message for a rule that applies to nothing; arguments as in `available_layers`."""
+    return f"rule {short(pattern)} applies to nothing; {available_layers(pattern, layers, others)}"
+
+
+def available_layers(query: str, layers: Sequence[str], others: Mapping[str, str]) -> str:
+    """List what resembles a name, for an error message.
+
+    `layers` are the names of supported layers. `others` maps the paths of other modules with
     matrices to their class names.
     """
-    close = near_misses(pattern, layers) or "none"
-    text = f"rule {short(pattern)} applies to nothing; available layers: {close}"
+    text = f"available layers: {near_misses(query, layers) or 'none'}"
     if not others:
         return f"{text}."
-    close = difflib.get_close_matches(pattern, others, n=3, cutoff=0.3) or list(others)[:3]
+    close = difflib.get_close_matches(query, others, n=3, cutoff=0.3) or list(others)[:3]
     listed = ", ".join(f"{path or 'the model'} ({others[path]})" for path in close)
     return f"{text}; unsupported classes: {listed}. {EINSUMS_HINT}."
 

@@ -20,16 +20,24 @@ import safetensors.numpy
 from flax import nnx
 
 from lorasp_jax.adapters import adaptation, paths
-from lorasp_jax.adapters.io.peft_folders import CONFIG, PREFIX, TENSORS, Adapter, read_folder
+from lorasp_jax.adapters.io.peft_folders import (
+    CONFIG,
+    PREFIX,
+    TENSORS,
+    Adapter,
+    read_folder,
+    to_torch,
+)
 from lorasp_jax.adapters.io.peft_full import (
     Names,
+    base_parameters,
     check_biases,
     export_full_parameters,
-    full_parameters,
 )
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.base.writing import write_bytes, write_text
 from lorasp_jax.dense import AdaptedLayer, AdapterParam, validate
+from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA
 from lorasp_jax.peft.fields import short
 from lorasp_jax.peft.method import dropout_rate
@@ -69,10 +77,15 @@ def load_peft(
     """Load the adapters of a Hugging Face PEFT folder into a model.
 
     Adapters apply to dense layers and einsums, including those of `nnx.MultiHeadAttention`, whose
-    heads are concatenated as in torch. Biases and modules that PEFT trained in full (`bias`,
-    `modules_to_save`) become trainable parameters. AdaLoRA is loaded as the equivalent LoRA. If
-    ranks differ within a stack, adapters are zero-padded to the largest. `lora_dropout` becomes the
-    methods' `dropout`, which is active only under `with_dropout`.
+    heads are concatenated as in torch, and LoRA also to embeddings and convolutions. Biases and
+    modules that PEFT trained in full (`bias`, `modules_to_save`) become trainable parameters.
+    Embeddings and output layers that it only stored (`save_embedding_layers`) replace the model's.
+    AdaLoRA is loaded as the equivalent LoRA. If ranks differ within a stack, adapters are
+    zero-padded to the largest. `lora_dropout` becomes the methods' `dropout`, which is active only
+    under `with_dropout`.
+
+    The adapter of an `nnx.Embed` also changes the logits of its `attend`. In PEFT, that of an
+    embedding changes the logits only with `ensure_weight_tying`.
 
     Args:
         folder: local folder with adapter_config.json and adapter_model.safetensors, or a Hub
@@ -91,15 +104,19 @@ def load_peft(
     folder, names = _local_folder(folder), checked_names(names)
     shapes = {
         location.path: nnx_layers.matrices_shape(location.child, einsums)
-        for location in paths.locate_matmul_layers(root, einsums)
+        for location in paths.locate_layers(root, einsums)
     }
     parameters = [p for p in paths.locate(root, nnx.Param) if p.name != "adapter"]
     sizes = {location.path: location.child.get_value().shape for location in parameters}
-    rules, values, full_values = _match_folder(folder, shapes, sizes, names)
+    others = paths.unsupported_classes(root, einsums)
+    rules, values, full_values = _match_folder(folder, shapes, sizes, others, names)
     adapted = adaptation.adapt(model, rules, rngs=nnx.Rngs(0), einsums=einsums)
-    for location in paths.locate(nnx.List([adapted]), AdapterParam):
+    for location in paths.locate(nnx.List([adapted]), nnx.Param):
         if location.path in full_values:
-            location.child.set_value(jnp.asarray(full_values[location.path]))
+            old = location.child.get_value()
+            if isinstance(old, QuantizedKernel):
+                raise ValueError(f"{folder} replaces {location.path}: quantize after loading it")
+            location.child.set_value(jnp.asarray(full_values[location.path], old.dtype))
     for location in paths.locate(nnx.List([adapted]), AdaptedLayer):
         if location.path in values:
             location.child.adapter.set_value(jax.tree.map(jnp.asarray, values[location.path]))
@@ -110,16 +127,20 @@ def _match_folder(
     folder: pathlib.Path,
     shapes: Mapping[str, Sequence[int]],
     sizes: Mapping[str, Sequence[int]],
+    others: Mapping[str, str],
     names: Names,
 ) -> tuple[paths.Rules, dict[str, Adapter], Adapter]:
     """Match a folder against the kernel matrices `[..., I, O]` and the parameters of a model.
 
-    Returns rules for `adapt`, the adapters' parameters by path, and the fully trained parameters
-    by path.
+    `others` maps the paths of modules that adapters do not support to their class names.
+
+    Returns rules for `adapt`, the adapters' parameters by path, and the values of base parameters,
+    trained or not, by path.
     """
-    config, modules, full = read_folder(folder)
+    contents = read_folder(folder)
+    config, unused = contents.config, dict(contents.adapters)
     kind, dropout = DoRA if config.get("use_dora") else LoRA, config.get("lora_dropout") or 0.0
-    unused, candidates, rules, values = dict(modules), [], [], {}
+    candidates, rules, values = [], [], {}
     for path, (*leading, d_in, d_out) in shapes.items():
         module_names = [names(path, index) for index in np.ndindex(*leading)]
         candidates += module_names
@@ -134,16 +155,24 @@ def _match_folder(
         rank = values[path]["lora_a"].shape[-1]
         with paths.naming("load", folder):
             rules.append((f"^{re.escape(path)}$", kind(rank, scale * rank, dropout=dropout)))
-    if not modules:
+    if not contents.adapters:
         raise ValueError(f"{folder} contains no adapters")
-    if unused:
-        name, close = min(unused), paths.near_misses(min(unused), candidates)
-        raise ValueError(f"{folder} adapts {short(name)}, which the model lacks; it has {close}")
-    check_biases(folder, config.get("bias", "none"), full, sizes, values)
-    full_values = full_parameters(folder, full, shapes, sizes, names)
+    if effective := sorted(name for name, adapter in unused.items() if _has_effect(adapter)):
+        known = paths.available_layers(effective[0], candidates, others)
+        raise ValueError(
+            f"{folder} adapts {short(effective[0])}, the name of no layer that adapters support; "
+            f"{known}"
+        )
+    check_biases(folder, config.get("bias", "none"), contents.trained, sizes, values)
+    trained, frozen = base_parameters(folder, contents, shapes, sizes, names)
     # These rules come first, since the bias of an adapted layer may be fully fine-tuned.
-    full_rules = [(f"^{re.escape(path)}$", FullFineTuning()) for path in full_values]
-    return [*full_rules, *rules], values, full_values
+    full_rules = [(f"^{re.escape(path)}$", FullFineTuning()) for path in trained]
+    return [*full_rules, *rules], values, trained | frozen
+
+
+def _has_effect(adapter: Adapter) -> bool:
+    """Whether an adapter changes its layer. Those of unused layers stay at zero in training."""
+    return "magnitude" in adapter or bool(adapter["lora_a"].any() and adapter["lora_b"].any())
 
 
 def _local_folder(folder: str | os.PathLike[str]) -> pathlib.Path:
@@ -216,8 +245,6 @@ def _supported_layers(model: nnx.Module) -> dict[str, AdaptedLayer]:
             )
         if layer.method.splits_kernel:
             raise ValueError(f"the adapter of {path} split the kernel: merge it instead")
-        if isinstance(layer, nnx_layers.LoRALayer):
-            raise ValueError(f"PEFT cannot store {path}: not dense and no einsum")
         layers[path] = layer
     return layers
 
@@ -257,10 +284,15 @@ def _to_peft(layer: AdaptedLayer, index: tuple[int, ...]) -> tuple[float, Adapte
         active = np.flatnonzero(params["lora_e"])
         active = active if len(active) else np.array([0])  # PEFT needs a rank of at least 1
         a, b = (a * params["lora_e"])[:, active], b[active]
-    tensors = {
-        "lora_A.weight": np.ascontiguousarray(a.T),
-        "lora_B.weight": np.ascontiguousarray(b.T),
-    }
+    if isinstance(layer, nnx_layers.EmbedLayer):
+        names = ("lora_embedding_A", "lora_embedding_B")
+    else:
+        names = ("lora_A.weight", "lora_B.weight")
+        if isinstance(layer, nnx_layers.ConvLayer):
+            sizes = layer.kernel_size  # pyright: ignore[reportAttributeAccessIssue]
+            a = a.reshape(*sizes, -1, a.shape[-1])
+            b = b.reshape(*(1 for _ in sizes), *b.shape)
+    tensors = dict(zip(names, (to_torch(a), to_torch(b)), strict=True))
     if "magnitude" in params:
         tensors["lora_magnitude_vector"] = params["magnitude"]
     return layer.method.scale, tensors  # pyright: ignore[reportAttributeAccessIssue, reportOptionalMemberAccess]
@@ -268,7 +300,7 @@ def _to_peft(layer: AdaptedLayer, index: tuple[int, ...]) -> tuple[float, Adapte
 
 def _config(modules: Mapping[str, tuple[float, Adapter]], base: str | None) -> dict[str, Any]:
     """Fields of adapter_config.json: the most common rank and α, and patterns for the others."""
-    ranks = {name: len(adapter["lora_A.weight"]) for name, (_, adapter) in modules.items()}
+    ranks = {name: len(next(iter(adapter.values()))) for name, (_, adapter) in modules.items()}
     alphas = {name: scale * ranks[name] for name, (scale, _) in modules.items()}
     rank, alpha = (collections.Counter(x.values()).most_common(1)[0][0] for x in (ranks, alphas))
     return {

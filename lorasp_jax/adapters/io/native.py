@@ -45,6 +45,15 @@ FIELDS: dict[str, Any] = {
     "metadata": {},
 }
 """Schema of the JSON, see `json_values.check`."""
+_FLOATS = {
+    "F64": np.float64,
+    "F32": np.float32,
+    "F16": np.float16,
+    "BF16": jnp.bfloat16,
+    "F8_E4M3": jnp.float8_e4m3fn,
+    "F8_E5M2": jnp.float8_e5m2,
+}
+"""Floating-point types of safetensors files."""
 
 
 def save_adapters(
@@ -224,14 +233,17 @@ def read_tensors(path: pathlib.Path) -> tuple[bytes, dict[str, np.ndarray]]:
     Raises:
         ValueError: the file is damaged, or a tensor is not floating-point or not finite.
     """
+    tensors = {}
     with as_value_error(path, safetensors.SafetensorError):
         check_memory(check_regular(path).stat().st_size, path)
         data = path.read_bytes()
-        tensors = dict(sorted(safetensors.numpy.load(data).items()))
-        for name, tensor in tensors.items():
-            is_float = jnp.issubdtype(tensor.dtype, jnp.floating)
-            if not is_float or not np.isfinite(tensor.astype(np.float32)).all():
+        # Not `safetensors.numpy.load`, which knows neither bf16 nor float8.
+        for name, stored in sorted(safetensors.deserialize(data), key=lambda pair: pair[0]):
+            dtype = _FLOATS.get(stored["dtype"])
+            tensor = np.frombuffer(stored["data"], dtype or np.uint8)
+            if not dtype or not np.isfinite(tensor.astype(np.float32)).all():
                 raise ValueError(f"tensor {name!r} must be floating-point and finite")
+            tensors[name] = tensor.reshape(stored["shape"])
     return data, tensors
 
 

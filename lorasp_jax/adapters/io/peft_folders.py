@@ -11,7 +11,7 @@ import pathlib
 import re
 import reprlib
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,11 +22,14 @@ from lorasp_jax.peft.fields import short
 
 CONFIG, TENSORS = "adapter_config.json", "adapter_model.safetensors"
 PREFIX = "base_model.model."
+# A state dict that PEFT did not save itself still has the adapter's name in its keys.
 _TENSOR = re.compile(
-    rf"{re.escape(PREFIX)}(.+)\.(lora_A|lora_B|lora_E|lora_magnitude_vector)(\.weight)?"
+    rf"{re.escape(PREFIX)}(?P<module>.+)\.lora_(?P<embedding>embedding_)?"
+    r"(?P<part>[ABE]|magnitude_vector)(?:\.(?!weight$)(?P<adapter>[^.]+))?(?:\.weight)?"
 )
-_FULL_TENSOR = re.compile(rf"{re.escape(PREFIX)}(.+?)(\.base_layer)?\.(weight|bias)")
+_BASE_TENSOR = re.compile(rf"{re.escape(PREFIX)}(.+?)(\.base_layer)?\.(weight|bias)")
 _ADA_CONSTANT = 1e-5  # AdaLoRA's scale is α/(init_r + this)
+_STEPS = 1e9  # at most as many to match a pattern; about a hundredth of them are taken
 # Initializations that do not change the base. With others (PiSSA, OLoRA, CorDA, LoRA-GA, LoftQ), A
 # and B fit only the residual base.
 _BASE_PRESERVING = (None, True, False, "gaussian", "orthogonal", "eva", "mica")
@@ -34,7 +37,8 @@ _BASE_PRESERVING = (None, True, False, "gaussian", "orthogonal", "eva", "mica")
 _DISABLED = (None, False, [], {}, "none")
 _UNSUPPORTED = (
     "lora_bias", "fan_in_fan_out", "layer_replication", "use_qalora", "target_parameters",
-    "trainable_token_indices", "use_bdlora", "alora_invocation_tokens",
+    "trainable_token_indices", "use_bdlora", "alora_invocation_tokens", "arrow_config",
+    "kasa_config", "monteclora_config",
 )  # fmt: skip
 # Schema of the fields that this module interprets, see `json_values.check`.
 _FIELDS: dict[str, Any] = {
@@ -51,11 +55,28 @@ _FIELDS: dict[str, Any] = {
 
 Adapter = dict[str, np.ndarray]
 FullTensors = dict[tuple[str, str], np.ndarray]
-"""Fully trained parameters by (module, "weight" or "bias"), in torch's layout."""
+"""Weights and biases by (module, "weight" or "bias"), in torch's layout."""
 
 
-def read_folder(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter], FullTensors]:
-    """Read the config, the adapters by module in this project's layout, and the `FullTensors`.
+class PeftFolder(NamedTuple):
+    """Contents of a PEFT folder.
+
+    Attributes:
+        config: fields of adapter_config.json.
+        adapters: by module, in this project's layout.
+        trained: fully trained parameters.
+        base: frozen parameters of the base, with which PEFT replaces those of the model. It stores
+            embeddings and output layers that it adapts, or that were resized.
+    """
+
+    config: dict[str, Any]
+    adapters: dict[str, Adapter]
+    trained: FullTensors
+    base: FullTensors
+
+
+def read_folder(folder: pathlib.Path) -> PeftFolder:
+    """Read a PEFT folder.
 
     Raises:
         ValueError: files are missing or damaged, or the adapter is not supported.
@@ -67,19 +88,23 @@ def read_folder(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter
             raise ValueError(f"bias must be 'none', 'all' or 'lora_only', got {config['bias']!r}")
     _, tensors = read_tensors(folder / TENSORS)
     _check_supported(folder, config)
-    modules, full_values = collections.defaultdict(dict), {}
+    modules, trained, base = collections.defaultdict(dict), {}, {}
+    adapter_names = set()
     for name, tensor in tensors.items():
         if match := _TENSOR.fullmatch(name):
-            modules[match[1]][match[2]] = tensor.astype(np.float32)
-        elif (match := _FULL_TENSOR.fullmatch(name)) and _is_fully_trained(
-            config, match[1], match[3]
-        ):
-            full_values[match[1], match[3]] = tensor.astype(np.float32)
+            values, key = modules[match["module"]], f"lora_{match['part']}"
+            adapter_names.add(match["adapter"])
+        elif match := _BASE_TENSOR.fullmatch(name):
+            values = trained if _is_fully_trained(config, match[1], match[3]) else base
+            key = match[1], match[3]
         else:
             raise ValueError(f"{folder} has the unexpected tensor {short(name)}")
+        if key in values or len(adapter_names) > 1:
+            raise ValueError(f"{folder} has several tensors for {short(name)}: save one adapter")
+        values[key] = tensor.astype(np.float32)
     with as_value_error(folder, re.error):
-        imported = {name: _from_peft(config, name, tensors) for name, tensors in modules.items()}
-    return config, imported, full_values
+        adapters = {name: _from_peft(config, name, tensors) for name, tensors in modules.items()}
+    return PeftFolder(config, adapters, trained, base)
 
 
 def _check_supported(folder: pathlib.Path, config: Mapping[str, Any]) -> None:
@@ -97,9 +122,15 @@ def _check_supported(folder: pathlib.Path, config: Mapping[str, Any]) -> None:
 
 
 def _is_fully_trained(config: Mapping[str, Any], module: str, kind: str) -> bool:
-    """Whether the config allows a fully trained weight or bias of the module."""
-    saved = any(f".{name}." in f".{module}." for name in config.get("modules_to_save") or ())
-    return saved or (kind == "bias" and config.get("bias") in ("all", "lora_only"))
+    """Whether the config says that a weight or bias of the module was fully trained.
+
+    As in PEFT (_set_trainable of 0.21.2), an entry of modules_to_save is the end of a name, also in
+    the middle of a word, and comprises the modules inside.
+    """
+    ends = (dot.start() for dot in re.finditer(r"\.|$", module))
+    saved = tuple(config.get("modules_to_save") or ())
+    is_saved = any(module[:end].endswith(saved) for end in ends)
+    return is_saved or (kind == "bias" and config.get("bias") in ("all", "lora_only"))
 
 
 def _from_peft(config: Mapping[str, Any], module: str, tensors: Adapter) -> Adapter:
@@ -109,11 +140,15 @@ def _from_peft(config: Mapping[str, Any], module: str, tensors: Adapter) -> Adap
     expected |= {"lora_magnitude_vector"} if config.get("use_dora") else set()
     if expected != tensors.keys():
         raise ValueError(f"{module} must have {sorted(expected)}, got {sorted(tensors)}")
-    a, b, alpha = tensors["lora_A"].T, tensors["lora_B"].T, _alpha(config, module)
-    if not alpha or (ada and (config.get("init_r") or 0) < 1):
-        raise ValueError(f"{module} lacks lora_alpha or init_r for its scale")
+    if not (alpha := _alpha(config, module)):
+        raise ValueError(f"{module} needs a lora_alpha other than 0 for its scale, got {alpha}")
+    if not ada and not len(tensors["lora_A"]):
+        raise ValueError(f"{module} has rank 0, but a rank must be at least 1")
+    a, b = _matrix(module, tensors["lora_A"]), _matrix(module, tensors["lora_B"])
     if ada:
-        scale = alpha / (config["init_r"] + _ADA_CONSTANT)
+        if (first := config.get("init_r") or 0) < 1:
+            raise ValueError(f"{module} needs an init_r of at least 1 for its scale, got {first}")
+        scale = alpha / (first + _ADA_CONSTANT)
         a = a * tensors["lora_E"][:, 0]
     else:
         rank = a.shape[1]
@@ -124,17 +159,49 @@ def _from_peft(config: Mapping[str, Any], module: str, tensors: Adapter) -> Adap
     return adapter
 
 
+def _matrix(module: str, tensor: np.ndarray) -> np.ndarray:
+    """Convert A to `[sizes · I, R]` or B to `[R, O]`; only those of a convolution have sizes."""
+    if tensor.ndim < 2:
+        raise ValueError(f"{module} must have matrices, got a tensor of shape {tensor.shape}")
+    kernel = from_torch(tensor)
+    return kernel.reshape(math.prod(kernel.shape[:-1]), kernel.shape[-1])
+
+
+def from_torch(kernel: np.ndarray) -> np.ndarray:
+    """Convert torch's `[out, in, *sizes]` to `[*sizes, I, O]`; sizes are those of a convolution."""
+    return kernel.transpose(*range(2, kernel.ndim), 1, 0)
+
+
+def to_torch(kernel: np.ndarray) -> np.ndarray:
+    """Inverse of `from_torch`."""
+    return np.ascontiguousarray(kernel.transpose(-1, -2, *range(kernel.ndim - 2)))
+
+
 def _alpha(config: Mapping[str, Any], module: str) -> Any:
     """α of a module: that of the first pattern that matches its name or a suffix after a dot.
 
-    As in PEFT (get_pattern_key of 0.21.2), but without repetitions except a leading ".*": a pattern
-    such as (a+)+b may take forever to match.
+    As in PEFT (get_pattern_key of 0.21.2), whose AdaLoRA has no patterns.
     """
-    for pattern, alpha in (config.get("alpha_pattern") or {}).items():
-        if not re.fullmatch(r"(\.\*)?([\w.^$()\[\]|-]|\\\D)*", pattern):
-            raise RefusedError(
-                f"alpha_pattern has {short(pattern)}: a pattern with repetitions is not supported"
-            )
+    patterns = config.get("alpha_pattern") or {} if config["peft_type"] == "LORA" else {}
+    for pattern, alpha in patterns.items():
+        _check_cost(pattern, module)
         if re.match(rf"(.*\.)?({pattern})$", module):
             return alpha
     return config.get("lora_alpha")
+
+
+def _check_cost(pattern: str, module: str) -> None:
+    """Raise RefusedError if matching an untrusted pattern could take forever, as (a+)+b does.
+
+    Without repeated groups and back references, each repetition has at most as many ends as the
+    name has characters, and each group as many as it has alternatives.
+    """
+    plain = re.sub(r"\\\D|\[\^?\]?[^]]*\]", "x", pattern)
+    repetitions = len(re.findall(r"(?<!\()[*+?{]", plain))
+    groups, bars = plain.count("(") + 1, plain.count("|")
+    cost = math.log(len(module)) * (1 + repetitions) + math.log(bars / groups + 1) * groups
+    if re.search(r"\)[*+{]|\\|\(\?(?!<?[=!]|:)", plain) or cost > math.log(_STEPS):
+        raise RefusedError(
+            f"alpha_pattern has {short(pattern)}, which may take forever to match: write it "
+            "without repeated groups, back references and flags, and with fewer repetitions"
+        )

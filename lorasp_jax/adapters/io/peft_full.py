@@ -14,7 +14,13 @@ import numpy as np
 from flax import nnx
 
 from lorasp_jax.adapters import paths
-from lorasp_jax.adapters.io.peft_folders import PREFIX, Adapter, FullTensors
+from lorasp_jax.adapters.io.peft_folders import (
+    PREFIX,
+    Adapter,
+    FullTensors,
+    PeftFolder,
+    from_torch,
+)
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdapterParam, Dense
 from lorasp_jax.peft.fields import short
@@ -25,40 +31,52 @@ _TORCH_NAMES = {"kernel": "weight", "embedding": "weight", "scale": "weight", "b
 _AXES = {"embedding": 2, "scale": 1, "bias": 1}
 
 
-def full_parameters(
+def base_parameters(
     folder: pathlib.Path,
-    full: FullTensors,
+    contents: PeftFolder,
     shapes: Mapping[str, Sequence[int]],
     sizes: Mapping[str, Sequence[int]],
     names: Names,
-) -> Adapter:
-    """A folder's fully trained parameters, by path, in the model's layout.
+) -> tuple[Adapter, Adapter]:
+    """A folder's fully trained and its frozen parameters, by path, in the model's layout.
+
+    Args:
+        folder: its path.
+        contents: of the folder.
+        shapes: `[..., I, O]` of the kernel matrices of the model's layers, by path.
+        sizes: shapes of the model's parameters by path.
+        names: as for `load_peft`.
 
     Raises:
         ValueError: the model lacks a parameter or has a different shape, or the folder covers only
             some layers of a stack.
     """
-    values, unused = {}, dict(full)
-    for path, size in sizes.items() if full else ():
+    trained, frozen, unused = {}, {}, contents.base | contents.trained
+    for path, size in sizes.items() if unused else ():
         module, _, name = path.rpartition("/")
-        kind = _TORCH_NAMES.get(name, "")
+        if not (kind := _TORCH_NAMES.get(name)):
+            continue
         leading = _stack(name, size, shapes.get(module))
         keys = [(names(module, index), kind) for index in np.ndindex(*leading)]
-        parts = [unused.pop(key) for key in keys if key in unused]
-        if not parts:
+        found = [key for key in keys if key in unused]
+        if not found:
             continue
-        if len(parts) < len(keys):
+        if len(found) < len(keys):
             raise ValueError(f"{folder} has the {kind} of only some layers of {module}")
-        value = np.stack([_from_torch(part) if name == "kernel" else part for part in parts])
+        parts = [unused.pop(key) for key in keys]
+        value = np.stack([from_torch(part) if name == "kernel" else part for part in parts])
         rows = value.shape[1:] if name == "kernel" else (value[0].size,)
         shape = tuple(size[len(leading) :])
         if rows != (shape if name == "kernel" else (math.prod(shape),)):
             raise ValueError(f"{path} has shape {rows} in {folder}, but {shape} in the model")
-        values[path] = value.reshape(tuple(size))
-    if unused:
-        module, kind = min(unused)
-        raise ValueError(f"{folder} has the {kind} of {short(module)}, which the model lacks")
-    return values
+        is_trained = not contents.trained.keys().isdisjoint(keys)
+        (trained if is_trained else frozen)[path] = value.reshape(tuple(size))
+    # PEFT also stores an output layer that is tied to the embedding, which the model may not have.
+    read = [value for key, value in contents.base.items() if key not in unused]
+    for key, value in unused.items():
+        if key in contents.trained or not any(np.array_equal(value, other) for other in read):
+            raise ValueError(f"{folder} has the {key[1]} of {short(key[0])}, which the model lacks")
+    return trained, frozen
 
 
 def check_biases(
@@ -123,11 +141,6 @@ def _stack(name: str, size: Sequence[int], matrices: Sequence[int] | None) -> tu
     if matrices is not None:
         return tuple(matrices[:-2])
     return tuple(size[: -_AXES[name]]) if name in _AXES else ()
-
-
-def _from_torch(kernel: np.ndarray) -> np.ndarray:
-    """Convert torch's `[out, in, *sizes]` to `[*sizes, I, O]`; sizes are those of a convolution."""
-    return kernel.transpose(*range(2, kernel.ndim), 1, 0)
 
 
 def _parts(

@@ -6,6 +6,7 @@ instead.
 """
 
 import functools
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -292,7 +293,9 @@ def describe_einsum(describe: Callable[[Any], Any], layer: Any) -> tuple[str, st
 
 
 def matrices_shape(layer: Any, einsums: Einsums) -> tuple[int, ...]:
-    """Shape [..., *batch, I, O] of the kernel matrices of a dense layer or einsum, adapted or not.
+    """Shape [..., *batch, I, O] of the kernel matrices of a supported layer, adapted or not.
+
+    For a convolution, I is the product of its sizes and its number of input channels.
 
     Raises:
         ValueError: the equation cannot be adapted.
@@ -300,8 +303,12 @@ def matrices_shape(layer: Any, einsums: Einsums) -> tuple[int, ...]:
     if isinstance(layer, AdaptedLayer):
         return tuple(layer.kernel_matrices().shape)
     known = supported_class(layer, einsums)
-    if known is nnx.Linear:
-        return layer.kernel.get_value().shape
+    if known is nnx.Conv:
+        sizes, (*outer, _, d_out) = layer.kernel_size, layer.kernel.get_value().shape
+        outer = outer[: len(outer) - len(sizes)]
+        return (*outer, math.prod(layer.kernel.get_value().shape[len(outer) : -1]), d_out)
+    if known in (nnx.Linear, nnx.Embed):
+        return kernel_of(layer).get_value().shape
     name, equation = kernel_and_equation(layer, known, einsums)
     value = getattr(layer, name).get_value()
     shaped = jax.ShapeDtypeStruct(value.shape, value.dtype)

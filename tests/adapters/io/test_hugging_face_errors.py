@@ -7,6 +7,12 @@ from lorasp_jax.adapters.io import hugging_face
 from lorasp_jax.peft import DoRA, FullFineTuning, LoRA, LoRASP
 from tests.adapters.io.peft_folder import Net, adapted, edit_config, edit_tensors
 
+BAD_PATTERNS = (
+    *("(a+)+b", r"(l)\1", "(?x:#[\n(l+)+#]\n)", "(?#[)(l+)+(?#])"),
+    *("l?" * 40, "(l|l)" * 40, ".*l" * 20),
+)
+"""Patterns that may take forever to match."""
+
 
 @pytest.mark.parametrize(
     ("changes", "name"),
@@ -18,7 +24,7 @@ from tests.adapters.io.peft_folder import Net, adapted, edit_config, edit_tensor
         *[({"lora_alpha": bad}, "lora_alpha") for bad in (None, 0, 1e308, True)],
         *[({name: bad}, name) for name in ("use_rslora", "use_dora") for bad in ("x", 1)],
         *[({"alpha_pattern": bad}, "alpha_pattern") for bad in ({"lin.0": "8"}, 3)],
-        *[({"alpha_pattern": {p: 8}}, "alpha_pattern has") for p in ("l+", "(a+)+b", r"(l)\1")],
+        *[({"alpha_pattern": {p: 8}}, "alpha_pattern has") for p in BAD_PATTERNS],
         ({"alpha_pattern": {"l(": 8}}, "is damaged"),
         ({"bias": 0}, "bias"),
         ({"init_lora_weights": "pissa"}, "init_lora_weights"),
@@ -48,13 +54,31 @@ def extended(tensors):
     return tensors | {"base_model.model.head.weight": np.zeros(3, np.float32)}
 
 
+def emptied(tensors):
+    side = lambda name: np.s_[:0] if "lora_A" in name else np.s_[:, :0]  # noqa: E731
+    return {name: np.ascontiguousarray(value[side(name)]) for name, value in tensors.items()}
+
+
+def doubled(tensors):
+    return tensors | {
+        name.replace("lora_A", "lora_A.other"): value for name, value in tensors.items()
+    }
+
+
+def flattened(tensors):
+    return {name: value.ravel() for name, value in tensors.items()}
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (renamed, "'lin.7', .* lin"),
         (halved, "lin.2 .*lora_B"),
         (narrowed, "lin.0 .* 24x40"),
-        (extended, "head.weight"),
+        (extended, "weight of 'head'"),
+        (emptied, "lin.0 has rank 0"),
+        (doubled, "several tensors for .*lin.0.lora_A"),
+        (flattened, "lin.0 must have matrices"),
         (lambda tensors: {}, "no adapters"),
     ],
 )
