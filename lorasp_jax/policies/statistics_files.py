@@ -3,11 +3,11 @@
 statistics.json           ours
 norm_stats.json           openpi: {"norm_stats": {"state": {"mean": [...], ...}, "actions": ...}}.
                           Checkpoints have it in assets/<dataset>/
-meta/stats.json           LeRobot dataset: {"observation.state": {...}, "action": {...}, ...}
-meta/episodes_stats.jsonl LeRobot dataset, version 2.1: one such object per episode, under "stats"
 policy_preprocessor.json  LeRobot policy: its normalizer step names a safetensors file with tensors
                           "observation.state.mean" and so on, as does the unnormalizer step of
                           policy_postprocessor.json
+meta/stats.json           LeRobot dataset: {"observation.state": {...}, "action": {...}, ...}
+meta/episodes_stats.jsonl LeRobot dataset, version 2.1: one such object per episode, under "stats"
 model.safetensors         older LeRobot policy: tensors among the weights, named
                           "normalize_inputs.buffer_observation_state.mean" or, by dataset,
                           "normalize_inputs.so100_buffer_observation_state.mean"
@@ -133,11 +133,11 @@ _READERS: dict[str, Callable[[list[Path]], dict[str, Stats]]] = {
     OURS: _ours,
     OPENPI: _openpi,
     f"assets/**/{OPENPI}": _openpi,
+    PIPELINES[0]: _policy,
     f"meta/{DATASET}": _dataset,
     DATASET: _dataset,
     f"meta/{EPISODES}": _episodes,
     EPISODES: _episodes,
-    PIPELINES[0]: _policy,
     "*.safetensors": _weights,
 }
 

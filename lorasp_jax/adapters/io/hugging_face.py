@@ -284,15 +284,11 @@ def _to_peft(layer: AdaptedLayer, index: tuple[int, ...]) -> tuple[float, Adapte
         active = np.flatnonzero(params["lora_e"])
         active = active if len(active) else np.array([0])  # PEFT needs a rank of at least 1
         a, b = (a * params["lora_e"])[:, active], b[active]
-    if isinstance(layer, nnx_layers.EmbedLayer):
-        names = ("lora_embedding_A", "lora_embedding_B")
-    else:
-        names = ("lora_A.weight", "lora_B.weight")
-        if isinstance(layer, nnx_layers.ConvLayer):
-            sizes = layer.kernel_size  # pyright: ignore[reportAttributeAccessIssue]
-            a = a.reshape(*sizes, -1, a.shape[-1])
-            b = b.reshape(*(1 for _ in sizes), *b.shape)
-    tensors = dict(zip(names, (to_torch(a), to_torch(b)), strict=True))
+    if isinstance(layer, nnx_layers.ConvLayer):
+        sizes = layer.kernel_size  # pyright: ignore[reportAttributeAccessIssue]
+        a, b = a.reshape(*sizes, -1, a.shape[-1]), b.reshape(*(1 for _ in sizes), *b.shape)
+    name = "lora_embedding_{}" if isinstance(layer, nnx_layers.EmbedLayer) else "lora_{}.weight"
+    tensors = {name.format("A"): to_torch(a), name.format("B"): to_torch(b)}
     if "magnitude" in params:
         tensors["lora_magnitude_vector"] = params["magnitude"]
     return layer.method.scale, tensors  # pyright: ignore[reportAttributeAccessIssue, reportOptionalMemberAccess]

@@ -7,7 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import lorasp_jax
+from lorasp_jax.adapters.io import hugging_face
 from lorasp_jax.base import hub
+from lorasp_jax.models.backbone import Backbone
+from lorasp_jax.models.checkpoints import loading
 from lorasp_jax.policies import statistics_files
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor
@@ -75,14 +78,16 @@ def load_checkpoint(
         size: a size of π0, such as "base_pi05", for checkpoints that do not record it.
         dtype: of parameters and products; "" leaves the default.
         cameras: backbone camera -> the robot's name for it; empty: the backbone's names.
-        adapters: name -> folder; see `load_adapters`.
+        adapters: name -> folder of `save_adapters`, or LeRobot's of a PEFT adapter, which can also
+            be a Hub repository.
 
     Raises:
         ValueError: something is missing or does not fit; see `models.load`, `statistics_files.read`
             and `Processor.of`.
     """
-    folder = hub.local(where)  # once: asking a hub again could give another revision
-    config = sized("pi0", size) if size else lorasp_jax.models.load_config(folder)
+    checkpoint = loading.find(where)
+    folder = checkpoint.folder  # asking a hub again could give another revision
+    config = checkpoint.resized(sized("pi0", size)) if size else checkpoint.config
     if dtype:
         config = dataclasses.replace(config, dtype=dtype, param_dtype=dtype)
     moments = statistics_files.read(statistics or folder, dataset=dataset)
@@ -95,8 +100,14 @@ def load_checkpoint(
     prompts = PromptTable.of(words, ["press the button"], config, num_joints=joints)
     prompts = dataclasses.replace(prompts, instructions=())
     processor = Processor.of(config, moments, prompts, num_joints=joints, cameras=cameras or None)
-    model = lorasp_jax.models.load(folder, config)
+    model = checkpoint.load(config)
     models = {UNADAPTED: model}
-    for name, path in (adapters or {}).items():
-        models[name] = lorasp_jax.load_adapters(path, model)
+    models |= {name: _adapted(path, model) for name, path in (adapters or {}).items()}
     return {name: Loaded(Policy(each, processor), words) for name, each in models.items()}
+
+
+def _adapted(where: str, model: Backbone) -> Backbone:
+    """Return the model with the adapters of a folder."""
+    if hub.is_remote(where) or (Path(where) / hugging_face.CONFIG).exists():
+        return lorasp_jax.load_peft(where, model, names=lorasp_jax.models.lerobot_names(model))
+    return lorasp_jax.load_adapters(where, model)

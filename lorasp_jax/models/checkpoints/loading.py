@@ -7,16 +7,21 @@ import os
 from pathlib import Path
 from typing import Any, Literal
 
+from lorasp_jax.adapters.io import hugging_face
 from lorasp_jax.base import hub, json_values
 from lorasp_jax.base.files import as_value_error, read_json
 from lorasp_jax.models import backbone
 from lorasp_jax.models.checkpoints import lerobot_config, native, published
 from lorasp_jax.models.checkpoints.layouts import ModelMismatchError
-from lorasp_jax.models.checkpoints.tensor_files import weight_files
+from lorasp_jax.models.checkpoints.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.inputs import InputConfig
+from lorasp_jax.models.pi0 import lerobot as pi0_files
 
 _log = logging.getLogger(__name__)
+_DEPTHS = ("*", "*/*", "checkpoints/*/pretrained_model")  # where an experiment's models are
+_PARTS = (SINGLE, INDEX, hugging_face.TENSORS, f"params/{published.METADATA}")
+_UNFINISHED = "orbax-checkpoint-tmp"  # in the name of a folder that Orbax is writing
 
 Layout = Literal["ours", "openpi", "lerobot"]
 
@@ -28,7 +33,8 @@ class ModelFolder:
     Attributes:
         folder: its path.
         layout: "ours" (this project's config.json), "openpi" (Orbax folder `params`) or, for any
-            other folder, "lerobot" (safetensors and a config.json with the policy type).
+            other folder, "lerobot" (safetensors with LeRobot's names: a policy of LeRobot, whose
+            config.json has the policy type, or openpi's PyTorch conversion).
         fields: contents of config.json; empty if there is no such file.
     """
 
@@ -48,6 +54,17 @@ class ModelFolder:
         if self.layout == "openpi":
             return backbone.find("pi0").base()
         return _lerobot_config(self.folder, self.fields)
+
+    def resized(self, config: BackboneConfig) -> BackboneConfig:
+        """Return a config with the lengths that openpi's PyTorch conversions record.
+
+        Raises:
+            ValueError: the folder records all sizes itself.
+        """
+        if self.layout == "ours" or "type" in self.fields:
+            raise ValueError(f"{self.folder / native.CONFIG} records the sizes: leave out --size")
+        with as_value_error(self.folder / native.CONFIG):
+            return pi0_files.with_lengths(config, self.fields)
 
     @property
     def inputs(self) -> InputConfig | None:
@@ -83,20 +100,26 @@ def find(where: str | os.PathLike[str]) -> ModelFolder:
         where: a folder, "hf://owner/name" or "gs://bucket/folder"; see `hub.local`.
 
     Raises:
-        ValueError: `where` cannot be reached, or its config.json is damaged.
+        ValueError: `where` cannot be reached, its config.json is damaged, or it is an adapter or a
+            folder of several models.
     """
     folder = hub.local(where)
     fields = _read_fields(folder)
     if "backbone" in fields:
         return ModelFolder(folder, "ours", fields)
-    return ModelFolder(folder, "openpi" if published.orbax_folder(folder) else "lerobot", fields)
+    if published.orbax_folder(folder):
+        return ModelFolder(folder, "openpi", fields)
+    if fields.get("use_peft") or not _has_weights(folder):
+        _refuse_adapter(folder, os.fspath(where))
+        _refuse_parent(folder)
+    return ModelFolder(folder, "lerobot", fields)
 
 
 def load(where: str | os.PathLike[str], config: Any = None) -> Any:
     """Load a model from a folder, a Hugging Face Hub repository or a bucket.
 
     The layout is detected from the files: this project's config.json, LeRobot's config.json with
-    the policy type, or openpi's Orbax folder `params`.
+    the policy type, openpi's Orbax folder `params`, or the safetensors of its PyTorch conversion.
 
     Args:
         where: a folder, "hf://owner/name" or "gs://bucket/folder"; see `hub.local`.
@@ -129,8 +152,14 @@ def _read_fields(folder: Path) -> dict[str, Any]:
 
 
 def _lerobot_config(folder: Path, fields: dict[str, Any]) -> BackboneConfig:
-    if not fields and any(path.exists() for path in weight_files(folder)):
-        raise ValueError(f"{folder} has weights, but no {native.CONFIG} with sizes: pass a config")
+    if pi0_files.is_conversion(fields):
+        with as_value_error(folder / native.CONFIG):
+            names = TensorFiles(weight_files(folder))
+            return pi0_files.conversion_config(fields, pi05="time_mlp_in.weight" in names)
+    if "type" not in fields and _has_weights(folder):
+        raise ValueError(
+            f"{folder} has weights, but no {native.CONFIG} with sizes: pass a config, or --size"
+        )
     if "type" not in fields:
         raise ValueError(
             f"{folder} contains no model: expected this project's or LeRobot's {native.CONFIG}, "
@@ -138,6 +167,43 @@ def _lerobot_config(folder: Path, fields: dict[str, Any]) -> BackboneConfig:
         )
     with as_value_error(folder / native.CONFIG):
         return lerobot_config.parse(fields)
+
+
+def _has_weights(folder: Path) -> bool:
+    """Whether a folder has safetensors with a model's weights."""
+    return any(path.exists() for path in weight_files(folder))
+
+
+def _refuse_adapter(folder: Path, where: str) -> None:
+    """Raise ValueError for a folder of Hugging Face PEFT, which LeRobot writes beside a config."""
+    if not (path := folder / hugging_face.CONFIG).exists():
+        return
+    with as_value_error(path):
+        base = str(read_json(path).get("base_model_name_or_path") or "its base")
+    if hub.REPOSITORY.fullmatch(base) and not os.path.exists(base):
+        base = hub.HUB + base
+    raise ValueError(
+        f"{where} is a PEFT adapter of {base}, not a model: load {base}, then the adapter with "
+        f"load_peft(..., names=models.lerobot_names(model)); to serve it, pass {base} --adapter "
+        f"NAME={where} --statistics {where}"
+    )
+
+
+def _refuse_parent(folder: Path) -> None:
+    """Raise ValueError for a folder without a model that contains folders of models.
+
+    openpi has one folder a step, and LeRobot checkpoints/<step>/pretrained_model.
+    """
+    below = {
+        path.parent.parent if path.name == published.METADATA else path.parent
+        for depth in _DEPTHS
+        for part in _PARTS
+        for path in folder.glob(f"{depth}/{part}")
+        if _UNFINISHED not in str(path)
+    }
+    if below:
+        last = max(map(str, below), key=lambda name: (len(name), name))
+        raise ValueError(f"{folder} contains no model itself: pass a folder below, such as {last}")
 
 
 def _require_same_heads(config: Any, folder: Path, fields: dict[str, Any]) -> None:

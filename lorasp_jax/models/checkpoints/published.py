@@ -30,11 +30,13 @@ from lorasp_jax.base.files import check_local, check_memory
 from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.models.checkpoints import layouts, orbax_folders
 from lorasp_jax.models.checkpoints.native import base_arrays, by_path, named_arrays, set_arrays
-from lorasp_jax.models.checkpoints.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
+from lorasp_jax.models.checkpoints.tensor_files import SINGLE, TensorFiles, weight_files
 from lorasp_jax.models.pi0 import openpi_lora
 
+METADATA = "_METADATA"
+"""File of every Orbax folder."""
 _CONCURRENT_GB = 1  # host memory that Orbax may use in addition to the result
-_PREFIX = "model."  # prefix of every tensor in a LeRobot policy
+_PREFIX, _WEIGHT = "model.", ".weight"  # of every tensor in a LeRobot policy, of most
 # Normalization statistics, which older LeRobot versions stored among the weights.
 _STATISTIC = re.compile(r"(?:un)?normalize_(?:inputs|targets|outputs)\.")
 _COMPILED = "_orig_mod."  # prefix that torch.compile adds
@@ -125,6 +127,31 @@ def stored_dtypes(folder: Path, config: Any) -> dict[str, np.dtype]:
     return {name: theirs[name].dtype for name in theirs}
 
 
+def lerobot_names(model: Any) -> Callable[[str, tuple[int, ...]], str]:
+    """Names of a backbone's layers in LeRobot's PEFT folders, the `names` of `load_peft`.
+
+    LeRobot adapts the policy that holds the network as `model` (policies/pretrained.py,
+    wrap_with_peft).
+
+    Args:
+        model: a backbone, not part of a larger model.
+
+    Returns:
+        Function (path, index) -> module name.
+    """
+    layers: dict[str, tuple[str, ...]] = {}
+    for rule in _published_names(model.config).LAYOUTS["lerobot"](model.config):
+        if rule.theirs[0].endswith(_WEIGHT):
+            layers.setdefault(rule.ours[0].rpartition("/")[0], rule.theirs)
+
+    def name(path: str, index: tuple[int, ...]) -> str:
+        if path not in layers:
+            raise ValueError(f"{path} is no layer of the backbone: load into the backbone itself")
+        return _PREFIX + layers[path][index[0] if index else 0].removesuffix(_WEIGHT)
+
+    return name
+
+
 def _published_names(config: Any) -> ModuleType:
     package = type(config).__module__.rpartition(".")[0]
     return importlib.import_module(f"{package}.published_names")
@@ -135,8 +162,8 @@ def _open(folder: Path, lerobot_name: Callable[[str], str]) -> tuple[str, Mutabl
     if params := orbax_folder(folder):
         return "openpi", _restore(params)
     files = weight_files(folder)
-    if not ((folder / INDEX).exists() or files[0].exists()):
-        raise ValueError(f"{folder} has neither openpi's params/_METADATA nor LeRobot's {SINGLE}")
+    if files == [folder / SINGLE] and not files[0].exists():
+        raise ValueError(f"{folder} has neither openpi's params/{METADATA} nor LeRobot's {SINGLE}")
 
     def rename(name: str) -> str:
         return lerobot_name(name.removeprefix(_PREFIX).removeprefix(_COMPILED))
@@ -145,9 +172,14 @@ def _open(folder: Path, lerobot_name: Callable[[str], str]) -> tuple[str, Mutabl
 
 
 def orbax_folder(folder: Path) -> Path | None:
-    """Return the Orbax folder of an openpi checkpoint, or None if there is none."""
+    """Return the Orbax folder of an openpi checkpoint, or None if there is none.
+
+    Like openpi (policies/policy_config.py), prefers a PyTorch conversion, a safetensors file.
+    """
+    if (folder / SINGLE).exists():
+        return None
     candidates = (folder / "params", folder)
-    return next((path for path in candidates if (path / "_METADATA").exists()), None)
+    return next((path for path in candidates if (path / METADATA).exists()), None)
 
 
 def _restore(folder: Path) -> dict[str, np.ndarray]:

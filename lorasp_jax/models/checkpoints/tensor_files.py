@@ -21,13 +21,16 @@ SINGLE, INDEX = "model.safetensors", "model.safetensors.index.json"
 
 
 def weight_files(folder: Path) -> list[Path]:
-    """List the shards in a folder's index or, without an index, its single safetensors file.
+    """List a folder's single safetensors file or, without one, the shards in its index.
+
+    Transformers prefers the single file (modeling_utils.py), and LeRobot reads nothing else
+    (policies/pretrained.py).
 
     Raises:
         ValueError: the index is damaged or names files outside the folder.
     """
     index = folder / INDEX
-    if not index.exists():
+    if (folder / SINGLE).exists() or not index.exists():
         return [folder / SINGLE]
     with as_value_error(index):
         names = sorted(set(read_json(index)["weight_map"].values()))
@@ -61,11 +64,13 @@ class TensorFiles(MutableMapping[str, np.ndarray]):
         self._tensors[new] = self._tensors.pop(old)
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Read a tensor; raise ValueError if it is larger than this machine's memory."""
+        """Read a tensor; raise ValueError if it is float8 or larger than this machine's memory."""
         file, stored = self._tensors[name]
         tensor = file.get_slice(stored)
         bits = re.search(r"\d+", tensor.get_dtype())  # "BF16", "F8_E4M3", "BOOL"
         check_memory(math.prod(tensor.get_shape()) * (int(bits[0]) if bits else 8) // 8, name)
+        if tensor.get_dtype().startswith("F8"):
+            raise ValueError(f"{name} is in {tensor.get_dtype()}: convert it to bf16 or float32")
         return file.get_tensor(stored)
 
     def __delitem__(self, name: str) -> None:

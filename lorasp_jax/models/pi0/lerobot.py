@@ -1,11 +1,16 @@
-"""Convert the config.json of a LeRobot 0.6 pi0 or pi0.5 policy (policies/pi0, policies/pi05)."""
+"""Convert the config.json of a LeRobot 0.6 pi0 or pi0.5 policy (policies/pi0, policies/pi05).
+
+Also that of openpi's PyTorch conversions (examples/convert_jax_model_to_pytorch.py at 15a9616),
+whose tensors have the same names.
+"""
 
 import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
 from lorasp_jax.models.checkpoints.lerobot_config import require
-from lorasp_jax.models.inputs import LEROBOT_PI0, LEROBOT_PI05
+from lorasp_jax.models.config import BackboneConfig
+from lorasp_jax.models.inputs import LEROBOT_PI0, LEROBOT_PI05, OPENPI, OPENPI_PI05
 from lorasp_jax.models.pi0.pi0 import Pi0Config
 
 
@@ -31,6 +36,27 @@ def pi05_config(fields: Mapping[str, Any]) -> Pi0Config:
     config = Pi0Config.base_pi05()
     return dataclasses.replace(
         pi0_config(fields), pi05=True, max_tokens=config.max_tokens, inputs=LEROBOT_PI05
+    )
+
+
+def is_conversion(fields: Mapping[str, Any]) -> bool:
+    """Whether the fields are those of openpi's PyTorch conversion."""
+    return "type" not in fields and "action_horizon" in fields
+
+
+def conversion_config(fields: Mapping[str, Any], *, pi05: bool) -> BackboneConfig:
+    """Like `pi0_config`, for openpi's PyTorch conversion, which does not record `pi05`."""
+    config = (pi05_config if pi05 else pi0_config)(fields)
+    config = dataclasses.replace(config, inputs=OPENPI_PI05 if pi05 else OPENPI)
+    return with_lengths(config, fields)
+
+
+def with_lengths(config: BackboneConfig, fields: Mapping[str, Any]) -> BackboneConfig:
+    """Return a config with the lengths of chunks and actions that a conversion records."""
+    return dataclasses.replace(
+        config,
+        chunk=fields.get("action_horizon", config.chunk),
+        action_dim=fields.get("action_dim", config.action_dim),
     )
 
 

@@ -39,6 +39,8 @@ CASES = {
     "bias_all": peft.LoraConfig(**LORA, bias="all"),
     "bias_lora_only": peft.LoraConfig(**LORA, bias="lora_only"),
     "modules_to_save": peft.LoraConfig(r=3, target_modules=["lin.0"], modules_to_save=["lin.2"]),
+    "end_of_a_name": peft.LoraConfig(r=3, target_modules=["lin.0"], modules_to_save=["n.2"]),
+    "lookahead": peft.LoraConfig(**LORA, alpha_pattern={r"(?!lin\.2).*\d": 1}),
     "pissa": peft.LoraConfig(**LORA, init_lora_weights="pissa"),
     "olora": peft.LoraConfig(**LORA, init_lora_weights="olora"),
     "loha": peft.LoHaConfig(r=4, target_modules=ENDS),

@@ -31,6 +31,8 @@ RANKS = {
     "bias_all": [4, 4],
     "bias_lora_only": [4, 4],
     "modules_to_save": [3],
+    "end_of_a_name": [3],
+    "lookahead": [4, 4],
     "pissa": [8, 8],  # twice PEFT's rank, as an update of the original base
     "olora": [8, 8],
 }

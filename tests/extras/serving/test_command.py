@@ -50,9 +50,11 @@ def test_a_checkpoint_is_loaded_with_and_without_adapters(dummy_base, tmp_path):
     graphdef, adapters, frozen = lorasp_jax.split(adapted)
     adapted = nnx.merge(graphdef, with_noise(adapters, 0.1), frozen)
     native.save_adapters(tmp_path / "ours", adapted)
-    loaded = loading.load_checkpoint(str(dummy_base), adapters={"mine": str(tmp_path / "ours")})
+    lorasp_jax.save_peft(tmp_path / "theirs", adapted, names=models.lerobot_names(adapted))
+    adapters = {name: str(tmp_path / name) for name in ("ours", "theirs")}
+    loaded = loading.load_checkpoint(str(dummy_base), adapters=adapters)
     adapted_paths = {n: len(adaptation.methods(each.policy.model)) for n, each in loaded.items()}
-    assert adapted_paths == {"base": 0, "mine": 3}  # vision, language, action
+    assert adapted_paths == {"base": 0, "ours": 3, "theirs": 3}  # vision, language, action
     processor = loaded["base"].policy.processor
     assert processor.robot_slots == (0, 1, 2, 3, 4, 5, 7)
     np.testing.assert_array_equal(np.asarray(processor.statistics.state["std"])[:6], 2)
@@ -63,6 +65,8 @@ def test_a_checkpoint_is_loaded_with_and_without_adapters(dummy_base, tmp_path):
     [
         ({"where": "assets/pi0_nano"}, "number of joints: pass --joints"),
         ({"size": "huge"}, "unknown size 'huge'"),
+        ({"size": "base_pi05"}, "records the sizes: leave out --size"),
+        ({"where": "assets"}, "assets contains no model itself: .* such as .*assets/"),
         ({"statistics": str(ROOT / "tests" / "models")}, "no statistics in"),
         ({"cameras": {"top": "front"}}, "keys of cameras"),
     ],

@@ -1,5 +1,6 @@
 """`load` for every layout; the published sizes are replaced by those of the golden models."""
 
+import dataclasses
 import json
 import logging
 import shutil
@@ -12,6 +13,7 @@ import safetensors.numpy
 from lorasp_jax import models
 from lorasp_jax.models.checkpoints import loading, published
 from lorasp_jax.models.checkpoints.native import named_arrays
+from lorasp_jax.models.inputs import OPENPI, OPENPI_PI05
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
 from tests.models import test_pi0_parity as pi0
@@ -99,6 +101,70 @@ def test_openpi(tmp_path):
     assert model.config == models.load_config(folder) == pi0.CONFIG
     assert loading.find(folder).layout == "openpi"
     assert_same(model, published.load_published(folder / "params", pi0.CONFIG)[0])
+
+
+def test_single_files_win_as_in_the_projects_that_own_the_layouts(tmp_path):
+    """Over shards in Transformers and LeRobot, over `params` in openpi."""
+    model = random_backbone(Pi0Config.dummy())
+    for layout in ("lerobot", "openpi"):
+        published.save(tmp_path, model, layout)
+    tensors = safetensors.numpy.load_file(tmp_path / "model.safetensors")
+    changed = {name: array + 1 for name, array in tensors.items()}
+    safetensors.numpy.save_file(changed, tmp_path / "model-00001-of-00001.safetensors")
+    shards = dict.fromkeys(tensors, "model-00001-of-00001.safetensors")
+    (tmp_path / "model.safetensors.index.json").write_text(json.dumps({"weight_map": shards}))
+    assert_same(models.load(tmp_path, model.config), model)
+    safetensors.numpy.save_file(changed, tmp_path / "model.safetensors")
+    loaded = models.load(tmp_path, model.config)
+    np.testing.assert_array_equal(loaded.state_proj.bias[...], model.state_proj.bias[...] + 1)
+
+
+@pytest.mark.parametrize("pi05", [False, True])
+def test_conversions_of_openpi(pi05, tmp_path, monkeypatch):
+    """No prefix in the names; chunk and action length are in config.json, pi05 in the names."""
+    config = dataclasses.replace(pi0.CONFIG, pi05=pi05, chunk=10)
+    monkeypatch.setattr(
+        Pi0Config, "base_pi05", lambda: dataclasses.replace(pi0.CONFIG, pi05=True, max_tokens=20)
+    )
+    model = random_backbone(config)
+    published.save(tmp_path, model, "lerobot")
+    tensors = safetensors.numpy.load_file(tmp_path / "model.safetensors")
+    tensors = {name.removeprefix("model."): array for name, array in tensors.items()}
+    safetensors.numpy.save_file(tensors, tmp_path / "model.safetensors")
+    fields = {"action_dim": 32, "action_horizon": 10, "paligemma_variant": "gemma_2b"}
+    (tmp_path / "config.json").write_text(json.dumps(fields | {"precision": "bfloat16"}))
+    loaded = models.load(tmp_path)
+    assert_same(loaded, model)
+    assert (loaded.config.pi05, loaded.config.chunk) == (pi05, 10)
+    assert loaded.config.inputs == (OPENPI_PI05 if pi05 else OPENPI)
+    assert loading.find(tmp_path).resized(pi0.CONFIG).chunk == 10
+    (tmp_path / "config.json").write_text(json.dumps(fields | {"type": "pi0"}))
+    with pytest.raises(ValueError, match="leave out --size"):
+        loading.find(tmp_path).resized(pi0.CONFIG)
+
+
+def test_a_folder_of_several_checkpoints(tmp_path):
+    for step in ("5000", "20000", "30000.orbax-checkpoint-tmp-3"):
+        shutil.copytree(pi0.GOLDEN / "orbax", tmp_path / "pi0_mine" / "try" / step)
+    for where in (tmp_path / "pi0_mine" / "try", tmp_path / "pi0_mine"):
+        with pytest.raises(ValueError, match=r"no model itself: .* such as .*/try/20000$"):
+            models.load(where, pi0.CONFIG)
+    lerobot = tmp_path / "lerobot" / "checkpoints" / "005000" / "pretrained_model"
+    lerobot.mkdir(parents=True)
+    (lerobot / "model.safetensors").touch()
+    with pytest.raises(ValueError, match=r"005000/pretrained_model$"):
+        models.load_config(tmp_path / "lerobot")
+
+
+def test_an_adapter_is_not_a_model(tmp_path):
+    (tmp_path / "config.json").write_text(json.dumps({**FIELDS, "use_peft": True}))
+    (tmp_path / "adapter_config.json").write_text(
+        json.dumps({"peft_type": "LORA", "base_model_name_or_path": "lerobot/smolvla_base"})
+    )
+    expected = f"PEFT adapter of hf://lerobot/smolvla_base, .* --adapter NAME={tmp_path}"
+    for load in (models.load, models.load_config, lambda path: models.load(path, smolvla.CONFIG)):
+        with pytest.raises(ValueError, match=expected):
+            load(tmp_path)
 
 
 def test_ours_and_the_hub(tmp_path, monkeypatch):
