@@ -123,6 +123,8 @@ def tensors(prefix="", separator=".", names=NAMES):
 
 def test_lerobot_policy(tmp_path):
     pre = {**tensors(), "observation.state.count": np.array([126])}
+    of_a_dataset = {name: lists(STATE + 1) for name in ("observation.state", "action")}
+    (tmp_path / "stats.json").write_text(json.dumps(of_a_dataset))
     assert_statistics(statistics_files.read(policy(tmp_path, pre, tensors())))
     other = {**tensors(), "action.mean": ACTION[0] + 1}
     with pytest.raises(ValueError, match=r"action\.mean"):

@@ -163,7 +163,7 @@ def _match_folder(
             f"{folder} adapts {short(effective[0])}, the name of no layer that adapters support; "
             f"{known}"
         )
-    check_biases(folder, config.get("bias", "none"), contents.trained, sizes, values)
+    check_biases(folder, config.get("bias") or "none", contents.trained, sizes, values)
     trained, frozen = base_parameters(folder, contents, shapes, sizes, names)
     # These rules come first, since the bias of an adapted layer may be fully fine-tuned.
     full_rules = [(f"^{re.escape(path)}$", FullFineTuning()) for path in trained]

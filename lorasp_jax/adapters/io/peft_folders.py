@@ -15,9 +15,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lorasp_jax.adapters import paths
 from lorasp_jax.adapters.io.native import read_tensors
 from lorasp_jax.base import json_values
-from lorasp_jax.base.files import RefusedError, as_value_error, read_json
+from lorasp_jax.base.files import as_value_error, read_json
 from lorasp_jax.peft.fields import short
 
 CONFIG, TENSORS = "adapter_config.json", "adapter_model.safetensors"
@@ -102,7 +103,7 @@ def read_folder(folder: pathlib.Path) -> PeftFolder:
         if key in values or len(adapter_names) > 1:
             raise ValueError(f"{folder} has several tensors for {short(name)}: save one adapter")
         values[key] = tensor.astype(np.float32)
-    with as_value_error(folder, re.error):
+    with paths.naming("load", folder):
         adapters = {name: _from_peft(config, name, tensors) for name, tensors in modules.items()}
     return PeftFolder(config, adapters, trained, base)
 
@@ -149,7 +150,10 @@ def _from_peft(config: Mapping[str, Any], module: str, tensors: Adapter) -> Adap
         if (first := config.get("init_r") or 0) < 1:
             raise ValueError(f"{module} needs an init_r of at least 1 for its scale, got {first}")
         scale = alpha / (first + _ADA_CONSTANT)
-        a = a * tensors["lora_E"][:, 0]
+        e = _matrix(module, tensors["lora_E"])
+        if e.shape != (1, a.shape[1]):
+            raise ValueError(f"{module} has {e.shape} singular values for rank {a.shape[1]}")
+        a = a * e
     else:
         rank = a.shape[1]
         scale = alpha / (math.sqrt(rank) if config.get("use_rslora") else rank)
@@ -185,13 +189,18 @@ def _alpha(config: Mapping[str, Any], module: str) -> Any:
     patterns = config.get("alpha_pattern") or {} if config["peft_type"] == "LORA" else {}
     for pattern, alpha in patterns.items():
         _check_cost(pattern, module)
-        if re.match(rf"(.*\.)?({pattern})$", module):
-            return alpha
+        try:
+            if re.match(rf"(.*\.)?({pattern})$", module):
+                return alpha
+        except (re.error, RecursionError, OverflowError) as error:
+            raise ValueError(
+                f"alpha_pattern has {short(pattern)}, which is wrong: {error}"
+            ) from error
     return config.get("lora_alpha")
 
 
 def _check_cost(pattern: str, module: str) -> None:
-    """Raise RefusedError if matching an untrusted pattern could take forever, as (a+)+b does.
+    """Raise ValueError if matching an untrusted pattern could take forever, as (a+)+b does.
 
     Without repeated groups and back references, each repetition has at most as many ends as the
     name has characters, and each group as many as it has alternatives.
@@ -201,7 +210,7 @@ def _check_cost(pattern: str, module: str) -> None:
     groups, bars = plain.count("(") + 1, plain.count("|")
     cost = math.log(len(module)) * (1 + repetitions) + math.log(bars / groups + 1) * groups
     if re.search(r"\)[*+{]|\\|\(\?(?!<?[=!]|:)", plain) or cost > math.log(_STEPS):
-        raise RefusedError(
-            f"alpha_pattern has {short(pattern)}, which may take forever to match: write it "
-            "without repeated groups, back references and flags, and with fewer repetitions"
+        raise ValueError(
+            f"alpha_pattern has {short(pattern)}: repeated groups, back references, named groups, "
+            "flags and many repetitions are not supported, as they may take forever to match"
         )

@@ -63,20 +63,29 @@ def base_parameters(
             continue
         if len(found) < len(keys):
             raise ValueError(f"{folder} has the {kind} of only some layers of {module}")
-        parts = [unused.pop(key) for key in keys]
-        value = np.stack([from_torch(part) if name == "kernel" else part for part in parts])
-        rows = value.shape[1:] if name == "kernel" else (value[0].size,)
         shape = tuple(size[len(leading) :])
-        if rows != (shape if name == "kernel" else (math.prod(shape),)):
-            raise ValueError(f"{path} has shape {rows} in {folder}, but {shape} in the model")
+        with paths.naming("load", folder):
+            parts = [_from_torch(path, unused.pop(key), shape) for key in keys]
         is_trained = not contents.trained.keys().isdisjoint(keys)
-        (trained if is_trained else frozen)[path] = value.reshape(tuple(size))
+        (trained if is_trained else frozen)[path] = np.stack(parts).reshape(tuple(size))
     # PEFT also stores an output layer that is tied to the embedding, which the model may not have.
     read = [value for key, value in contents.base.items() if key not in unused]
     for key, value in unused.items():
         if key in contents.trained or not any(np.array_equal(value, other) for other in read):
             raise ValueError(f"{folder} has the {key[1]} of {short(key[0])}, which the model lacks")
     return trained, frozen
+
+
+def _from_torch(path: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Convert one layer's parameter; raise ValueError unless it has the model's shape."""
+    name = path.rpartition("/")[2]
+    if name == "kernel" and value.ndim > 1:
+        value = from_torch(value)
+    elif name in ("scale", "bias") and value.size == math.prod(shape):
+        value = value.reshape(shape)  # ours may have head axes
+    if value.shape != shape:
+        raise ValueError(f"{path} must have shape {shape}, as in the model, got {value.shape}")
+    return value
 
 
 def check_biases(

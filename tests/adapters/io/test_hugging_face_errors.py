@@ -25,7 +25,7 @@ BAD_PATTERNS = (
         *[({name: bad}, name) for name in ("use_rslora", "use_dora") for bad in ("x", 1)],
         *[({"alpha_pattern": bad}, "alpha_pattern") for bad in ({"lin.0": "8"}, 3)],
         *[({"alpha_pattern": {p: 8}}, "alpha_pattern has") for p in BAD_PATTERNS],
-        ({"alpha_pattern": {"l(": 8}}, "is damaged"),
+        ({"alpha_pattern": {"l(": 8}}, "which is wrong"),
         ({"bias": 0}, "bias"),
         ({"init_lora_weights": "pissa"}, "init_lora_weights"),
     ],
