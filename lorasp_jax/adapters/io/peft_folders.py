@@ -25,7 +25,7 @@ CONFIG, TENSORS = "adapter_config.json", "adapter_model.safetensors"
 PREFIX = "base_model.model."
 # A state dict that PEFT did not save itself still has the adapter's name in its keys.
 _TENSOR = re.compile(
-    rf"{re.escape(PREFIX)}(?P<module>.+)\.lora_(?P<embedding>embedding_)?"
+    rf"{re.escape(PREFIX)}(?P<module>.+)\.lora_(?:embedding_)?"
     r"(?P<part>[ABE]|magnitude_vector)(?:\.(?!weight$)(?P<adapter>[^.]+))?(?:\.weight)?"
 )
 _BASE_TENSOR = re.compile(rf"{re.escape(PREFIX)}(.+?)(\.base_layer)?\.(weight|bias)")

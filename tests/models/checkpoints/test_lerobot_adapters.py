@@ -12,10 +12,11 @@ from flax import nnx
 import lorasp_jax
 from lorasp_jax import models
 from lorasp_jax.adapters.io import hugging_face
-from lorasp_jax.dense import Dense
+from lorasp_jax.dense import AdapterParam, Dense
 from lorasp_jax.models.checkpoints import published
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
+from tests.adapters.io.peft_folder import edit_config, edit_tensors
 
 PROJECTIONS = (
     "state_proj",
@@ -100,6 +101,25 @@ def test_names_are_those_of_the_published_tensors(policy, tmp_path):
     matrices = {name for name, tensor in tensors.items() if tensor.ndim > 1}
     tables = {name for name in matrices if re.search(r"embed_tokens|position_emb|lm_head", name)}
     assert found == matrices - tables
+
+
+def test_full_training_modules(tmp_path):
+    """LeRobot's option; the module is stored in full instead of an adapter."""
+    model = create("smolvla")
+    write(tmp_path, model, "smolvla")
+    d_in, d_out = model.state_proj.kernel.shape
+    prefix = "base_model.model.model.state_proj"
+    value = np.arange(d_in * d_out, dtype=np.float32).reshape(d_out, d_in)
+
+    def trained_in_full(tensors):
+        others = {name: array for name, array in tensors.items() if prefix not in name}
+        return others | {f"{prefix}.weight": value, f"{prefix}.bias": value[:, 0].copy()}
+
+    edit_tensors(tmp_path, trained_in_full)
+    edit_config(tmp_path, modules_to_save=["state_proj"])
+    loaded = lorasp_jax.load_peft(tmp_path, model, names=models.lerobot_names(model))
+    np.testing.assert_array_equal(loaded.state_proj.kernel[...], value.T)
+    assert isinstance(loaded.state_proj.kernel, AdapterParam)
 
 
 def test_a_part_of_a_backbone(tmp_path):
