@@ -1,8 +1,9 @@
 """Read statistics in the file formats of openpi and LeRobot, and in our own JSON.
 
 statistics.json           ours
-norm_stats.json           openpi: {"norm_stats": {"state": {"mean": [...], ...}, "actions": ...}}.
-                          Checkpoints have it in assets/<dataset>/
+assets/**/norm_stats.json openpi's checkpoint, by dataset: {"norm_stats": {"state": {"mean": [...],
+                          ...}, "actions": ...}}
+norm_stats.json           the same file elsewhere
 policy_preprocessor.json  LeRobot policy: its normalizer step names a safetensors file with tensors
                           "observation.state.mean" and so on, as does the unnormalizer step of
                           policy_postprocessor.json
@@ -131,8 +132,8 @@ def _weights(files: list[Path]) -> dict[str, Stats]:
 
 _READERS: dict[str, Callable[[list[Path]], dict[str, Stats]]] = {
     OURS: _ours,
-    OPENPI: _openpi,
     f"assets/**/{OPENPI}": _openpi,
+    OPENPI: _openpi,
     PIPELINES[0]: _policy,
     f"meta/{DATASET}": _dataset,
     DATASET: _dataset,

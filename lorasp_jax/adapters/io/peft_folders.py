@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lorasp_jax.adapters import paths
-from lorasp_jax.adapters.io.native import read_tensors
+from lorasp_jax.adapters.io.native import DESCRIPTION, read_tensors
 from lorasp_jax.base import json_values
 from lorasp_jax.base.files import as_value_error, read_json
 from lorasp_jax.peft.fields import short
@@ -82,6 +82,7 @@ def read_folder(folder: pathlib.Path) -> PeftFolder:
     Raises:
         ValueError: files are missing or damaged, or the adapter is not supported.
     """
+    _refuse_other_folders(folder)
     with as_value_error(folder / CONFIG):
         config = read_json(folder / CONFIG)
         json_values.check({name: v for name, v in config.items() if v is not None}, _FIELDS)
@@ -106,6 +107,16 @@ def read_folder(folder: pathlib.Path) -> PeftFolder:
     with paths.naming("load", folder):
         adapters = {name: _from_peft(config, name, tensors) for name, tensors in modules.items()}
     return PeftFolder(config, adapters, trained, base)
+
+
+def _refuse_other_folders(folder: pathlib.Path) -> None:
+    """Raise ValueError for a folder of `save_adapters`, or one above a PEFT folder."""
+    if (folder / CONFIG).exists():
+        return
+    if (folder / DESCRIPTION).exists():
+        raise ValueError(f"{folder} is a folder of save_adapters: load it with load_adapters")
+    if below := sorted(folder.glob(f"*/{CONFIG}")):
+        raise ValueError(f"{folder} lacks {CONFIG}: pass a folder below, as {below[-1].parent}")
 
 
 def _check_supported(folder: pathlib.Path, config: Mapping[str, Any]) -> None:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from lorasp_jax.adapters.io import hugging_face
+from lorasp_jax.adapters.io.native import save_adapters
 from lorasp_jax.peft import DoRA, FullFineTuning, LoRA, LoRASP
 from tests.adapters.io.peft_folder import Net, adapted, edit_config, edit_tensors
 
@@ -36,6 +37,14 @@ def test_unsupported_configs(copy, changes, name):
     edit_config(copy, **changes)
     with pytest.raises(ValueError, match=name):
         hugging_face.load_peft(copy, Net())
+
+
+def test_folders_of_another_kind(copy, tmp_path):
+    with pytest.raises(ValueError, match=f"pass a folder below, as {copy}"):
+        hugging_face.load_peft(copy.parent, Net())
+    save_adapters(tmp_path / "ours", adapted(("lin/0", LoRA(rank=2))))
+    with pytest.raises(ValueError, match="load it with load_adapters"):
+        hugging_face.load_peft(tmp_path / "ours", Net())
 
 
 def renamed(tensors):
