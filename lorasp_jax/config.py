@@ -168,6 +168,8 @@ class DataConfig:
     """Dataset to train on, which then also sets robot and tasks: LeRobot (folder or
     hf://owner/name), RLDS, or a cache (python -m lorasp_jax.data convert). Empty: collect
     demonstrations with the scripted expert."""
+    cameras: tuple[str, ...] = ()
+    """Cameras of the dataset to use, in the order of the backbone's; empty: all, by name."""
     episodes: int = 512
     """Successful demonstrations per task."""
     num_envs: int = 256
@@ -192,6 +194,8 @@ class DataConfig:
             raise ValueError("data.validation holds episodes of a dataset out: add data.source")
         if self.fresh_every and self.source:
             raise ValueError("data.fresh_every cannot be combined with data.source: drop one")
+        if self.cameras and not self.source:
+            raise ValueError("data.cameras are those of a dataset: name it with data.source")
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,10 @@ import math
 import numbers
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from types import MappingProxyType
+from typing import Any, Self, TypeVar
 
 import jax
 import numpy as np
@@ -19,6 +20,7 @@ from lorasp_jax.base.files import as_value_error
 from lorasp_jax.base.writing import atomic_file
 
 Array = jax.Array | np.ndarray
+T = TypeVar("T")
 
 SHARED = ("task", "robot", "control_dt", "physics_dt", "actions", "instructions")
 """Fields that must be equal in order to concatenate episodes."""
@@ -191,6 +193,36 @@ def check_camera(name: str) -> None:
     """Raise a ValueError if a camera's name cannot be part of a file name."""
     if not _CAMERA.fullmatch(name):
         raise ValueError(f"camera name {name[:80]!r} must have letters, digits, - _ . and spaces")
+
+
+def choose_cameras(
+    available: Mapping[str, T],
+    chosen: Sequence[str],
+    path: Path,
+    others: Mapping[str, str] = MappingProxyType({}),
+) -> tuple[dict[str, T], dict[str, str]]:
+    """Select cameras of a dataset.
+
+    Args:
+        available: camera -> anything.
+        chosen: names of the cameras to use; empty: all.
+        path: the dataset.
+        others: picture -> why it is not available.
+
+    Returns:
+        `available`, in the order of `chosen`; and camera -> why it is left out.
+
+    Raises:
+        ValueError: a camera is unknown, or there is none.
+    """
+    left = "".join(f"; {name} is left out ({reason})" for name, reason in others.items())
+    if not available:
+        raise ValueError(f"{path} has no color camera{left}")
+    if unknown := [name for name in chosen if name not in available]:
+        known = ", ".join(available)
+        raise ValueError(f"{path} has no camera {unknown[0]!r}: choose from {known}{left}")
+    skipped = {name: "not chosen" for name in available if chosen and name not in chosen}
+    return {name: available[name] for name in chosen or available}, {**others, **skipped}
 
 
 def concatenate(parts: Sequence[Episodes]) -> Episodes:

@@ -26,7 +26,7 @@ from array_record.python.array_record_data_source import ArrayRecordDataSource
 from google.protobuf.message import DecodeError
 
 from envs.datasets import rlds_schema
-from envs.datasets.episodes import SHARED, Episodes, concatenate
+from envs.datasets.episodes import SHARED, Episodes, choose_cameras, concatenate
 from lorasp_jax.base import json_values
 from lorasp_jax.base.files import as_value_error, check_regular, first_line, read_json
 from lorasp_jax.base.locks import locked
@@ -93,23 +93,32 @@ class Reader:
         path: folder of the dataset.
         metadata: see `ShardWriter`.
         cameras: camera -> feature of its images.
+        left_out: camera -> why it is not among the cameras.
         control_dt: time between two actions [s].
         num_steps: total number of control steps.
     """
 
     kind = "RLDS"
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: str | os.PathLike[str], cameras: Sequence[str] = ()) -> None:
         """Open a dataset.
 
+        Args:
+            path: the folder.
+            cameras: names of the cameras to use; empty: all.
+
         Raises:
-            ValueError: as in `read`.
+            ValueError: as in `read`, or a camera is unknown.
         """
         self.path: Path = Path(path)
         self.metadata: dict[str, Any] = metadata(self.path)
         with _reading(self.path):
-            cameras = self.metadata["cameras"]
-            self.cameras: dict[str, str] = {n: rlds_schema.image_feature(n) for n in cameras}
+            sizes = self.metadata["cameras"]
+        available = {name: rlds_schema.image_feature(name) for name in sizes}
+        self.cameras: dict[str, str]
+        self.left_out: dict[str, str]
+        self.cameras, self.left_out = choose_cameras(available, cameras, self.path)
+        with _reading(self.path):
             self.control_dt: float = float(self.metadata["control_dt"])
             self.num_steps: int = self.metadata["steps"]
             self._shared: dict[str, Any] = {name: self.metadata[name] for name in SHARED}

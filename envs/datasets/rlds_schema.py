@@ -184,8 +184,11 @@ def _chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def _decode(file: bytes, size: Any) -> np.ndarray:
-    """Decode an image to uint8 `[H, W, 3]`; raise ValueError if its size is not `size`."""
+    """Decode an image to uint8 `[H, W, 3]`; raise ValueError if its size is not `size`,
+    or if it has no colors."""
     with Image.open(io.BytesIO(file), formats=("PNG",)) as image:
         if [image.height, image.width] != list(size):  # checked before decoding
             raise ValueError(f"an image has {image.height} x {image.width} pixels, not {size}")
+        if image.mode != "RGB":
+            raise ValueError(f"an image has the mode {image.mode}, not RGB")
         return np.asarray(image)

@@ -13,7 +13,8 @@ equalities. A hinge's limits are the intersection of its range and its actuator'
 camera "wrist" becomes the wrist camera; an arm without one gets that of the built-in robots.
 
 As on the built-in robots, only the fingers collide, because MJX is slow with meshes. Each finger
-gets a small sphere at its tip, and a box around those of its colliding geoms that reach near it.
+gets a small sphere at its tip, and a box around those of its colliding geoms that reach near it;
+if a mesh is thicker further up, only its end counts.
 """
 
 import os

@@ -50,7 +50,7 @@ def find(model: mujoco.MjModel, arm: ArmIds, tcp: str | None) -> Hand:
     signs, across = _open(model, data, arm)
     site = _site(model, tcp)
     axes = _axes(model, data, arm, across, site)
-    left, right = (_end(_corners(model, data, joint) @ axes) for joint in arm.fingers)
+    left, right = _bounds(model, data, arm, axes)
     gap = left[0, 1] - right[1, 1]
     if gap < 2 * TIP_RADIUS:
         raise ValueError(f"the fingers open by only {1000 * gap:.0f} mm")
@@ -84,7 +84,11 @@ def _open(model: mujoco.MjModel, data: mujoco.MjData, arm: ArmIds) -> tuple[np.n
     if abs(along[1]) < _PARALLEL:
         raise ValueError(f"the fingers' axes are {_degrees(along[1])} deg apart, not on one line")
     address = model.jnt_qposadr[arm.fingers]
-    centers = [_corners(model, data, joint).mean(axis=(0, 1)) @ line for joint in arm.fingers]
+    points = [_points(model, data, joint) for joint in arm.fingers]
+    out = np.mean([p.mean(axis=0) for p in points], axis=0) - data.xanchor[arm.joints[-1]]
+    out -= (out @ line) * line
+    out /= max(float(np.linalg.norm(out)), 1e-9)
+    centers = [_near_end(p, p @ out).mean(axis=0) @ line for p in points]
 
     def offset(ends: tuple[float, ...]) -> float:
         first, second = centers + along * (ends - data.qpos[address])
@@ -99,18 +103,40 @@ def _open(model: mujoco.MjModel, data: mujoco.MjData, arm: ArmIds) -> tuple[np.n
 
 def _corners(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> np.ndarray:
     """Return the corners `[N, 8, 3]` of the bounding boxes of the N colliding geoms of a finger."""
-    finger, corners = model.jnt_bodyid[joint], []
-    for geom in np.flatnonzero(model.geom_contype | model.geom_conaffinity):
+    boxes = {geom: model.geom_aabb[geom].reshape(2, 3) for geom in _geoms(model, joint)}
+    corners = {geom: center + half * _CORNERS for geom, (center, half) in boxes.items()}
+    return np.stack([_in_world(data, geom, points) for geom, points in corners.items()])
+
+
+def _points(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> np.ndarray:
+    """Return the points `[N, 3]` of a finger: vertices of its meshes, corners of other geoms."""
+    points = []
+    for geom, corners in zip(_geoms(model, joint), _corners(model, data, joint), strict=True):
+        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
+            mesh = model.geom_dataid[geom]
+            first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+            corners = _in_world(data, geom, model.mesh_vert[first : first + count])
+        points.append(corners)
+    return np.concatenate(points)
+
+
+def _geoms(model: mujoco.MjModel, joint: int) -> list[int]:
+    """Return the colliding geoms of a finger."""
+    finger, geoms = model.jnt_bodyid[joint], []
+    for geom in np.flatnonzero(model.geom_contype | model.geom_conaffinity).tolist():
         body = model.geom_bodyid[geom]
         while body > finger:  # parents have smaller ids than their children
             body = model.body_parentid[body]
         if body == finger:
-            center, half = model.geom_aabb[geom].reshape(2, 3)
-            rotation = data.geom_xmat[geom].reshape(3, 3)
-            corners.append(data.geom_xpos[geom] + (center + half * _CORNERS) @ rotation.T)
-    if not corners:
+            geoms.append(geom)
+    if not geoms:
         raise ValueError(f"finger {model.joint(joint).name} needs a geom with contype, conaffinity")
-    return np.stack(corners)
+    return geoms
+
+
+def _in_world(data: mujoco.MjData, geom: int, points: np.ndarray) -> np.ndarray:
+    """Convert points `[N, 3]` of a geom to the world."""
+    return data.geom_xpos[geom] + points @ data.geom_xmat[geom].reshape(3, 3).T
 
 
 def _site(model: mujoco.MjModel, tcp: str | None) -> str | None:
@@ -147,11 +173,34 @@ def _axes(
     return np.stack([np.cross(across, z), across, z], axis=1)
 
 
+def _bounds(
+    model: mujoco.MjModel, data: mujoco.MjData, arm: ArmIds, axes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the bounds [2, 3] of both fingers along the hand's axes."""
+    left, right = (_end(_corners(model, data, joint) @ axes) for joint in arm.fingers)
+    tips = [_tip(_points(model, data, joint) @ axes) for joint in arm.fingers]
+    gap, tip_gap = left[0, 1] - right[1, 1], tips[0][0, 1] - tips[1][1, 1]
+    # A mesh may have a carriage behind its pad, even one that reaches over the middle.
+    return (tips[0], tips[1]) if tip_gap > gap + 2 * TIP_RADIUS else (left, right)
+
+
 def _end(corners: np.ndarray) -> np.ndarray:
     """Return the bounds [2, 3] of those boxes of a finger, [N, 8, 3], that reach near its end."""
-    reach = corners[:, :, 2].max(axis=1)
-    near = corners[reach > reach.max() - 2 * TIP_LENGTH].reshape(-1, 3)
+    near = _near_end(corners, corners[:, :, 2].max(axis=1)).reshape(-1, 3)
     return np.stack([near.min(axis=0), near.max(axis=0)])
+
+
+def _tip(points: np.ndarray) -> np.ndarray:
+    """Return the bounds [2, 3] of the end of a finger, given its points [N, 3]."""
+    near = _near_end(points, points[:, 2])
+    low, high = near.min(axis=0), near.max(axis=0)
+    low[2] = high[2] - 2 * TIP_LENGTH  # a straight finger has no vertices along its length
+    return np.stack([low, high])
+
+
+def _near_end(points: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Select those of `[N, ...]` points or boxes that reach, `[N]` in m, near a finger's end."""
+    return points[reach > reach.max() - 2 * TIP_LENGTH]
 
 
 def _center(

@@ -26,6 +26,7 @@ _TILTS = np.deg2rad([25, 94])  # in the task "pour": while carrying the cup, whi
 # Our choices, not dictated by the tasks.
 _TOLERANCE = 0.004  # m, largest error of a pose that counts as reached
 _LEVER = 0.1  # m, converts an error in angle to one in position
+_CENTERED = 0.05  # m from the z axis to the first hinge of an arm whose base is at the origin
 _MARGIN = 0.05  # rad, minimum distance of each joint from its limits
 _ROWS = 32  # poses solved at once
 _TRIES, _SPREAD = 8, 0.4  # number of random starts, standard deviation around the guess [rad]
@@ -47,6 +48,7 @@ def complete(robot: Robot) -> Robot:
         raise ValueError(
             f"the hand must reach x 0.34 m, y 0 m, z 0.18 m (the start of every episode), pointing "
             f"down or leaning outward by up to 45 deg; it misses by {1000 * errors.min():.0f} mm"
+            f"{_off_origin(robot)}"
         )
     cost = np.maximum(table_errors, _TOLERANCE)
     cost[errors > _TOLERANCE] = np.inf
@@ -56,12 +58,21 @@ def complete(robot: Robot) -> Robot:
     if cost[best] > _TOLERANCE:
         warnings.warn(
             f"robot {robot.name} misses parts of the table by up to "
-            f"{1000 * table_errors[best]:.0f} mm: it cannot solve every task layout",
+            f"{1000 * table_errors[best]:.0f} mm: it cannot solve every task layout"
+            f"{_off_origin(robot)}",
             stacklevel=3,
         )
     tool = robot.tool @ robots.rotation("z", float(turns[best]))
     robot = dataclasses.replace(robot, tool=tool, home=homes[best], lean=float(leans[best]))
     return dataclasses.replace(robot, tilt_side=_tilt_side(robot))
+
+
+def _off_origin(robot: Robot) -> str:
+    """Say where the base is if it is not at the origin."""
+    x, y = robot.chain[0, :2, 3]
+    if math.hypot(x, y) <= _CENTERED:
+        return ""
+    return f"; its first hinge is at x {x:.3g} m, y {y:.3g} m: place the base at the origin"
 
 
 def _try_leans(robot: Robot, leans: np.ndarray, turns: np.ndarray) -> tuple[np.ndarray, ...]:

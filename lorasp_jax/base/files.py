@@ -113,6 +113,14 @@ def read_json(path: Path, folder: Path | None = None) -> Any:
     return value
 
 
+def read_json_lines(path: Path, folder: Path | None = None) -> list[Any]:
+    """Read a file of one JSON value a line (see `read_bytes`).
+
+    Only a line feed ends a line: JSON strings may contain the other line ends of Unicode.
+    """
+    return [json.loads(line) for line in read_text(path, folder).split("\n") if line.strip()]
+
+
 @contextlib.contextmanager
 def as_value_error(path: Path, *also: type[Exception], remedy: str = "") -> Iterator[None]:
     """Convert read errors to a ValueError that names the path; a RefusedError passes unchanged.

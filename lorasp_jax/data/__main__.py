@@ -51,9 +51,13 @@ def convert(options: argparse.Namespace, console: Console) -> None:
     """Convert datasets to a cache for training, or one dataset to RLDS or LeRobot v3.0."""
     from lorasp_jax.data import cache, lerobot_export, rlds_export
     from lorasp_jax.data.opening import open_source
+    from lorasp_jax.data.source import describe_left_out
 
     keys = keys_of(options)
     sources = [open_source(path, keys) for path in options.paths]
+    for source in sources:
+        if unused := describe_left_out(source):
+            console.print(unused, soft_wrap=True, highlight=False, markup=False)
     if options.to != "cache" and len(sources) > 1:
         raise ValueError(f"--to {options.to} converts exactly one dataset, got {len(sources)}")
     if options.to != "cache" and isinstance(sources[0], cache.Cache):
@@ -111,6 +115,8 @@ def add_keys(parser: argparse.ArgumentParser) -> None:
     text = "dimensions to use, by name or index: joints first, gripper last (default: all)"
     add("--state-numbers", nargs="+", default=(), metavar="NAME", help=text)
     add("--action-numbers", nargs="+", default=(), metavar="NAME", help=text)
+    text = "gripper openings among the dimensions in use (default: the last one)"
+    add("--grippers", nargs="+", default=(), metavar="NAME", help=text)
     text = "cameras to use, with names of your choice (default: all)"
     add("--cameras", nargs="+", default=(), metavar="NAME=FEATURE", type=_camera, help=text)
     text = f"unit of the joints {default}"
@@ -127,9 +133,11 @@ def keys_of(options: argparse.Namespace) -> Keys:
     values: dict[str, Any] = {
         field.name: getattr(options, field.name) for field in dataclasses.fields(Keys)
     }
-    for name in ("state_numbers", "action_numbers"):
+    for name in ("state_numbers", "action_numbers", "grippers"):
         values[name] = tuple(values[name])
     values["cameras"] = dict(options.cameras)
+    if len(values["cameras"]) < len(options.cameras):
+        raise ValueError(f"--cameras must have unique names, got {options.cameras}")
     return Keys(**values)
 
 

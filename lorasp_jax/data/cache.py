@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.datasets.episodes import SHARED, Episodes, check_camera
+from envs.datasets.episodes import SHARED, Episodes, check_camera, choose_cameras
 from lorasp_jax.base.digest import verify_digest, with_digest
 from lorasp_jax.base.files import as_value_error, read_json
 from lorasp_jax.base.json_values import check
@@ -172,15 +172,20 @@ class Cache:
         path: the folder.
         metadata: content of cache.json, including robot, tasks, instructions and control_dt.
         cameras: name -> height and width.
+        left_out: camera -> why it is not among the cameras.
     """
 
     kind = "cache"
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: str | os.PathLike[str], cameras: Sequence[str] = ()) -> None:
         """Open a cache.
 
+        Args:
+            path: the folder.
+            cameras: names of the cameras to use; empty: all.
+
         Raises:
-            ValueError: the cache is missing, damaged or in another format.
+            ValueError: the cache is missing, damaged or in another format, or lacks a camera.
         """
         self.path: Path = Path(path)
         header = self.path / HEADER
@@ -188,7 +193,11 @@ class Cache:
             raise ValueError(f"{path} is not a cache: it has no {HEADER}")
         with as_value_error(header):
             self.metadata: dict[str, Any] = _read_header(header)
-        self.cameras: dict[str, list[int]] = self.metadata["cameras"]
+        self.cameras: dict[str, list[int]]
+        self.left_out: dict[str, str]
+        self.cameras, self.left_out = choose_cameras(self.metadata["cameras"], cameras, self.path)
+        for name in self.left_out:  # the rest identifies what a run was trained on
+            del self.metadata["crc32"][_IMAGE + name]
         self.control_dt: float = self.metadata["control_dt"]
         self.num_steps: int = self.metadata["steps"]
         self.instructions: tuple[str, ...] = tuple(self.metadata["instructions"])

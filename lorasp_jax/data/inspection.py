@@ -20,7 +20,7 @@ from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.config import AugmentConfig
 from lorasp_jax.data.augmentation import WRIST, recipe
 from lorasp_jax.data.lerobot import LeRobot
-from lorasp_jax.data.source import Source
+from lorasp_jax.data.source import Source, describe_left_out
 from lorasp_jax.data.video import downscale
 
 EPISODES, FRAMES, TILE, LINE = 6, 5, 128, 14
@@ -93,6 +93,8 @@ def report(source: Source, console: Console) -> None:
         f"median {np.median(summary.length):g}",
         "steps": f"{steps} at {hertz:g} Hz, {minutes:.1f} minutes",
     }
+    if unused := describe_left_out(source):
+        console.print(unused, style="yellow", soft_wrap=True, highlight=False, markup=False)
     for name, text in lines.items():
         console.print(f"{name:9}{text}", soft_wrap=True, highlight=False, markup=False)
     console.print("instructions", highlight=False)
@@ -107,7 +109,10 @@ def report(source: Source, console: Console) -> None:
 
 def hints(summary: Summary) -> list[str]:
     """Return hints about probable unit errors in a recording."""
-    joints, gripper = np.abs(summary.state[:, :-1]).max(), np.abs(summary.state[:, -1]).max()
+    joints, gripper = (
+        np.abs(summary.state[:, :-1]).max(initial=0),
+        np.abs(summary.state[:, -1]).max(),
+    )
     texts = []
     if joints > 2 * math.pi:
         texts.append(

@@ -18,6 +18,8 @@ class Keys:
         action: feature with the commanded joints and gripper.
         state_numbers: names or indices of the state dimensions to use, in order; all if empty.
         action_numbers: the same for the action.
+        grippers: names or indices of the gripper openings among the state dimensions in use; the
+            last one if empty. Two arms have two.
         cameras: camera -> feature; if empty, all image features, named without the prefix
             "observation.images.".
         angles: unit of the joints.
@@ -32,6 +34,7 @@ class Keys:
     action: str = "action"
     state_numbers: tuple[str, ...] = ()
     action_numbers: tuple[str, ...] = ()
+    grippers: tuple[str, ...] = ()
     cameras: Mapping[str, str] = dataclasses.field(default_factory=dict)
     angles: Literal["radians", "degrees"] = "radians"
     gripper: Literal["metres", "millimetres"] = "metres"

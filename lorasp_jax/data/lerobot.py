@@ -8,18 +8,24 @@ other columns. Each episode is returned as `Episodes` with E = 1, in this projec
 """
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
-from envs.datasets.episodes import Episodes
+from envs.datasets.episodes import Episodes, check_camera, choose_cameras
 from lorasp_jax.base import hub
-from lorasp_jax.base.files import as_int, check_memory, check_regular
+from lorasp_jax.base.files import (
+    RefusedError,
+    check_memory,
+    check_regular,
+    join_inside,
+    read_bytes,
+)
+from lorasp_jax.data import lerobot_features
 from lorasp_jax.data.keys import Keys
 from lorasp_jax.data.lerobot_files import (
     EpisodeEntry,
@@ -31,7 +37,6 @@ from lorasp_jax.data.lerobot_files import (
 from lorasp_jax.data.video import VideoReader, decode_image
 
 _COLUMNS = ("timestamp", "frame_index", "episode_index", "task_index")
-_MAX_DIM = 10_000  # limit for state and action
 _TIME_TOLERANCE = 0.25
 """Tolerance of timestamps, in frame periods, as for videos."""
 
@@ -46,13 +51,19 @@ class LeRobot:
         index: metadata of the dataset.
         keys: feature mapping.
         cameras: camera -> feature.
+        left_out: picture -> why it is not among the cameras.
         control_dt: time between two steps [s].
         names: "state" and "action" -> names of the selected dimensions, in order; their indices if
             the dataset has no names.
     """
 
     def __init__(
-        self, source: str | os.PathLike[str], keys: Keys | None = None, *, name: str = ""
+        self,
+        source: str | os.PathLike[str],
+        keys: Keys | None = None,
+        *,
+        name: str = "",
+        cameras: Sequence[str] = (),
     ) -> None:
         """Open a dataset.
 
@@ -60,6 +71,7 @@ class LeRobot:
             source: a folder, or hf://owner/name, which is downloaded from the Hub.
             keys: feature mapping; None uses LeRobot's usual names.
             name: name of the dataset; if empty, that of the folder or repository.
+            cameras: names of the cameras to use; empty: all.
 
         Raises:
             ValueError: the dataset is missing or damaged, or lacks a feature named in `keys`.
@@ -69,18 +81,17 @@ class LeRobot:
         self.keys: Keys = keys or Keys()
         self.kind: str = f"LeRobot {self.index.version}"
         self.name: str = name or Path(source).name
-        self.cameras: dict[str, str] = self._cameras()
+        self.cameras: dict[str, str]
+        self.left_out: dict[str, str]
+        self.cameras, self.left_out = self._choose_cameras(cameras)
         self.control_dt: float = self.keys.every / self.index.fps
-        self._columns = {"state": self._selection("state"), "action": self._selection("action")}
-        self.names: dict[str, list[str]] = {
-            kind: [self._names(kind)[column] for column in columns]
-            for kind, columns in self._columns.items()
-        }
-        if len(self.names["state"]) != len(self.names["action"]):
-            raise ValueError(
-                f"{self.path} has other dimensions in state than in action, {self.names}: choose "
-                "the same joints and gripper with --state-numbers and --action-numbers"
-            )
+        self._sizes: dict[str, int] = {}
+        self._columns: dict[str, list[int]] = {}
+        self.names: dict[str, list[str]] = {}
+        for kind in ("state", "action"):
+            self._select(kind)
+        self._grippers: list[int] = self._select_grippers()
+        self._check_order()
         images = [key for key in self.cameras.values() if not self._is_video(key)]
         needed = (self.keys.state, self.keys.action, *_COLUMNS, *images)
         self._needed = list(dict.fromkeys(needed))  # state and action may be the same feature
@@ -129,43 +140,57 @@ class LeRobot:
             episode.validate_numbers()
         return episode
 
-    def _cameras(self) -> dict[str, str]:
-        available = {
-            key.removeprefix("observation.").removeprefix("images."): key
-            for key, feature in self.index.features.items()
-            if feature["dtype"] in ("video", "image")
-        }
-        selected = dict(self.keys.cameras) or available
-        if not selected or not set(selected.values()) <= set(available.values()):
-            raise ValueError(f"{self.path} has the cameras {available}, at least one is needed")
-        return selected
+    def _choose_cameras(self, chosen: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
+        """Return `cameras` and `left_out`."""
+        with as_value_error(self._info):
+            pictures, reasons = lerobot_features.pictures(self.index.features)
+        selected = dict(self.keys.cameras) or pictures
+        known = [key for key in pictures.values() if key not in reasons]
+        if wrong := [k for n, k in self.keys.cameras.items() if k not in known]:
+            why = f"is no color camera ({reasons[wrong[0]]})" if wrong[0] in reasons else "is none"
+            raise ValueError(f"{self.path}: {wrong[0]} {why}: choose cameras from {known}")
+        usable = {name: key for name, key in selected.items() if key in known}
+        others = {name: reasons[key] for name, key in pictures.items() if key in reasons}
+        cameras, left_out = choose_cameras(usable, chosen, self.path, others)
+        for name, key in cameras.items():
+            try:
+                check_camera(name)
+            except ValueError as error:
+                raise ValueError(f"{self.path}: {error}; rename it: --cameras NAME={key}") from None
+        return cameras, left_out
+
+    @property
+    def _info(self) -> Path:
+        return self.path / "meta" / "info.json"
 
     def _is_video(self, key: str) -> bool:
         return self.index.features[key]["dtype"] == "video"
 
-    def _names(self, kind: str) -> list[str]:
-        """Return the names of a feature's dimensions, or their indices if they are unnamed."""
-        key = getattr(self.keys, kind)
-        with as_value_error(self.path / "meta" / "info.json"):
-            feature = self.index.features[key]
-            (dim,) = map(as_int, feature["shape"])
-            if not 0 < dim <= _MAX_DIM:
-                raise ValueError(f"{key} has {dim} dimensions")
-            names = feature.get("names")
-            while isinstance(names, Mapping):  # {"motors": [...]}
-                names = next(iter(names.values()), None)
-        if isinstance(names, list) and len(names) == dim:
-            return [str(name) for name in names]
-        return [str(i) for i in range(dim)]
+    def _select(self, kind: str) -> None:
+        """Select dimensions of the state or action."""
+        key, wanted = getattr(self.keys, kind), getattr(self.keys, f"{kind}_numbers")
+        with as_value_error(self._info):
+            names = lerobot_features.dimension_names(self.index.features, key, self._info)
+        columns = lerobot_features.select(names, wanted, f"{self.path}: {kind}")
+        self._sizes[kind], self._columns[kind] = len(names), columns
+        self.names[kind] = [names[column] for column in columns]
 
-    def _selection(self, kind: str) -> list[int]:
-        """Return the indices of the selected dimensions of a feature."""
-        names = self._names(kind)
-        selected = getattr(self.keys, f"{kind}_numbers") or [str(i) for i in range(len(names))]
-        by_name = {str(i): i for i in range(len(names))} | {n: i for i, n in enumerate(names)}
-        if unknown := [name for name in selected if name not in by_name]:
-            raise ValueError(f"{self.path} has no {kind} {unknown[0]}: choose from {[*by_name]}")
-        return [by_name[name] for name in selected]
+    def _select_grippers(self) -> list[int]:
+        """Return which of the selected dimensions are grippers."""
+        if not self.keys.grippers:
+            return [len(self.names["state"]) - 1]
+        what = f"{self.path}: the selected state"
+        return lerobot_features.select(self.names["state"], self.keys.grippers, what)
+
+    def _check_order(self) -> None:
+        """Raise ValueError unless state and action have the same dimensions, in this order."""
+        state, action = self.names["state"], self.names["action"]
+        if len(state) != len(action) or (state != action and sorted(state) == sorted(action)):
+            raise ValueError(
+                f"{self.path} has other dimensions in state than in action, {self.names}: choose "
+                "the same joints and gripper, in the same order, with --state-numbers and "
+                "--action-numbers"
+            )
 
     def _frames(self, entry: EpisodeEntry) -> Any:
         """Read the episode's rows from its parquet file; check frame numbers and timestamps."""
@@ -174,31 +199,35 @@ class LeRobot:
             if self._table[0] != path:
                 self._table = path, read_table(path, self.path, self._needed)
             table = self._table[1]
-            table = table.filter(pc.equal(table["episode_index"], number))
-            frames = table["frame_index"].cast(pa.int64()).to_numpy()
-            times = table["timestamp"].cast(pa.float64()).to_numpy()
+            of_episode = lerobot_features.rows(table["episode_index"], 1)[:, 0] == number
+            table = table.filter(pa.array(of_episode))
+            frames, times = (
+                lerobot_features.rows(table[name], 1)[:, 0] for name in ("frame_index", "timestamp")
+            )
             if len(frames) != entry.length or np.any(frames != np.arange(len(frames))):
                 raise ValueError(f"episode {number} must have frames 0 to {entry.length - 1}")
             drift = np.abs(times - frames / self.index.fps) * self.index.fps
             if not np.all(drift <= _TIME_TOLERANCE):
+                if np.ptp(drift) <= _TIME_TOLERANCE:
+                    raise RefusedError(
+                        f"{path}: episode {number} begins at the timestamp {times[0]:g} s, but the "
+                        "timestamps of each episode must begin at 0"
+                    )
                 raise ValueError(f"episode {number} does not have {self.index.fps:g} fps")
         return table
 
     def _values(self, table: Any, entry: EpisodeEntry, kind: str) -> np.ndarray:
         """Return joints [rad] and gripper [m], f32 `[T, J+1]`."""
-        key, path = getattr(self.keys, kind), entry.table
-        with as_value_error(path):
-            column = table[key].combine_chunks()
-            dim = len(self._names(kind))
-            dims = set(pc.list_value_length(column).to_pylist())
-            values = column.flatten().cast(pa.float64()).to_numpy(zero_copy_only=False)
-            if dims != {dim}:
-                raise ValueError(f"episode {entry.number} must have {dim} dimensions in {key}")
-        values = values.reshape(-1, dim)[:, self._columns[kind]]
-        if self.keys.angles == "degrees":
-            values = np.concatenate([np.deg2rad(values[:, :-1]), values[:, -1:]], axis=1)
-        if self.keys.gripper == "millimetres":
-            values = np.concatenate([values[:, :-1], values[:, -1:] / 1000], axis=1)
+        key, columns = getattr(self.keys, kind), self._columns[kind]
+        with as_value_error(entry.table):
+            try:
+                values = lerobot_features.rows(table[key], self._sizes[kind])[:, columns]
+            except ValueError as error:
+                raise ValueError(f"{key} of episode {entry.number}: {error}") from error
+        is_gripper = np.isin(np.arange(len(columns)), self._grippers)
+        angle = np.deg2rad(1) if self.keys.angles == "degrees" else 1
+        length = 1e-3 if self.keys.gripper == "millimetres" else 1
+        values = values * np.where(is_gripper, length, angle)
         every = self.keys.every
         # Each selected state is paired with the last action before the next selected state.
         first = 0 if kind == "state" else every - 1
@@ -208,8 +237,14 @@ class LeRobot:
     def _instruction(self, table: Any, entry: EpisodeEntry) -> int:
         """Return the index of the episode's instruction in `Episodes.instructions`."""
         with as_value_error(entry.table):
-            (task,) = pc.unique(table["task_index"]).to_pylist()
-            return sorted(self.index.tasks).index(task)
+            tasks = np.unique(lerobot_features.rows(table["task_index"], 1))
+            known = sorted(self.index.tasks)
+            if len(tasks) > 1 or tasks[0] not in known:
+                raise RefusedError(
+                    f"{entry.table}: episode {entry.number} must have one of the tasks {known}, "
+                    f"got {tasks}"
+                )
+            return known.index(int(tasks[0]))
 
     def _images(self, table: Any, entry: EpisodeEntry, camera: str) -> np.ndarray:
         """Load the images of the selected frames, uint8 `[T, H, W, 3]`."""
@@ -219,11 +254,26 @@ class LeRobot:
             video = self._video(camera, path)
             fps, length = self.index.fps, entry.length
             return video.read(start, length, fps, every=every, image_size=size)
+        what = f"{entry.table}: a picture of {key}"
         with as_value_error(entry.table):
-            files = [row["bytes"] for row in table[key].to_pylist()[::every]]
-            first = decode_image(files[0], size)
-            check_memory(len(files) * first.nbytes, f"an episode in {entry.table}")
-            return np.stack([first, *(decode_image(file, size) for file in files[1:])])
+            column = table[key]
+            if not (pa.types.is_struct(column.type) or pa.types.is_binary(column.type)):
+                raise RefusedError(f"{what} is {column.type}, neither a PNG nor a JPEG file")
+            # Read one by one, because rows may name files in place of containing them.
+            files = (self._file(row, what) for row in column.to_pylist()[::every])
+            first = decode_image(next(files), what, size)
+            length = -(-entry.length // every)
+            check_memory(length * first.nbytes, f"an episode in {entry.table}")
+            return np.stack([first, *(decode_image(file, what, size) for file in files)])
+
+    def _file(self, row: Any, what: str) -> bytes:
+        """Return the content of a picture file that a row contains, or names by its path."""
+        content, name = (
+            (row.get("bytes"), row.get("path")) if isinstance(row, dict) else (row, None)
+        )
+        if content is None and name is None:
+            raise RefusedError(f"{what} is missing")
+        return read_bytes(join_inside(self.path, name), self.path) if content is None else content
 
     def _video(self, camera: str, path: Path) -> VideoReader:
         """Return a camera's video, left open because the next episode may be in the same file."""

@@ -7,10 +7,9 @@ Source: LeRobot, src/lerobot/datasets/utils.py, at 0.3.3 (2.1) and at 0.6.1 (3.0
 """
 
 import contextlib
-import json
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,12 +20,13 @@ from PIL import Image
 
 from lorasp_jax.base import files
 from lorasp_jax.base.files import (
+    RefusedError,
     as_int,
     check_memory,
     check_regular,
     join_inside,
     read_json,
-    read_text,
+    read_json_lines,
 )
 
 VERSIONS = ("v2.0", "v2.1", "v3.0")
@@ -100,11 +100,11 @@ def _read_2(
     """Read tasks and episodes of versions 2.0 and 2.1."""
     path = folder / "meta" / "tasks.jsonl"
     with as_value_error(path):
-        tasks = {as_int(row["task_index"]): str(row["task"]) for row in _json_lines(path, folder)}
+        tasks = _tasks(path, read_json_lines(path, folder))
     path = folder / "meta" / "episodes.jsonl"
     episodes = []
     with as_value_error(path):
-        for row in _json_lines(path, folder):
+        for row in read_json_lines(path, folder):
             number = as_int(row["episode_index"])
             chunk = number // as_int(info["chunks_size"])
             fields = {"episode_index": number, "episode_chunk": chunk}
@@ -131,7 +131,7 @@ def _read_3(
             {"task": row.pop("__index_level_0__", None), **row}
             for row in read_table(path, folder).to_pylist()
         ]
-        tasks = {as_int(row["task_index"]): str(row["task"]) for row in rows}
+        tasks = _tasks(path, rows)
     episodes = []
     for path in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
         with as_value_error(path):
@@ -142,6 +142,18 @@ def _read_3(
                 number, length = as_int(row["episode_index"]), as_int(row["length"])
                 episodes.append(EpisodeEntry(number, length, table, files))
     return tasks, episodes
+
+
+def _tasks(path: Path, rows: Sequence[Mapping[str, Any]]) -> dict[int, str]:
+    """Return task index -> instruction."""
+    tasks: dict[int, str] = {}
+    for row in rows:
+        number, text = as_int(row["task_index"]), row["task"]
+        if not isinstance(text, str):
+            raise RefusedError(f"{path}: task {number} must be text, got {text!r}")
+        if tasks.setdefault(number, text) != text:
+            raise RefusedError(f"{path}: task {number} is both {tasks[number]!r} and {text!r}")
+    return tasks
 
 
 def _video_3(
@@ -177,7 +189,10 @@ def read_table(
         Exception: any error that `as_value_error` converts.
     """
     with pq.ParquetFile(check_regular(path, folder)) as file:
-        available = columns or file.schema_arrow.names
+        names = file.schema_arrow.names
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise RefusedError(f"{path} has several columns {twice[0]}")
+        available = columns or names
         selected = [name for name in available if not name.startswith(without)]
         check_memory(_size(file.metadata, set(selected)), path)
         return file.read(columns=selected)
@@ -202,10 +217,6 @@ def _check(folder: Path, info: Mapping[str, Any], episodes: Sequence[EpisodeEntr
     listed = {"total_episodes": len(lengths), "total_frames": sum(lengths.values())}
     if any(info.get(name, count) != count for name, count in listed.items()):
         raise ValueError(f"{folder}/meta/info.json does not match the episodes: {listed}")
-
-
-def _json_lines(path: Path, folder: Path) -> Iterator[dict[str, Any]]:
-    return (json.loads(line) for line in read_text(path, folder).splitlines() if line.strip())
 
 
 def as_value_error(path: Path) -> contextlib.AbstractContextManager[None]:

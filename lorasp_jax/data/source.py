@@ -1,6 +1,6 @@
 """The interface that all dataset formats share."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Protocol
 
 from envs.datasets.episodes import Episodes
@@ -23,6 +23,11 @@ class Source(Protocol):
         ...
 
     @property
+    def left_out(self) -> Mapping[str, str]:
+        """Camera or other picture -> why it is not among the cameras."""
+        ...
+
+    @property
     def control_dt(self) -> float:
         """Time between two actions [s]."""
         ...
@@ -39,3 +44,9 @@ class Source(Protocol):
     def episode(self, number: int, cameras: Sequence[str] | None = None) -> Episodes:
         """Load one episode into host memory, with images from `cameras`, or from all if None."""
         ...
+
+
+def describe_left_out(source: Source) -> str:
+    """Name the pictures that are not used, on one line; empty if all are."""
+    texts = [f"{name} ({reason})" for name, reason in source.left_out.items()]
+    return "left out: " * bool(texts) + ", ".join(texts)

@@ -10,14 +10,16 @@ import av
 import av.error
 import numpy as np
 from av.video.reformatter import VideoReformatter
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
-from lorasp_jax.base.files import as_value_error, check_memory
+from lorasp_jax.base.files import RefusedError, as_value_error, check_memory
 
 # Allowed containers: FFmpeg would also read playlists, which refer to other files and URLs.
 _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 _OPTIONS = {"format_whitelist": _CONTAINERS, "protocol_whitelist": "file"}
 _FORMATS = ("PNG", "JPEG")
+_ONE_CHANNEL = ("1", "L", "LA", "La", "I", "F")
+"""Pillow's modes without colors; 16-bit ones are "I;16" and the like."""
 _TOLERANCE = 0.25
 """Tolerance of a frame's time, in frame periods. It is small enough to tell adjacent frames apart,
 and to notice a wrong frame rate within a few frames."""
@@ -34,12 +36,13 @@ class VideoReader:
         """Open the file.
 
         Raises:
-            ValueError: the file is missing or damaged.
+            ValueError: the file is missing or damaged, or has no colors.
         """
         self.path = path
         with as_value_error(path, av.error.FFmpegError):
             self._container: Any = av.open(f"file:{path}", container_options=_OPTIONS)
             self._stream = self._container.streams.video[0]
+            _check_color(self._stream.codec_context.pix_fmt or "", str(path))
         self._stream.thread_type = "AUTO"
         self._frames: Iterator[Any] = self._container.decode(self._stream)
         # Shared by all frames: creating a reformatter takes as long as converting a frame.
@@ -103,17 +106,37 @@ class VideoReader:
         self._container.close()
 
 
-def decode_image(file: bytes, image_size: int = 0) -> np.ndarray:
+def decode_image(file: bytes, what: str, image_size: int = 0) -> np.ndarray:
     """Decode a PNG or JPEG image to uint8 `[H, W, 3]`, downscaled by `downscale`.
 
+    Args:
+        file: the content of the file.
+        what: the image's name in messages.
+        image_size: see `downscale`.
+
     Raises:
+        RefusedError: the image has another format, or one channel.
         OSError, SyntaxError, ValueError, DecompressionBombError: the image is damaged, or larger
             than Pillow's limit.
     """
-    with Image.open(io.BytesIO(file), formats=_FORMATS) as image:
+    try:
+        image = Image.open(io.BytesIO(file), formats=_FORMATS)
+    except UnidentifiedImageError as error:
+        start = bytes(file[:8])
+        raise RefusedError(f"{what} is neither PNG nor JPEG: it begins with {start}") from error
+    with image:
         if image.width * image.height > (Image.MAX_IMAGE_PIXELS or math.inf):
             raise ValueError(f"an image has more than {Image.MAX_IMAGE_PIXELS} pixels")
+        _check_color(image.mode, what)
         return downscale(np.asarray(image.convert("RGB")), image_size)
+
+
+def _check_color(pixels: str, what: str) -> None:
+    """Refuse depth and other images of one channel, given a pixel format of Pillow or FFmpeg."""
+    if pixels.partition(";")[0] in _ONE_CHANNEL or pixels.startswith("gray"):
+        raise RefusedError(
+            f"{what} has one channel, as depth has, not colors: choose other cameras with --cameras"
+        )
 
 
 def downscale(image: np.ndarray, image_size: int) -> np.ndarray:

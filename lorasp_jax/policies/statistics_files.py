@@ -14,7 +14,6 @@ model.safetensors         older LeRobot policy: tensors among the weights, named
                           "normalize_inputs.so100_buffer_observation_state.mean"
 """
 
-import json
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -25,7 +24,14 @@ import numpy as np
 import safetensors
 
 from lorasp_jax.base import hub
-from lorasp_jax.base.files import as_value_error, check_regular, join_inside, read_json, read_text
+from lorasp_jax.base.files import (
+    as_value_error,
+    check_regular,
+    join_inside,
+    read_json,
+    read_json_lines,
+    read_text,
+)
 from lorasp_jax.policies.statistics import NAMES, Statistics, validate
 
 OURS, OPENPI, DATASET = "statistics.json", "norm_stats.json", "stats.json"
@@ -94,8 +100,7 @@ def _dataset(files: list[Path]) -> dict[str, Stats]:
 
 
 def _episodes(files: list[Path]) -> dict[str, Stats]:
-    lines = read_text(files[0]).splitlines()
-    rows = [json.loads(line)["stats"] for line in lines if line.strip()]
+    rows = [row["stats"] for row in read_json_lines(files[0])]
     kinds = {"state": "observation.state", "action": "action"}
     return {"": {kind: aggregate([row[name] for row in rows]) for kind, name in kinds.items()}}
 

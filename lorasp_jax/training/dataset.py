@@ -32,17 +32,18 @@ def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
     """
     cache_folder = folder / CACHE
     path = cache_folder if cache_folder.exists() else config.data.source
-    source = open_source(path, Keys(image_size=model.image_size))
+    source = open_source(path, Keys(image_size=model.image_size), config.data.cameras)
     if abs(source.control_dt / config.control_dt - 1) > _DT_TOLERANCE:
         raise ValueError(
             f"{path} has a control period of {source.control_dt:.4g} s, but this run has "
             f"--control-dt {config.control_dt:g}: pass --control-dt {source.control_dt:.4g}, or "
             "keep every N-th step with python -m lorasp_jax.data convert --every N"
         )
-    if len(source.cameras) > len(model.cameras):
+    if len(source.cameras) > (most := len(model.cameras)):
         raise ValueError(
             f"{path} has cameras {', '.join(source.cameras)}, but the backbone accepts at most "
-            f"{len(model.cameras)}: select cameras with python -m lorasp_jax.data convert --cameras"
+            f"{most}: choose with --data.cameras, such as --data.cameras "
+            f"{' '.join([*source.cameras][:most])}"
         )
     first = source.episode(0, ())
     if first.actions != "joint":

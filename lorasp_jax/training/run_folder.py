@@ -40,7 +40,10 @@ STOPPED = "stopped.json"
 """File with the reason why training stopped; removed when training continues."""
 
 
-_OPTIONAL = (("model", "base_dtype"), ("model", "chunk"), ("optim", "rtc_max_delay"))
+_OPTIONAL = (
+    *(("data", "cameras"), ("model", "base_dtype"), ("model", "chunk")),
+    ("optim", "rtc_max_delay"),
+)
 """Settings that `to_json` omits at their defaults, which are 0 or empty, as it omits `adapt`:
 results files of studies do not have them."""
 

@@ -24,7 +24,7 @@ from lorasp_jax.base import hub
 from lorasp_jax.base.bars import bars
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Batch, encode, flatten, sample_batch, windows
-from lorasp_jax.data.source import Source
+from lorasp_jax.data.source import Source, describe_left_out
 from lorasp_jax.data.split import held_out
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.models.backbone import Backbone
@@ -150,10 +150,18 @@ def prepare(
     run = Run(config, folder, console, built.base_hash, started)
     _load_or_collect(run, built, collect, meanwhile)
     relative = config.model.relative_actions
-    inputs = processor([*run.episodes.values()], model.config, built.prompts, relative=relative)
+    inputs = processor(
+        [*run.episodes.values()],
+        model.config,
+        built.prompts,
+        relative=relative,
+        cameras=config.data.cameras,
+    )
     if any(method.needs_statistics for method in rules.methods(config)):
         model = _adapt(config, base, rules.rules(config), input_moments(run, base, inputs))
     if built.source:
+        if unused := describe_left_out(built.source):
+            console.print(unused, markup=False, soft_wrap=True)
         cameras = [f"{name} -> {slot}" for slot, name in inputs.cameras if name]
         size = f"{inputs.image_size} x {inputs.image_size}"
         summary = f"cameras: {', '.join(cameras)}; resized to {size}"
@@ -291,12 +299,13 @@ def processor(
     prompts: PromptTable,
     *,
     relative: bool = False,
+    cameras: Sequence[str] = (),
 ) -> Processor:
     """Build the processor from the prompts and the statistics of the demonstrations.
 
-    Cameras, sorted by name, fill the backbone's camera slots in order. With `relative`, joint
-    targets are relative to the state at the start of the chunk; otherwise the model's config
-    decides.
+    `cameras`, by default all sorted by name, fill the backbone's camera slots in order. With
+    `relative`, joint targets are relative to the state at the start of the chunk; otherwise the
+    model's config decides.
     """
     joints = episodes[0].state.shape[-1] - 1
     slots, dim = robot_slots(joints, model_config.inputs), model_config.action_dim
@@ -310,9 +319,10 @@ def processor(
     state = np.repeat(np.asarray(steps.state), chunk, axis=0)
     valid = np.ones(len(state), bool)
     statistics = Statistics.measure(state, action, valid, slots=slots, dim=dim)
-    cameras = dict(zip(model_config.cameras, sorted(episodes[0].image), strict=False))
+    ordered = cameras or sorted(episodes[0].image)
+    filled = dict(zip(model_config.cameras, ordered, strict=False))
     return Processor.of(
-        model_config, statistics, prompts, num_joints=joints, cameras=cameras, delta=delta
+        model_config, statistics, prompts, num_joints=joints, cameras=filled, delta=delta
     )
 
 

@@ -139,7 +139,7 @@ BROKEN = {
     "no feature": (lambda f: edit_info(f, lambda i: i["features"].pop("action")), "'action'"),
     "no pictures": (
         lambda f: edit_info(f, lambda i: [i["features"].pop(k) for k in [*i["features"]][2:4]]),
-        "cameras",
+        "no color camera",
     ),
     "one short row": (lambda f: edit_rows(f, set_value("action", 3, lambda x: x[:-1])), "action"),
     "no number": (

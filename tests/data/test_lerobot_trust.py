@@ -97,8 +97,8 @@ def test_playlists_are_refused(tmp_path):
 
 def test_image_formats():
     """Pillow would run a program for PostScript."""
-    with pytest.raises(OSError, match="image"):
-        decode_image(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n")
+    with pytest.raises(ValueError, match="neither PNG nor JPEG"):
+        decode_image(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n", "a picture")
 
 
 def test_many_equal_rows(tmp_path):

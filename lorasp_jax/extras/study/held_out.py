@@ -41,7 +41,8 @@ def settings(config: Config) -> Config:
     """
     if config.seed == SEED:
         raise ValueError(f"seed {SEED} is reserved for held-out episodes")
-    data = dataclasses.replace(config.data, source="", fresh_every=0, episodes=EPISODES)
+    changes = {"source": "", "cameras": (), "fresh_every": 0, "episodes": EPISODES}
+    data = dataclasses.replace(config.data, **changes)
     return dataclasses.replace(config, data=data, seed=SEED)
 
 
