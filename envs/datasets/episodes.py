@@ -115,6 +115,8 @@ class Episodes:
         """
         with as_value_error(path := Path(path)):
             with path.open("rb") as file, np.load(file) as archive:
+                if len(set(archive.files)) < len(archive.files):
+                    raise ValueError("two of its arrays have the same name")
                 fields: dict[str, Any] = dict(archive)
             header = json.loads(fields.pop("header").tobytes())
             fields |= {name: header[name] for name in _METADATA}

@@ -105,10 +105,10 @@ def read_json(path: Path, folder: Path | None = None) -> Any:
     """Read a JSON file (see `read_bytes`).
 
     Raises:
-        ValueError: it is not JSON, or has a string with a lone surrogate.
+        ValueError: it is not JSON, has a string with a lone surrogate or a key twice.
         RecursionError: it is nested too deeply.
     """
-    value = json.loads(read_text(path, folder))
+    value = json.loads(read_text(path, folder), object_pairs_hook=_unique)
     json.dumps(value, ensure_ascii=False).encode()  # raises for lone surrogates
     return value
 
@@ -118,7 +118,17 @@ def read_json_lines(path: Path, folder: Path | None = None) -> list[Any]:
 
     Only a line feed ends a line: JSON strings may contain the other line ends of Unicode.
     """
-    return [json.loads(line) for line in read_text(path, folder).split("\n") if line.strip()]
+    lines = read_text(path, folder).split("\n")
+    return [json.loads(line, object_pairs_hook=_unique) for line in lines if line.strip()]
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Build a JSON object, whose last value would otherwise win if a key appears twice."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"it has the key {max(keys, key=keys.count)!r} twice")
+    return found
 
 
 @contextlib.contextmanager

@@ -1,5 +1,6 @@
 """Untrusted files are refused before they are opened; valid ones are read."""
 
+import json
 import os
 import re
 import socket
@@ -99,6 +100,18 @@ def test_sizes(folder):
     files.check_memory(10**6, "this")
     with pytest.raises(files.RefusedError, match="film"):
         files.check_memory(10**20, "the film")
+
+
+def test_lines_of_json(tmp_path):
+    """Line ends of Unicode may be part of a string; a key must not appear twice."""
+    texts = ["a\u2028b", "\u2029", "\u0085", "\x7f"]
+    lines = [json.dumps({"text": text}, ensure_ascii=False) for text in texts]
+    (path := tmp_path / "lines").write_bytes("\r\n\n".join(lines).encode())
+    assert [row["text"] for row in files.read_json_lines(path)] == texts
+    path.write_text('{"a": {"b": 1, "c": 2, "b": 3}}')
+    for read in (files.read_json, files.read_json_lines):
+        with pytest.raises(ValueError, match="key 'b' twice"):
+            read(path)
 
 
 def test_integers():

@@ -212,6 +212,19 @@ def test_opening(tmp_path, simulated):
         open_source(simulated[1].path, Keys(angles="degrees"))
 
 
+def test_chosen_cameras(simulated, tmp_path):
+    """Of a cache, and of its copy."""
+    path = simulated[1].path
+    found = cache.Cache(path, ["wrist"])
+    assert (list(found.cameras), found.left_out) == (["wrist"], {"side": "not chosen"})
+    assert list(found.steps.image) == list(found.episode(0).image) == ["wrist"]
+    assert found.metadata["crc32"].keys() == simulated[1].metadata["crc32"].keys() - {"image_side"}
+    copy = written(tmp_path / "copy", found)
+    assert (copy.metadata["crc32"], copy.left_out) == (found.metadata["crc32"], {})
+    with pytest.raises(ValueError, match="no camera 'top': choose from side, wrist"):
+        open_source(path, cameras=["top"])
+
+
 @pytest.mark.parametrize(
     ("name", "change", "sentence"),
     [

@@ -54,3 +54,15 @@ def test_ranges_in_any_order(film, frames):
         reader.read(0.0, LENGTH + 1, FPS)
     np.testing.assert_array_equal(reader.read(0.0, 2, FPS), frames[:2])
     reader.close()
+
+
+def test_depth_is_refused(tmp_path):
+    path = tmp_path / "depth.mkv"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=FPS)
+        stream.height, stream.width, stream.pix_fmt = HEIGHT, WIDTH, "gray16le"
+        depth = np.full((HEIGHT, WIDTH), 900, np.uint16)
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(depth, format="gray16le")))
+        container.mux(stream.encode())
+    with pytest.raises(ValueError, match=r"depth\.mkv has one channel"):
+        VideoReader(path)

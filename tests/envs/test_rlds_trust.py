@@ -1,6 +1,7 @@
 """An RLDS dataset runs no code, stays in its folder, and takes bounded memory."""
 
 import dataclasses
+import io
 import json
 import os
 import sys
@@ -8,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 from array_record.python import array_record_module
+from PIL import Image
 
 from envs.datasets import rlds, rlds_schema
 from tests.envs.datasets.test_episodes import assert_equal, make
@@ -66,6 +68,16 @@ def test_images_of_another_size(path):
     edit(path / "metadata.json", lambda found: found["cameras"].update(side=[60, 80]))
     with pytest.raises(ValueError, match="6 x 8"):
         rlds.read(path)
+
+
+def test_images_without_colors(path, monkeypatch):
+    """A 16-bit PNG is depth."""
+    file = io.BytesIO()
+    Image.fromarray(np.full((6, 8), 900, np.uint16)).save(file, "png")
+    monkeypatch.setattr(rlds_schema, "_encode", lambda images: [file.getvalue()] * len(images))
+    rlds.write(make(), path.parent / "depth")
+    with pytest.raises(ValueError, match="mode I;16, not RGB"):
+        rlds.read(path.parent / "depth")
 
 
 @pytest.mark.parametrize("name", ["../../harm", "/tmp/harm", "é" * 300, ""])

@@ -1,6 +1,7 @@
 """Robots from a user's own MJCF, and their scenes."""
 
 import dataclasses
+import itertools
 from pathlib import Path
 
 import jax
@@ -188,6 +189,32 @@ def test_small_meshes_are_not_drawn(tmp_path):
     assert np.sum(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH) == 1
     drawn = build(model, ["side"]).geoms
     assert not np.any(model.geom_type[list(drawn)] == mujoco.mjtGeom.mjGEOM_MESH)
+
+
+def test_a_carriage_that_reaches_over_the_middle_is_no_finger(tmp_path, robot):
+    """The fingers open as far as their ends do; the pads are at the ends."""
+
+    def mesh(name, y, over):
+        pad = itertools.product((-0.01, 0.01), (y - 0.004, y + 0.004), (0.012, 0.05))
+        carriage = itertools.product((-0.01, 0.01), (y, over), (0, 0.012))
+        vertices = " ".join(f"{x:g}" for point in (*pad, *carriage) for x in point)
+        return f'<mesh name="{name}" vertex="{vertices}"/>'
+
+    meshes = mesh("hook_a", -0.001, -0.06) + mesh("hook_b", 0.001, 0.06)
+    box = 'type="box" size=".01 .004 .025" pos="0 {} .025"'
+    edits = [
+        (box.format(y), f'type="mesh" mesh="hook_{n}"') for n, y in (("a", -0.001), ("b", 0.001))
+    ]
+    found = mjcf.load(write(tmp_path, *edits, ("<asset>", f"<asset>{meshes}")), tcp="grip")
+    assert found.stroke == pytest.approx(robot.stroke, abs=1e-6)
+    np.testing.assert_allclose(found.tool, robot.tool, atol=1e-6)
+    model = scene.build(press.TASK.scene, found)
+    data = at(model, found.home, opening=0.03)
+    tcp, axes = data.site("tcp").xpos, data.site("tcp").xmat.reshape(3, 3)
+    kind = model.geom_conaffinity == 5
+    pads, size = (data.geom_xpos[kind] - tcp) @ axes, model.geom_size[kind]
+    np.testing.assert_allclose(np.abs(pads[:, 1]) - size[:, 1], 0.015, atol=1e-6)
+    np.testing.assert_allclose(np.abs(pads[:, 2]) + size.max(axis=1), robots.TIP_LENGTH, atol=1e-6)
 
 
 @pytest.mark.slow

@@ -55,6 +55,7 @@ _ONE_EDIT = (
     ),
     ("arm.xml is damaged", "</mujoco>", ""),
     ("reach x 0.34 m", 'range="0 160"', 'range="0 5"'),
+    ("first hinge is at x 0.5 m, y 0.9 m: place the base at the origin", "0 0 .02", ".5 .9 .02"),
 )
 _SEVERAL_EDITS = (
     (

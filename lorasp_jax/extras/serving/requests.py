@@ -203,12 +203,12 @@ def _lookup(message: Mapping[str, Any], key: str) -> Any:
 
 def _vector(name: str, value: Any) -> np.ndarray:
     """Convert a number, a list of numbers or an array `[n]` to f32 `[n]`."""
-    if isinstance(value, list) and all(type(x) in (int, float) for x in value):
+    if isinstance(value, list) and all(map(_is_number, value)):
         value = np.array(value, float)
     if isinstance(value, int | float) and not isinstance(value, bool):
         value = np.array([value], float)
     if not isinstance(value, np.ndarray | np.generic) or value.dtype.kind not in "iuf":
-        raise ValueError(f"{name} must be numbers, got {type(value).__name__}")
+        raise ValueError(f"{name} must be numbers, got {_describe(value)}")
     if value.ndim > 1:
         raise ValueError(f"{name} must have one axis, got shape {value.shape}")
     with np.errstate(over="ignore"):  # overflows to inf, which is rejected below
@@ -216,6 +216,24 @@ def _vector(name: str, value: Any) -> np.ndarray:
     if not np.isfinite(vector).all():
         raise ValueError(f"{name} must be finite")
     return vector
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a value is a number, also as NumPy's scalar or array `[]`."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.ndim == 0 and value.dtype.kind in "iuf"
+    return type(value) in (int, float)
+
+
+def _describe(value: Any) -> str:
+    """Name a value's type, and what it consists of."""
+    if isinstance(value, dict):
+        keys = ", ".join(key if isinstance(key, str) else repr(key) for key in value)
+        return f"a map with the keys {keys[:100]}"
+    if isinstance(value, list):
+        wrong = next((x for x in value if not _is_number(x)), None)
+        return f"a list with a value of type {type(wrong).__name__}"
+    return type(value).__name__
 
 
 def _text(name: str, value: Any) -> str | None:

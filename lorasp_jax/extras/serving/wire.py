@@ -81,6 +81,11 @@ class _Decoder:
 
     def map(self, fields: dict[Any, Any]) -> Any:
         self.list([*fields])
+        if b"nd" in fields or "__ndarray__" in fields:
+            raise FrameError(
+                "arrays must be encoded as openpi_client.msgpack_numpy does, as a map with the "
+                f"bytes keys __ndarray__, data, dtype and shape; got the keys {[*fields][:4]}"
+            )
         if b"__ndarray__" in fields:
             return _array(fields)
         return _scalar(fields) if b"__npgeneric__" in fields else fields

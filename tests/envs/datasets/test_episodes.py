@@ -1,6 +1,7 @@
 """Episodes on disk and in memory."""
 
 import dataclasses
+import zipfile
 
 import jax
 import numpy as np
@@ -46,6 +47,15 @@ def test_round_trip(tmp_path):
     assert [file.name for file in path.parent.iterdir()] == ["press.npz"]
     assert episodes.num_episodes == 3
     assert episodes.num_steps == 1 + 2 + 3
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_arrays_of_the_same_name_are_refused(tmp_path):
+    make().save(path := tmp_path / "press.npz")
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("state.npy", archive.read("action.npy"))
+    with pytest.raises(ValueError, match="same name"):
+        Episodes.load(path)
 
 
 def test_repr_is_one_line():

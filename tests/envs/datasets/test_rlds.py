@@ -62,6 +62,11 @@ def test_one_episode_at_a_time(path):
         assert_equal(found.episode(number, ()), dataclasses.replace(short, image={}))
         (camera,) = found.episode(number, ["wrist"]).image
         assert camera == "wrist"
+    chosen = rlds.Reader(path, ["wrist"])
+    assert (list(chosen.cameras), chosen.left_out) == (["wrist"], {"side": "not chosen"})
+    assert list(chosen.episode(0).image) == ["wrist"]
+    with pytest.raises(ValueError, match="no camera 'top': choose from side, wrist"):
+        rlds.Reader(path, ["top"])
 
 
 def test_other_cameras_robots_and_actions(path):

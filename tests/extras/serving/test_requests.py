@@ -70,7 +70,14 @@ def test_a_policy_that_needs_all_cameras_refuses_forms_with_fewer():
 
 
 @pytest.mark.parametrize("prompt", [b"go", np.str_("go"), np.array("go"), np.array(b"go")])
-@pytest.mark.parametrize("state", [[0.0] * 7, np.zeros(7, int), np.zeros(7, ">f8")])
+@pytest.mark.parametrize(
+    "state",
+    [
+        *([0.0] * 7, np.zeros(7, int), np.zeros(7, ">f8")),
+        [*np.zeros(6, np.float32), np.int64(0)],
+        [*[np.array(0.0)] * 6, 0],
+    ],
+)
 def test_values_of_other_types(prompt, state):
     request = parse(observation() | {"prompt": prompt, "state": state}, SPEC)
     assert (request.prompt, request.state.dtype) == ("go", np.float32)
@@ -83,7 +90,13 @@ def test_values_of_other_types(prompt, state):
         ({"state": np.full(7, np.nan)}, "state must be finite"),
         ({"state": np.full(7, 1e300)}, "state must be finite"),
         ({"state": np.zeros((1, 7))}, "state must have one axis, got shape (1, 7)"),
-        ({"state": ["0"] * 7}, "state must be numbers, got list"),
+        ({"state": [0, "0"]}, "state must be numbers, got a list with a value of type str"),
+        (
+            {"state": [np.zeros(7)]},
+            "state must be numbers, got a list with a value of type ndarray",
+        ),
+        ({"state": [np.True_] * 7}, "with a value of type bool"),
+        ({"state": {"x": 0, b"y": 1}}, "state must be numbers, got a map with the keys x, b'y'"),
         ({"state": np.zeros(7, bool)}, "state must be numbers"),
         ({"state": True}, "state must be numbers, got bool"),
         ({"state": None}, "state must be numbers, got NoneType"),

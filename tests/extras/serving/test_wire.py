@@ -52,6 +52,20 @@ def test_scalars_that_lie_are_refused(data, dtype):
         unpack(msgpack.packb({b"__npgeneric__": True, b"data": data, b"dtype": dtype}))
 
 
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {b"nd": True, b"type": "<f8", b"kind": b"", b"shape": [3], b"data": bytes(24)},
+        {b"nd": False, b"type": "<f8", b"data": bytes(8)},
+        {"__ndarray__": True, "dtype": "<f8", "shape": [3], "data": bytes(24)},
+    ],
+    ids=["msgpack_numpy", "its scalars", "text keys"],
+)
+def test_arrays_of_other_encodings_are_named(fields):
+    with pytest.raises(FrameError, match=r"encoded as openpi_client\.msgpack_numpy does"):
+        unpack(msgpack.packb({"state": fields}))
+
+
 FRAMES = {
     "empty": b"",
     "unused code": b"\xc1",
