@@ -215,7 +215,7 @@ def choose_cameras(
         `available`, in the order of `chosen`; and camera -> why it is left out.
 
     Raises:
-        ValueError: a camera is unknown, or there is none.
+        ValueError: a camera is unknown or chosen twice, or there is none.
     """
     left = "".join(f"; {name} is left out ({reason})" for name, reason in others.items())
     if not available:
@@ -223,6 +223,8 @@ def choose_cameras(
     if unknown := [name for name in chosen if name not in available]:
         known = ", ".join(available)
         raise ValueError(f"{path} has no camera {unknown[0]!r}: choose from {known}{left}")
+    if len(set(chosen)) < len(chosen):
+        raise ValueError(f"each camera of {path} can be chosen only once, got {', '.join(chosen)}")
     skipped = {name: "not chosen" for name in available if chosen and name not in chosen}
     return {name: available[name] for name in chosen or available}, {**others, **skipped}
 

@@ -146,9 +146,11 @@ class LeRobot:
             pictures, reasons = lerobot_features.pictures(self.index.features)
         selected = dict(self.keys.cameras) or pictures
         known = [key for key in pictures.values() if key not in reasons]
-        if wrong := [k for n, k in self.keys.cameras.items() if k not in known]:
-            why = f"is no color camera ({reasons[wrong[0]]})" if wrong[0] in reasons else "is none"
-            raise ValueError(f"{self.path}: {wrong[0]} {why}: choose cameras from {known}")
+        if wrong := [key for key in self.keys.cameras.values() if key not in known]:
+            why = f", it is marked as {reasons[wrong[0]]}" if wrong[0] in reasons else ""
+            raise ValueError(
+                f"{self.path} has no color camera {wrong[0]}{why}: choose from {', '.join(known)}"
+            )
         usable = {name: key for name, key in selected.items() if key in known}
         others = {name: reasons[key] for name, key in pictures.items() if key in reasons}
         cameras, left_out = choose_cameras(usable, chosen, self.path, others)
@@ -156,7 +158,10 @@ class LeRobot:
             try:
                 check_camera(name)
             except ValueError as error:
-                raise ValueError(f"{self.path}: {error}; rename it: --cameras NAME={key}") from None
+                raise ValueError(
+                    f"{self.path}: {error}; rename it with python -m lorasp_jax.data convert "
+                    f"--cameras NAME={key}"
+                ) from None
         return cameras, left_out
 
     @property

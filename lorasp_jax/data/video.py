@@ -135,7 +135,8 @@ def _check_color(pixels: str, what: str) -> None:
     """Refuse depth and other images of one channel, given a pixel format of Pillow or FFmpeg."""
     if pixels.partition(";")[0] in _ONE_CHANNEL or pixels.startswith("gray"):
         raise RefusedError(
-            f"{what} has one channel, as depth has, not colors: choose other cameras with --cameras"
+            f"{what} has one channel, as depth has, not colors: leave its camera out with "
+            "--cameras, or --data.cameras in training"
         )
 
 

@@ -29,6 +29,13 @@ def test_summary(source):
     assert not inspection.hints(found)
 
 
+def test_a_gripper_alone_has_no_joints(source):
+    found = inspection.summarize(source)
+    alone = dataclasses.replace(found, state=2 + found.state[:, 6:])
+    (hint,) = inspection.hints(alone)
+    assert "--gripper millimetres" in hint
+
+
 @pytest.mark.parametrize("actions", ["joint", "end_effector"])
 def test_dimensions_have_names(actions, source):
     episode = dataclasses.replace(source.episode(0, ()), actions=actions)

@@ -209,7 +209,7 @@ def test_cameras_of_the_same_short_name(folder):
     assert LeRobot(folder).cameras == {key: key for key in (SIDE, WRIST, "side")}
     mark(folder, "side", dtype="none")
     edit_info(folder, lambda info: info["features"].update({"left:eye": info["features"][SIDE]}))
-    with pytest.raises(ValueError, match="rename it: --cameras NAME=left:eye"):
+    with pytest.raises(ValueError, match="convert --cameras NAME=left:eye"):
         LeRobot(folder)
     assert main(["inspect", str(folder), "--cameras", f"a={SIDE}", f"a={WRIST}"]) == 2
 

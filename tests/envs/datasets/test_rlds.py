@@ -67,6 +67,8 @@ def test_one_episode_at_a_time(path):
     assert list(chosen.episode(0).image) == ["wrist"]
     with pytest.raises(ValueError, match="no camera 'top': choose from side, wrist"):
         rlds.Reader(path, ["top"])
+    with pytest.raises(ValueError, match="only once, got side, side"):
+        rlds.Reader(path, ["side", "side"])
 
 
 def test_other_cameras_robots_and_actions(path):
