@@ -3,8 +3,9 @@
     dataset = LeRobot("hf://lerobot/some_dataset", Keys(angles="degrees", gripper="millimetres"))
     episodes = dataset.episode(0)
 
-States and actions are columns of parquet files. Images are video frames, or PNG or JPEG files in
-other columns. Each episode is returned as `Episodes` with E = 1, in this project's order and units.
+States and actions are columns of parquet files. Images are video frames, or PNG or JPEG files
+that other columns contain or name. Each episode is returned as `Episodes` with E = 1, in this
+project's order and units.
 """
 
 import os
@@ -88,10 +89,8 @@ class LeRobot:
         self._sizes: dict[str, int] = {}
         self._columns: dict[str, list[int]] = {}
         self.names: dict[str, list[str]] = {}
-        for kind in ("state", "action"):
-            self._select(kind)
+        self._select_dimensions()
         self._grippers: list[int] = self._select_grippers()
-        self._check_order()
         images = [key for key in self.cameras.values() if not self._is_video(key)]
         needed = (self.keys.state, self.keys.action, *_COLUMNS, *images)
         self._needed = list(dict.fromkeys(needed))  # state and action may be the same feature
@@ -171,24 +170,15 @@ class LeRobot:
     def _is_video(self, key: str) -> bool:
         return self.index.features[key]["dtype"] == "video"
 
-    def _select(self, kind: str) -> None:
-        """Select dimensions of the state or action."""
-        key, wanted = getattr(self.keys, kind), getattr(self.keys, f"{kind}_numbers")
-        with as_value_error(self._info):
-            names = lerobot_features.dimension_names(self.index.features, key, self._info)
-        columns = lerobot_features.select(names, wanted, f"{self.path}: {kind}")
-        self._sizes[kind], self._columns[kind] = len(names), columns
-        self.names[kind] = [names[column] for column in columns]
-
-    def _select_grippers(self) -> list[int]:
-        """Return which of the selected dimensions are grippers."""
-        if not self.keys.grippers:
-            return [len(self.names["state"]) - 1]
-        what = f"{self.path}: the selected state"
-        return lerobot_features.select(self.names["state"], self.keys.grippers, what)
-
-    def _check_order(self) -> None:
-        """Raise ValueError unless state and action have the same dimensions, in this order."""
+    def _select_dimensions(self) -> None:
+        """Select those of state and action, which must be the same, in the same order."""
+        for kind in ("state", "action"):
+            key, wanted = getattr(self.keys, kind), getattr(self.keys, f"{kind}_numbers")
+            with as_value_error(self._info):
+                names = lerobot_features.dimension_names(self.index.features, key, self._info)
+            columns = lerobot_features.select(names, wanted, f"{self.path}: {kind}")
+            self._sizes[kind], self._columns[kind] = len(names), columns
+            self.names[kind] = [names[column] for column in columns]
         state, action = self.names["state"], self.names["action"]
         if len(state) != len(action) or (state != action and sorted(state) == sorted(action)):
             raise ValueError(
@@ -196,6 +186,13 @@ class LeRobot:
                 "the same joints and gripper, in the same order, with --state-numbers and "
                 "--action-numbers"
             )
+
+    def _select_grippers(self) -> list[int]:
+        """Return which of the selected dimensions are grippers."""
+        if not self.keys.grippers:
+            return [len(self.names["state"]) - 1]
+        what = f"{self.path}: the selected state"
+        return lerobot_features.select(self.names["state"], self.keys.grippers, what)
 
     def _frames(self, entry: EpisodeEntry) -> Any:
         """Read the episode's rows from its parquet file; check frame numbers and timestamps."""

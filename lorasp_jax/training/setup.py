@@ -149,25 +149,23 @@ def prepare(
     console.print(f"memory per device: {built.memory}; rematerialization: {base.config.remat}")
     run = Run(config, folder, console, built.base_hash, started)
     _load_or_collect(run, built, collect, meanwhile)
-    relative = config.model.relative_actions
-    inputs = processor(
-        [*run.episodes.values()],
-        model.config,
-        built.prompts,
-        relative=relative,
-        cameras=config.data.cameras,
-    )
+    options = {"relative": config.model.relative_actions, "cameras": config.data.cameras}
+    inputs = processor([*run.episodes.values()], model.config, built.prompts, **options)
     if any(method.needs_statistics for method in rules.methods(config)):
         model = _adapt(config, base, rules.rules(config), input_moments(run, base, inputs))
     if built.source:
-        if unused := describe_left_out(built.source):
-            console.print(unused, markup=False, soft_wrap=True)
-        cameras = [f"{name} -> {slot}" for slot, name in inputs.cameras if name]
-        size = f"{inputs.image_size} x {inputs.image_size}"
-        summary = f"cameras: {', '.join(cameras)}; resized to {size}"
-        console.print(summary, markup=False, soft_wrap=True)
+        _print_cameras(built.source, inputs, console)
     run.policy = Policy(model, inputs)
     return run
+
+
+def _print_cameras(source: Source, inputs: Processor, console: Console) -> None:
+    if unused := describe_left_out(source):
+        console.print(unused, markup=False, soft_wrap=True)
+    cameras = [f"{name} -> {slot}" for slot, name in inputs.cameras if name]
+    size = f"{inputs.image_size} x {inputs.image_size}"
+    summary = f"cameras: {', '.join(cameras)}; resized to {size}"
+    console.print(summary, markup=False, soft_wrap=True)
 
 
 def _load_or_collect(
