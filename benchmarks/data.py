@@ -50,6 +50,7 @@ class Noise:
     def __init__(self, steps: int, height: int, width: int) -> None:
         self.num_steps, self._rng = steps, np.random.default_rng(0)
         self._size = (1, EPISODE, height, width, 3)
+        self.left_out: dict[str, str] = {}
 
     def __len__(self) -> int:
         return self.num_steps // EPISODE

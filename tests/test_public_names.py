@@ -25,8 +25,8 @@ PUBLIC = {
         create find from_settings names to_settings
     """,
     "lorasp_jax.models": """
-        Observation lerobot_names load load_config pi0 published save set_arrays smolvla
-        weights_hash
+        Observation lerobot_names load load_config openpi_configs pi0 published save set_arrays
+        smolvla weights_hash
     """,
     "lorasp_jax.policies": "Policy Processor PromptTable statistics_files tokenizer",
     "lorasp_jax.data": "Stream cache open_source",

@@ -42,7 +42,7 @@ class Episodes:
         state: f32 `[E, T, J + 1]` joint angles [rad] and gripper opening [m], measured before each
             action.
         action: f32 `[E, T, A]` commands; by default A = J + 1 joint targets [rad] and gripper
-            opening [m].
+            opening [m]. Recordings may have another A.
         length: int32 `[E]` number of valid steps, 1 to T; the rest is padding.
         instruction: int32 `[E]` index into `instructions`.
         instructions: phrasings of the task.
@@ -166,7 +166,11 @@ class Episodes:
             )
         yield self.state.ndim == 3 and self.state.size > 0, "state must have shape [E, T, J + 1]"
         episodes, steps, width = self.state.shape
-        shape = (episodes, steps, 7 if self.actions == "end_effector" else width)
+        if self.actions == "end_effector":
+            width = 7
+        elif self.physics_dt == 0 and self.action.ndim == 3:  # recordings: of any length
+            width = max(1, self.action.shape[2])
+        shape = (episodes, steps, width)
         yield self.action.shape == shape, f"action must have shape {shape}, got {self.action.shape}"
         for name in ("state", "action"):
             values = np.asarray(getattr(self, name))

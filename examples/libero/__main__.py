@@ -1,6 +1,6 @@
 """Measure a policy's success on LIBERO or LIBERO-PRO, through a policy server of openpi's protocol.
 
-    python -m lorasp_jax.extras.serving gs://openpi-assets/checkpoints/pi0_libero --joints 7 ...
+    python -m lorasp_jax.extras.serving gs://openpi-assets/checkpoints/pi05_libero ...
     python -m examples.libero --suite libero_spatial
 
 Requests, pictures and episodes are those of openpi's examples/libero/main.py (at 15a9616).

@@ -1,6 +1,7 @@
 """Types of command-line arguments, for argparse."""
 
 import argparse
+import re
 
 
 def positive(text: str) -> int:
@@ -8,6 +9,19 @@ def positive(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"must be a positive whole number, got {text!r}")
     return int(text)
+
+
+def indices(text: str) -> tuple[int, ...]:
+    """Parse "none", or indices and ranges of them, as in 0-5,7."""
+    if text == "none":
+        return ()
+    if not re.fullmatch(r"\d{1,4}(-\d{1,4})?(,\d{1,4}(-\d{1,4})?)*", text):
+        raise argparse.ArgumentTypeError(f"must be none, or numbers such as 0-5,7, got {text!r}")
+    ends = [part.split("-") for part in text.split(",")]
+    ranges = [range(int(part[0]), int(part[-1]) + 1) for part in ends]
+    if not all(ranges):
+        raise argparse.ArgumentTypeError(f"ranges must ascend, got {text!r}")
+    return tuple(index for each in ranges for index in each)
 
 
 def pair(text: str) -> tuple[str, str]:

@@ -43,7 +43,7 @@ class Steps:
     Attributes:
         image: camera name -> `[N, H, W, 3]` uint8.
         state: `[N, J+1]` joints [rad] and gripper opening [m].
-        action: `[N, J+1]` joint targets [rad] and gripper opening [m].
+        action: `[N, J+1]` joint targets [rad] and gripper opening [m], or of another length.
         end: `[N]` int32, index just past the last step of the episode.
         instruction: `[N]` int32, row of the processor's token table.
         starts: `[S]` int32, the steps at which a window may start; None: all.

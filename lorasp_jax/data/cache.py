@@ -160,7 +160,7 @@ def _metadata(episode: Episodes) -> dict[str, Any]:
     """Return the metadata that all episodes of a cache must share."""
     metadata = {name: getattr(episode, name) for name in METADATA}
     metadata["cameras"] = {name: list(x.shape[2:4]) for name, x in sorted(episode.image.items())}
-    metadata["numbers"] = episode.state.shape[2]
+    metadata["numbers"] = [episode.state.shape[2], episode.action.shape[2]]
     return metadata
 
 

@@ -73,9 +73,12 @@ def summarize(source: Source) -> Summary:
 
 def _names(episode: Episodes) -> dict[str, list[str]]:
     """Return the dimension names of an episode in this project's own formats."""
-    joints = [f"joint_{i + 1}" for i in range(episode.state.shape[2] - 1)]
-    action = _END_EFFECTOR if episode.actions == "end_effector" else joints
-    return {"state": [*joints, "gripper"], "action": [*action, "gripper"]}
+    state, action = (
+        [f"joint_{i + 1}" for i in range(array.shape[2] - 1)]
+        for array in (episode.state, episode.action)
+    )
+    action = _END_EFFECTOR if episode.actions == "end_effector" else action
+    return {"state": [*state, "gripper"], "action": [*action, "gripper"]}
 
 
 def report(source: Source, console: Console) -> None:

@@ -90,7 +90,7 @@ class LeRobot:
         self._columns: dict[str, list[int]] = {}
         self.names: dict[str, list[str]] = {}
         self._select_dimensions()
-        self._grippers: list[int] = self._select_grippers()
+        self._grippers = {kind: self._select_grippers(kind) for kind in self.names}
         images = [key for key in self.cameras.values() if not self._is_video(key)]
         needed = (self.keys.state, self.keys.action, *_COLUMNS, *images)
         self._needed = list(dict.fromkeys(needed))  # state and action may be the same feature
@@ -171,7 +171,7 @@ class LeRobot:
         return self.index.features[key]["dtype"] == "video"
 
     def _select_dimensions(self) -> None:
-        """Select those of state and action, which must be the same, in the same order."""
+        """Select those of state and action, in the same order if they are the same."""
         for kind in ("state", "action"):
             key, wanted = getattr(self.keys, kind), getattr(self.keys, f"{kind}_numbers")
             with as_value_error(self._info):
@@ -180,19 +180,18 @@ class LeRobot:
             self._sizes[kind], self._columns[kind] = len(names), columns
             self.names[kind] = [names[column] for column in columns]
         state, action = self.names["state"], self.names["action"]
-        if len(state) != len(action) or (state != action and sorted(state) == sorted(action)):
+        if state != action and sorted(state) == sorted(action):
             raise ValueError(
-                f"{self.path} has other dimensions in state than in action, {self.names}: choose "
-                "the same joints and gripper, in the same order, with --state-numbers and "
-                "--action-numbers"
+                f"{self.path} has another order in state than in action, {self.names}: choose one "
+                "order with --state-numbers and --action-numbers"
             )
 
-    def _select_grippers(self) -> list[int]:
-        """Return which of the selected dimensions are grippers."""
+    def _select_grippers(self, kind: str) -> list[int]:
+        """Return which of the selected dimensions of state or action are grippers."""
         if not self.keys.grippers:
-            return [len(self.names["state"]) - 1]
-        what = f"{self.path}: the selected state"
-        return lerobot_features.select(self.names["state"], self.keys.grippers, what)
+            return [len(self.names[kind]) - 1]
+        what = f"{self.path}: the selected {kind}"
+        return lerobot_features.select(self.names[kind], self.keys.grippers, what)
 
     def _frames(self, entry: EpisodeEntry) -> Any:
         """Read the episode's rows from its parquet file; check frame numbers and timestamps."""
@@ -226,7 +225,7 @@ class LeRobot:
                 values = lerobot_features.rows(table[key], self._sizes[kind])[:, columns]
             except ValueError as error:
                 raise ValueError(f"{key} of episode {entry.number}: {error}") from error
-        is_gripper = np.isin(np.arange(len(columns)), self._grippers)
+        is_gripper = np.isin(np.arange(len(columns)), self._grippers[kind])
         angle = np.deg2rad(1) if self.keys.angles == "degrees" else 1
         length = 1e-3 if self.keys.gripper == "millimetres" else 1
         values = values * np.where(is_gripper, length, angle)

@@ -148,7 +148,8 @@ def _statistics(array: np.ndarray) -> dict[str, Any]:
 
 def _features(episode: Episodes) -> dict[str, Any]:
     joints = [*(f"joint_{i + 1}.pos" for i in range(episode.state.shape[2] - 1)), "gripper.pos"]
-    actions = joints if episode.actions == "joint" else None
+    same = episode.actions == "joint" and episode.action.shape[2] == len(joints)
+    actions = joints if same else None
     features: dict[str, Any] = {
         "observation.state": {"dtype": "float32", "shape": [len(joints)], "names": joints},
         "action": {"dtype": "float32", "shape": [episode.action.shape[2]], "names": actions},

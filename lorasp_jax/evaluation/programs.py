@@ -103,7 +103,7 @@ class SplitRollout:
     def compile(self, policy: Policy) -> None:
         """Compile all programs at once, whereas the first call compiles one after the other."""
         place = _placement(policy)
-        worlds, slots = self.env.num_envs, policy.processor.robot_slots
+        worlds, slots = self.env.num_envs, policy.processor.action_slots
         policy = _shareable(policy)
         key = jax.device_put(jax.random.key(0), place)
         blank = lambda x: jax.device_put(jnp.zeros(x.shape, x.dtype), place)  # noqa: E731

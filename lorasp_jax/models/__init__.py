@@ -1,7 +1,7 @@
 """Vision-language-action backbones, each a subpackage, and their checkpoints."""
 
 from lorasp_jax.models import pi0, smolvla
-from lorasp_jax.models.checkpoints import published
+from lorasp_jax.models.checkpoints import openpi_configs, published
 from lorasp_jax.models.checkpoints.loading import load, load_config
 from lorasp_jax.models.checkpoints.native import save, set_arrays, weights_hash
 from lorasp_jax.models.checkpoints.published import lerobot_names
@@ -12,6 +12,7 @@ __all__ = [
     "lerobot_names",
     "load",
     "load_config",
+    "openpi_configs",
     "pi0",
     "published",
     "save",

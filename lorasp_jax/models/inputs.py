@@ -23,6 +23,8 @@ class InputConfig:
     delta: tuple[bool, ...] = ()
     """True for each action dimension that is relative to the state at the start of the chunk; see
     `policies.processor.to_delta`. The action statistics are then those of relative actions."""
+    aloha: bool = False
+    """Convert ALOHA's states and actions to those of pi0's pretraining; see `policies.aloha`."""
     convention: Convention = "ours"
     """Project whose guard against division by zero applies in normalization."""
     gripper_slot: int | None = 7

@@ -2,7 +2,7 @@
 
 A robot uses some of the slots of a backbone's state and action vectors. Joints start at slot 0. The
 gripper is in slot 7 with this project's own weights, and directly after the joints with published
-weights. Unused slots are zero.
+weights. Unused slots are zero. The actions of some robots have another length than their states.
 """
 
 import dataclasses
@@ -17,6 +17,7 @@ import numpy as np
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.inputs import OURS, InputConfig
 from lorasp_jax.models.observation import Observation
+from lorasp_jax.policies import aloha
 from lorasp_jax.policies.images import resize_with_pad, to_unit
 from lorasp_jax.policies.normalization import normalize, unnormalize
 from lorasp_jax.policies.prompt_table import PromptTable
@@ -62,10 +63,10 @@ def to_delta(actions: jax.Array, state: jax.Array, mask: Sequence[bool]) -> jax.
     """Make actions relative to the state at the start of their chunk (openpi, DeltaActions).
 
     Args:
-        actions: `[..., C, J+1]`.
+        actions: `[..., C, J+1]`, or of another length.
         state: `[..., J+1]`.
-        mask: True for dimensions to make relative, usually the joints and not the gripper. Missing
-            trailing entries are False.
+        mask: True for dimensions to make relative, usually the joints and not the gripper, which
+            are the same in states and actions. Missing trailing entries are False.
     """
     return actions - _offset(actions, state, mask)
 
@@ -75,17 +76,20 @@ def to_absolute(actions: jax.Array, state: jax.Array, mask: Sequence[bool]) -> j
     return actions + _offset(actions, state, mask)
 
 
-def check_delta(mask: Sequence[bool], num_joints: int) -> None:
-    """Raise ValueError if a delta mask is longer than the robot's action vector."""
-    if len(mask) > num_joints + 1:
-        raise ValueError(f"delta mask has {len(mask)} entries, the actions {num_joints + 1}")
+def check_delta(mask: Sequence[bool], state_length: int, action_length: int) -> None:
+    """Raise ValueError if a delta mask is longer than the robot's state or action vector."""
+    if len(mask) > min(state_length, action_length):
+        raise ValueError(
+            f"delta mask has {len(mask)} entries, the state {state_length} and the actions "
+            f"{action_length}"
+        )
 
 
 def _offset(actions: jax.Array, state: jax.Array, mask: Sequence[bool]) -> jax.Array:
-    """Return the state `[..., 1, J+1]` f32 where the mask is True, else zero."""
-    full_mask = np.zeros(actions.shape[-1], bool)
-    full_mask[: len(mask)] = mask
-    return jnp.where(full_mask, state, 0)[..., None, :].astype(jnp.float32)
+    """Return the state f32 where the mask is True, else zero, as long as actions, `[..., 1, n]`."""
+    offset = jnp.where(np.array(mask, bool), state[..., : len(mask)], 0).astype(jnp.float32)
+    missing = actions.shape[-1] - len(mask)
+    return jnp.pad(offset, [*[(0, 0)] * (offset.ndim - 1), (0, missing)])[..., None, :]
 
 
 @jax.tree_util.register_dataclass
@@ -94,7 +98,8 @@ class Processor:
     """Converts observations and actions of one robot and its tasks. A pytree.
 
     Attributes:
-        robot_slots: slots of the robot's J+1 dimensions; see the function `robot_slots`.
+        state_slots: slots of the state's J+1 dimensions; see the function `robot_slots`.
+        action_slots: slots of the action's dimensions, usually the same.
         statistics: statistics of states and actions, by slot.
         prompts: tokenized prompts of the instructions.
         image_size: height and width of the backbone's images [pixels].
@@ -103,7 +108,8 @@ class Processor:
             and backbone use the same names.
     """
 
-    robot_slots: tuple[int, ...] = field(metadata={"static": True})
+    state_slots: tuple[int, ...] = field(metadata={"static": True})
+    action_slots: tuple[int, ...] = field(metadata={"static": True})
     statistics: Statistics
     prompts: PromptTable
     image_size: int = field(default=64, metadata={"static": True})
@@ -118,6 +124,7 @@ class Processor:
         prompts: PromptTable,
         *,
         num_joints: int,
+        action_length: int | None = None,
         cameras: Mapping[str, str] | None = None,
         delta: Sequence[bool] | None = None,
     ) -> "Processor":
@@ -127,7 +134,8 @@ class Processor:
             config: the backbone's sizes and input conventions.
             statistics: the robot's statistics, in the order of its joints or already in slots.
             prompts: tokenized prompts of the instructions.
-            num_joints: J.
+            num_joints: J, such that states have J+1 numbers.
+            action_length: length of the actions; None: J+1, too.
             cameras: backbone camera -> robot camera, see `camera_slots`; None if the names are
                 equal.
             delta: mask of relative action dimensions, see `to_delta`. The action statistics must be
@@ -135,33 +143,33 @@ class Processor:
 
         Raises:
             ValueError: joints, statistics or cameras do not fit the backbone, or the delta mask is
-                longer than the robot's actions.
+                longer than the robot's states or actions.
         """
+        action_length = action_length or num_joints + 1
         slots = robot_slots(num_joints, config.inputs)
-        if statistics.dim != config.action_dim:
-            statistics = statistics.to_slots(slots, config.action_dim)
+        action_slots = robot_slots(action_length - 1, config.inputs)
+        if {statistics.dim, statistics.action_length} != {config.action_dim}:
+            statistics = statistics.to_slots(slots, config.action_dim, action_slots)
         pairs = () if cameras is None else camera_slots(config.cameras, cameras)
         inputs = config.inputs
         if delta is not None:
             inputs = dataclasses.replace(inputs, delta=tuple(delta))
-        check_delta(inputs.delta, num_joints)
-        return cls(slots, statistics, prompts, config.image_size, inputs, pairs)
+        check_delta(inputs.delta, len(slots), len(action_slots))
+        if inputs.aloha and {len(slots), len(action_slots)} != {aloha.NUMBERS}:
+            raise ValueError(
+                f"ALOHA's states and actions have {aloha.NUMBERS} numbers, got {len(slots)} and "
+                f"{len(action_slots)}"
+            )
+        return cls(slots, action_slots, statistics, prompts, config.image_size, inputs, pairs)
 
     def shared(self) -> "Processor":
         """Return a processor for rows of the prompt table alone; see `PromptTable.shared`."""
         return dataclasses.replace(self, prompts=self.prompts.shared())
 
     @property
-    def slot_mask(self) -> np.ndarray:
-        """Mask of the robot's slots, `[A]` bool."""
-        mask = np.zeros(self.statistics.dim, bool)
-        mask[list(self.robot_slots)] = True
-        return mask
-
-    @property
     def flow_slots(self) -> np.ndarray:
         """Mask of the slots that carry flow noise and count in the loss, `[A]` bool."""
-        return self.slot_mask | (not self.inputs.quiet_slots)
+        return self._mask(self.action_slots) | (not self.inputs.quiet_slots)
 
     def encode(
         self, raw: RawObservation, instruction: jax.Array, *, state_noise: jax.Array | None = None
@@ -181,12 +189,12 @@ class Processor:
         """
         state = self.normalize_state(raw["state"])
         if state_noise is not None:
-            state = state + state_noise * self.slot_mask
+            state = state + state_noise * self._mask(self.state_slots)
         sources = dict(self.cameras) or {name: name for name in raw["image"]}
         missing = sorted({name for name in sources.values() if name} - set(raw["image"]))
         if missing:
             raise ValueError(f"the observation lacks camera {missing[0]}, got {[*raw['image']]}")
-        prompt = self.prompts.encode(instruction, state[:, np.array(self.robot_slots)])
+        prompt = self.prompts.encode(instruction, state[:, np.array(self.state_slots)])
         black = jnp.full((len(state), self.image_size, self.image_size, 3), -1.0)
         return Observation(
             images={
@@ -206,46 +214,52 @@ class Processor:
 
         `[..., J+1]` [rad, m] -> `[..., A]`.
         """
-        return self._to_slots("state", state)
+        return self._to_slots("state", self.state_slots, self._known_state(state))
 
     def normalize_actions(self, actions: jax.Array, state: jax.Array | None = None) -> jax.Array:
         """Normalize actions and put them into the backbone's slots.
 
         Args:
-            actions: `[..., C, J+1]` [rad, m].
+            actions: `[..., C, J+1]` [rad, m], or of the length of `action_slots`.
             state: `[..., J+1]` raw state at the start of the chunk; required for relative actions.
 
         Returns:
             `[..., C, A]`.
         """
+        if self.inputs.aloha:
+            actions = aloha.actions_to_pi0(actions)
         if self.inputs.delta:
-            actions = to_delta(actions, _require_state(state), self.inputs.delta)
-        return self._to_slots("action", actions)
+            actions = to_delta(actions, self._known_state(state), self.inputs.delta)
+        return self._to_slots("action", self.action_slots, actions)
 
     def decode(self, actions: jax.Array, state: jax.Array | None = None) -> jax.Array:
         """Invert `normalize_actions`: `[..., C, A]` -> `[..., C, J+1]` f32 [rad, m]."""
-        slots, inputs = np.array(self.robot_slots), self.inputs
+        slots, inputs = np.array(self.action_slots), self.inputs
         stats = {name: array[slots] for name, array in self.statistics.action.items()}
         actions = unnormalize(actions[..., slots], stats, inputs.action, inputs.convention)
         if inputs.delta:
-            actions = to_absolute(actions, _require_state(state), inputs.delta)
-        return actions
+            actions = to_absolute(actions, self._known_state(state), inputs.delta)
+        return aloha.actions_from_pi0(actions) if inputs.aloha else actions
 
-    def _to_slots(self, kind: str, values: jax.Array) -> jax.Array:
-        """Normalize states or actions `[..., J+1]` and return them in slots, `[..., A]`."""
-        slots, dim = np.array(self.robot_slots), self.statistics.dim
-        check_slots(self.robot_slots, dim, values.shape[-1])
-        stats = {name: array[slots] for name, array in getattr(self.statistics, kind).items()}
+    def _known_state(self, state: jax.Array | None) -> jax.Array:
+        """Return the raw state in the joint space that the weights know."""
+        if state is None:
+            raise ValueError("this backbone uses relative actions: pass the raw state")
+        return aloha.state_to_pi0(state) if self.inputs.aloha else state
+
+    def _mask(self, slots: Sequence[int]) -> np.ndarray:
+        """Return the mask of these slots, `[A]` bool."""
+        return np.isin(np.arange(self.statistics.dim), slots)
+
+    def _to_slots(self, kind: str, slots: Sequence[int], values: jax.Array) -> jax.Array:
+        """Normalize states or actions `[..., n]` and return them in slots, `[..., A]`."""
+        dim, at = self.statistics.dim, np.array(slots)
+        check_slots(slots, dim, values.shape[-1])
+        stats = {name: array[at] for name, array in getattr(self.statistics, kind).items()}
         normalized = normalize(values, stats, getattr(self.inputs, kind), self.inputs.convention)
-        return jnp.zeros((*values.shape[:-1], dim)).at[..., slots].set(normalized)
+        return jnp.zeros((*values.shape[:-1], dim)).at[..., at].set(normalized)
 
     def _image(self, name: str, image: jax.Array) -> jax.Array:
         centred, antialias = self.inputs.centred, self.inputs.antialias
         unit = to_unit(name, image)
         return resize_with_pad(unit, self.image_size, centred=centred, antialias=antialias)
-
-
-def _require_state(state: jax.Array | None) -> jax.Array:
-    if state is None:
-        raise ValueError("this backbone uses relative actions: pass the raw state")
-    return state

@@ -26,9 +26,9 @@ class Statistics:
     """Statistics of states and of actions. A pytree.
 
     Attributes:
-        state: f32 arrays by name, for some of `NAMES`. Their shape is `[J+1]` before `to_slots`
-            and `[A]` after it; unused slots then have mean 0 and std 1.
-        action: the same for actions.
+        state: f32 arrays by name, for some of `NAMES`. They have the robot's length, `[J+1]`,
+            before `to_slots` and `[A]` after it; unused slots then have mean 0 and std 1.
+        action: the same for actions, whose length before `to_slots` may be another.
     """
 
     state: Mapping[str, jax.Array]
@@ -36,8 +36,13 @@ class Statistics:
 
     @property
     def dim(self) -> int:
-        """Length of the arrays: A, or J+1 before `to_slots`."""
+        """Length of the state's arrays: A, or J+1 before `to_slots`."""
         return next(iter(self.state.values())).shape[-1]
+
+    @property
+    def action_length(self) -> int:
+        """Length of the action's arrays: A, or that of the robot's actions before `to_slots`."""
+        return next(iter(self.action.values())).shape[-1]
 
     @classmethod
     def measure(
@@ -48,49 +53,58 @@ class Statistics:
         *,
         slots: Sequence[int],
         dim: int,
+        action_slots: Sequence[int] | None = None,
     ) -> "Statistics":
         """Compute the statistics of demonstrations; std is at least `MIN_SPREAD`.
 
         Args:
             state: `[..., J+1]` joints [rad] and gripper [m].
-            action: `[..., J+1]` actions as the policy predicts them, absolute or relative to the
-                state.
+            action: `[..., J+1]`, or of another length: actions as the policy predicts them,
+                absolute or relative to the state.
             valid: `[...]` bool, False at padding.
-            slots: slots of the J+1 dimensions.
+            slots: slots of the state's dimensions.
             dim: number of slots, A.
+            action_slots: slots of the action's dimensions; None: those of the state's.
 
         Raises:
             ValueError: no step is valid, or the slots do not match the data.
         """
         valid = np.asarray(valid, bool)
+        action_slots = slots if action_slots is None else action_slots
         check_slots(slots, dim, np.shape(state)[-1])
+        check_slots(action_slots, dim, np.shape(action)[-1])
         if not valid.any():
             raise ValueError("statistics need at least one valid step")
         moments = (_measure(np.asarray(values, np.float64)[valid]) for values in (state, action))
-        return cls(*moments).to_slots(slots, dim)
+        return cls(*moments).to_slots(slots, dim, action_slots)
 
-    def to_slots(self, slots: Sequence[int], dim: int) -> "Statistics":
+    def to_slots(
+        self, slots: Sequence[int], dim: int, action_slots: Sequence[int] | None = None
+    ) -> "Statistics":
         """Move a robot's statistics into a backbone's slots.
 
         Args:
-            slots: slots of the robot's J+1 dimensions. Further dimensions of the statistics are
+            slots: slots of the state's dimensions. Further dimensions of the statistics are
                 dropped, because openpi pads its files.
             dim: number of slots, A.
+            action_slots: slots of the action's dimensions; None: those of the state's.
 
         Raises:
             ValueError: fewer dimensions than slots, or invalid slots.
         """
-        check_slots(slots, dim, len(slots))
-        if self.dim < len(slots):
-            raise ValueError(f"statistics need {len(slots)} dimensions, got {self.dim}")
 
-        def move(stats: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
+        def move(stats: Mapping[str, jax.Array], slots: Sequence[int]) -> dict[str, jax.Array]:
+            check_slots(slots, dim, len(slots))
+            length = next(iter(stats.values())).shape[-1]
+            if length < len(slots):
+                raise ValueError(f"statistics need {len(slots)} dimensions, got {length}")
             moved = {name: np.full(dim, _UNUSED[name], np.float32) for name in stats}
             for name, array in moved.items():
                 array[list(slots)] = stats[name][: len(slots)]
             return {name: jnp.asarray(array) for name, array in moved.items()}
 
-        return Statistics(move(self.state), move(self.action))
+        action_slots = slots if action_slots is None else action_slots
+        return Statistics(move(self.state, slots), move(self.action, action_slots))
 
     def to_json(self) -> str:
         """Return a JSON object: lists such as "state_mean", exact in fp32, and a digest."""
@@ -123,15 +137,18 @@ def validate(both: Mapping[str, Mapping[str, np.ndarray]], source: str) -> Stati
     """Create statistics from arrays by kind ("state", "action") and name.
 
     Raises:
-        ValueError: no statistics of one kind, unknown names, different lengths, values that are not
-            finite, or a negative standard deviation; the message names `source`.
+        ValueError: no statistics of one kind, unknown names, different lengths within a kind,
+            values that are not finite, or a negative standard deviation; the message names
+            `source`.
     """
     arrays = [array for stats in both.values() for array in stats.values()]
     names = {name for stats in both.values() for name in stats}
     if not (all(both.values()) and names <= set(NAMES)):
         raise ValueError(f"{source} must have state and action statistics among {', '.join(NAMES)}")
-    if any(array.ndim != 1 or array.shape != arrays[0].shape for array in arrays):
-        raise ValueError(f"statistics in {source} must be lists of equal length")
+    if any(array.ndim != 1 for array in arrays) or any(
+        len({array.shape for array in stats.values()}) > 1 for stats in both.values()
+    ):
+        raise ValueError(f"the statistics of each kind in {source} must be lists of equal length")
     negative = any((stats.get("std", np.zeros(1)) < 0).any() for stats in both.values())
     if negative or not all(np.isfinite(array).all() for array in arrays):
         raise ValueError(f"statistics in {source} must be finite, and no std negative")

@@ -47,7 +47,7 @@ Stats = dict[str, dict[str, np.ndarray]]
 """Statistics by kind ("state", "action") and name."""
 
 
-def read(where: str | os.PathLike[str], *, dataset: str = "") -> Statistics:
+def read(where: str | os.PathLike[str], *, dataset: str = "", default: str = "") -> Statistics:
     """Read a robot's statistics, in the order of its joints; `Statistics.to_slots` reorders them.
 
     Args:
@@ -55,6 +55,7 @@ def read(where: str | os.PathLike[str], *, dataset: str = "") -> Statistics:
             order. It can be a local path, a Hub repository or a bucket URL; see `hub.local`.
         dataset: the dataset, if a checkpoint has several. For openpi, its folder under assets/; for
             LeRobot, its name within the tensor names.
+        default: the dataset to choose among several if `dataset` is not given.
 
     Raises:
         ValueError: no statistics, damaged files, several datasets or an unknown one, no state or
@@ -67,6 +68,8 @@ def read(where: str | os.PathLike[str], *, dataset: str = "") -> Statistics:
         if files and files[0].match(pattern.rpartition("/")[2]):
             with as_value_error(files[0], safetensors.SafetensorError):
                 groups = reader(files)
+            if len(groups) > 1:
+                dataset = dataset or default
             return validate(_select(groups, dataset, str(where)), str(where))
     raise ValueError(f"no statistics in {where}: it must have one of {', '.join(_READERS)}")
 

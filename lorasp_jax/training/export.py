@@ -99,7 +99,8 @@ def _metadata(run: Run) -> dict[str, Any]:
             "tokenizer": hub.portable_path(config.model.tokenizer),
             "prompts": _prompts_digest(processor.prompts),
             "instructions": list(processor.prompts.instructions),
-            "num_joints": len(processor.robot_slots) - 1,
+            "num_joints": len(processor.state_slots) - 1,
+            "action_length": len(processor.action_slots),
             "cameras": {slot: name for slot, name in processor.cameras if name},
             "relative": list(processor.inputs.delta),
             "statistics": json.loads(processor.statistics.to_json()),
@@ -192,6 +193,7 @@ def _processor(policy: Mapping[str, Any], config: Any, words: str) -> Processor:
         Statistics.from_json(json.dumps(policy["statistics"])),
         prompts,
         num_joints=joints,
+        action_length=policy.get("action_length"),  # older runs: as long as states
         cameras=policy["cameras"],
         delta=policy["relative"],
     )

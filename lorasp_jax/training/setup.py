@@ -108,8 +108,9 @@ def build(config: Config, folder: Path, *, abstract: bool = False) -> RunSetup:
         base = with_config(base, cameras=base.config.cameras[: len(source.cameras)])
     prompts, joints = _prompts_and_joints(source, environments, tokenizer, base.config)
     _check_sizes(config, base.config.chunk)
-    check_delta(base.config.inputs.delta, joints)
-    robot_slots(joints, base.config.inputs)
+    if not source:
+        check_delta(base.config.inputs.delta, joints + 1, joints + 1)
+        robot_slots(joints, base.config.inputs)
     available = preflight.available_bytes()
     remat, memory = preflight.choose_remat(config, base.config, available)
     base = with_config(base, remat=remat)
@@ -305,22 +306,30 @@ def processor(
     `relative`, joint targets are relative to the state at the start of the chunk; otherwise the
     model's config decides.
     """
-    joints = episodes[0].state.shape[-1] - 1
+    joints, length = episodes[0].state.shape[-1] - 1, episodes[0].action.shape[-1]
     slots, dim = robot_slots(joints, model_config.inputs), model_config.action_dim
-    delta = (*[True] * joints, False) if relative else model_config.inputs.delta
+    action_slots = robot_slots(length - 1, model_config.inputs)
+    delta = (*[True] * (length - 1), False) if relative else model_config.inputs.delta
     steps = flatten([dataclasses.replace(group, image={}) for group in episodes])
     chunk = model_config.chunk if delta else 1
     window, _ = windows(steps, jnp.arange(len(steps.end)), chunk)
     action = np.asarray(
         to_delta(jnp.asarray(steps.action[window]), jnp.asarray(steps.state), delta)
-    ).reshape(-1, joints + 1)
+    ).reshape(-1, length)
     state = np.repeat(np.asarray(steps.state), chunk, axis=0)
     valid = np.ones(len(state), bool)
-    statistics = Statistics.measure(state, action, valid, slots=slots, dim=dim)
+    statistics = Statistics.measure(
+        state, action, valid, slots=slots, dim=dim, action_slots=action_slots
+    )
     ordered = cameras or sorted(episodes[0].image)
-    filled = dict(zip(model_config.cameras, ordered, strict=False))
     return Processor.of(
-        model_config, statistics, prompts, num_joints=joints, cameras=filled, delta=delta
+        model_config,
+        statistics,
+        prompts,
+        num_joints=joints,
+        action_length=length,
+        cameras=dict(zip(model_config.cameras, ordered, strict=False)),
+        delta=delta,
     )
 
 

@@ -83,8 +83,10 @@ def test_dimensions_are_selected_and_converted(tmp_path):
 
     edit_rows(folder, widen)
     edit_info(folder, describe)
-    with pytest.raises(ValueError, match=r"state .*3\.pos', 'torque', 'j"):
-        LeRobot(folder)
+    whole = LeRobot(folder)
+    assert [len(whole.names[kind]) for kind in ("state", "action")] == [8, 7]
+    assert whole.episode(0, ()).state.shape[2] == 8
+    assert whole.episode(0, ()).action.shape[2] == 7
     joints = tuple(f"joint_{i + 1}.pos" for i in range(6))
     for chosen in ((*joints, "gripper.pos"), ("0", "1", "2", "4", "5", "6", "7")):
         keys = Keys(state_numbers=chosen, angles="degrees", gripper="millimetres")

@@ -8,7 +8,6 @@ import pyarrow.parquet as pq
 import pytest
 
 from envs.datasets import rlds
-from lorasp_jax.data.keys import Keys
 from lorasp_jax.data.lerobot import LeRobot
 from lorasp_jax.data.lerobot_export import to_lerobot
 from lorasp_jax.data.opening import open_source
@@ -69,20 +68,16 @@ def test_actions_other_than_joint_targets(tmp_path):
     np.testing.assert_array_equal(rows["index"], int(episodes.length[0]) + np.arange(length))
 
 
-def test_fewer_actions_than_states_are_read_by_repeating_one(tmp_path):
+def test_fewer_actions_than_states(tmp_path):
     """As for LIBERO, whose state has two fingers and whose actions have one gripper."""
     episodes = make(actions="end_effector", robot="panda", control_dt=0.05)
     state = np.concatenate([episodes.state, -episodes.state[..., -1:]], -1)
     rlds.write(dataclasses.replace(episodes, state=state), tmp_path / "episodes")
     to_lerobot(open_source(tmp_path / "episodes"), tmp_path / "dataset", silent)
-    with pytest.raises(ValueError, match="dimensions"):
-        LeRobot(tmp_path / "dataset")
-    numbers = tuple("01234566")
-    found = LeRobot(tmp_path / "dataset", Keys(action_numbers=numbers)).episode(1)
+    found = LeRobot(tmp_path / "dataset").episode(1)
     length = int(episodes.length[1])
     np.testing.assert_array_equal(found.state[0], state[1, :length])
-    np.testing.assert_array_equal(found.action[0, :, :7], episodes.action[1, :length])
-    np.testing.assert_array_equal(found.action[0, :, 7], episodes.action[1, :length, 6])
+    np.testing.assert_array_equal(found.action[0], episodes.action[1, :length])
 
 
 def test_refusals_leave_nothing(tmp_path):

@@ -32,14 +32,14 @@ def processor(num_joints: int) -> Processor:
     valid = np.ones((4, 5), bool)
     statistics = Statistics.measure(state, action, valid, slots=slots, dim=DIM)
     tokens = jnp.array([[3, 4, 0], [5, 0, 0]])
-    return Processor(slots, statistics, PromptTable(Ids(tokens, tokens > 0)), image_size=16)
+    return Processor(slots, slots, statistics, PromptTable(Ids(tokens, tokens > 0)), image_size=16)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_slots(robot):
     slots, joints = ROBOTS[robot]
     assert robot_slots(joints) == slots
-    assert np.flatnonzero(processor(joints).slot_mask).tolist() == list(slots)
+    assert np.flatnonzero(processor(joints).flow_slots).tolist() == list(slots)
     with pytest.raises(ValueError, match=r"num_joints .* got 8"):
         robot_slots(8)
 
@@ -47,10 +47,10 @@ def test_slots(robot):
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_decode_inverts_normalize(robot):
     proc = processor(ROBOTS[robot][1])
-    actions = RNG.normal(size=(3, 4, len(proc.robot_slots))).astype(np.float32)
+    actions = RNG.normal(size=(3, 4, len(proc.action_slots))).astype(np.float32)
     normalized = np.asarray(normalize(proc, actions))
     assert normalized.shape == (3, 4, DIM)
-    assert not normalized[..., ~proc.slot_mask].any()
+    assert not normalized[..., ~proc.flow_slots].any()
     np.testing.assert_allclose(decode(proc, normalized), actions, atol=1e-5)
 
 
@@ -124,9 +124,8 @@ def published(num_joints: int = 6, relative: tuple[bool, ...] = (), **choices) -
 
 def test_published_weights_use_contiguous_slots():
     proc = published()
-    assert proc.robot_slots == (0, 1, 2, 3, 4, 5, 6)
-    assert (proc.slot_mask.sum(), proc.flow_slots.sum()) == (7, 32)
-    assert processor(6).flow_slots.tolist() == processor(6).slot_mask.tolist()
+    assert proc.state_slots == proc.action_slots == (0, 1, 2, 3, 4, 5, 6)
+    assert proc.flow_slots.sum() == 32
     state = RNG.normal(size=(2, 7)).astype(np.float32)
     obs = jax.device_get(encode(proc, {"image": {}, "state": jnp.asarray(state)}, np.zeros(2, int)))
     mean, std = proc.statistics.state["mean"][:7], proc.statistics.state["std"][:7]
@@ -168,7 +167,7 @@ def test_smolvla_is_padded_at_the_top():
     config = dataclasses.replace(SmolVLAConfig.base(), image_size=64)
     proc = processor(6)
     proc = dataclasses.replace(proc, image_size=64, inputs=config.inputs)
-    proc = dataclasses.replace(proc, robot_slots=robot_slots(6, config.inputs))
+    proc = dataclasses.replace(proc, state_slots=robot_slots(6, config.inputs))
     raw = {
         "image": {"side": np.full((1, 32, 64, 3), 255, np.uint8)},
         "state": np.zeros((1, 7), np.float32),
@@ -270,7 +269,7 @@ class EchoBackbone:
 def test_policy_encodes_and_decodes():
     proc = processor(6)
     state, action = (
-        np.broadcast_to(np.asarray(stats["mean"])[[*proc.robot_slots]], (2, 7))
+        np.broadcast_to(np.asarray(stats["mean"])[[*proc.state_slots]], (2, 7))
         for stats in (proc.statistics.state, proc.statistics.action)
     )
     policy = Policy(EchoBackbone(), proc)
@@ -279,3 +278,26 @@ def test_policy_encodes_and_decodes():
     )({"image": {}, "state": state})
     np.testing.assert_allclose(actions, np.stack([action] * 4, 1), atol=1e-5)
     assert aux == {"steps": 4}
+
+
+def test_actions_may_be_shorter_than_states():
+    """LIBERO has eight numbers of state and seven of action; six are relative."""
+    config = dataclasses.replace(
+        Pi0Config.base(), image_size=28, inputs=dataclasses.replace(OPENPI, delta=(True,) * 6)
+    )
+    state, action = RNG.normal(size=(20, 8)), RNG.normal(2.0, 3.0, (20, 7))
+    measured = Statistics.measure(
+        state, action, np.ones(20, bool), slots=range(8), dim=32, action_slots=range(7)
+    )
+    ids = jnp.array([[3, 4, 0]])
+    prompts = PromptTable(Ids(ids, ids > 0))
+    proc = Processor.of(config, measured, prompts, num_joints=7, action_length=7)
+    assert (len(proc.state_slots), len(proc.action_slots)) == (8, 7)
+    zeros = np.zeros((1, 2, 32), np.float32)
+    decoded = np.asarray(decode(proc, zeros, state[:1].astype(np.float32)))[0, 1]
+    np.testing.assert_allclose(decoded[:6], state[0, :6] + action.mean(axis=0)[:6], rtol=1e-4)
+    np.testing.assert_allclose(decoded[6], action[:, 6].mean(), rtol=1e-4)
+    back = normalize(proc, decoded[None, None], state[:1].astype(np.float32))
+    np.testing.assert_allclose(back, zeros[:, :1], atol=1e-5)
+    with pytest.raises(ValueError, match="delta mask has 8"):
+        Processor.of(config, measured, prompts, num_joints=7, action_length=7, delta=(True,) * 8)

@@ -5,18 +5,19 @@ import io
 import json
 import time
 
+import jax
 import numpy as np
 from rich.console import Console
 
 from envs.datasets import rlds
 from lorasp_jax.config import DataConfig, ModelConfig
-from lorasp_jax.data.batches import flatten
+from lorasp_jax.data.batches import flatten, sample_batch
 from lorasp_jax.evaluation.callback import NoEvaluation
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
 from lorasp_jax.peft import LoRA
 from lorasp_jax.report.html import write_report
-from lorasp_jax.training import setup
+from lorasp_jax.training import export, setup
 from lorasp_jax.training.base import base_model
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.run_folder import to_json, write_json
@@ -54,13 +55,41 @@ def test_prepare(tmp_path, monkeypatch):
     for name in ("state", "action", "end", "instruction"):
         np.testing.assert_array_equal(getattr(run.steps, name), getattr(expected, name))
     known = run.policy.processor.statistics.action
-    slots = np.array(run.policy.processor.robot_slots)
+    slots = np.array(run.policy.processor.action_slots)
     np.testing.assert_allclose(known["mean"][slots], expected.action.mean(0), atol=1e-6)
     small = 2**21
     assert not prepare(tmp_path, monkeypatch, "removed, but cached", small).streams
     (tmp_path / "dataset.json").unlink()
     assert prepare(tmp_path, monkeypatch, "removed, but cached", small // 64).streams
     assert prepare(tmp_path, monkeypatch, "removed, but cached", small).streams  # as at the start
+
+
+def test_actions_of_a_recording_may_be_shorter_than_its_states(tmp_path, monkeypatch):
+    """Through a cache, training's batches, and the files of a run."""
+    group = random_episodes("press", 0)
+    longer = np.concatenate([group.state, group.state[..., :1]], axis=-1)
+    recorded = dataclasses.replace(group, state=longer, physics_dt=0.0)
+    rlds.write(recorded, tmp_path / "rlds")
+    run = prepare(tmp_path / "run", monkeypatch, tmp_path / "rlds")
+    processor = run.policy.processor
+    assert (processor.state_slots, processor.action_slots) == (
+        (0, 1, 2, 3, 4, 5, 6, 7),
+        (0, 1, 2, 3, 4, 5, 7),
+    )
+    steps = run.steps
+    assert (steps.state.shape[1], steps.action.shape[1]) == (8, 7)
+    batch = sample_batch(
+        jax.random.key(0), steps, processor, batch_size=4, chunk=4, state_noise=0.0
+    )
+    assert not batch.action_mask[..., 6].any()
+    found = processor.decode(batch.actions)
+    assert found.shape == (4, 4, 7)
+    export.write(run)
+    loaded = export._processor(export._metadata(run)["policy"], run.policy.model.config, words="")
+    assert loaded.action_slots == processor.action_slots
+    np.testing.assert_array_equal(
+        loaded.normalize_state(longer[0]), processor.normalize_state(longer[0])
+    )
 
 
 def test_published_smolvla_is_trimmed_to_the_cameras_of_the_dataset(tmp_path, monkeypatch):

@@ -269,7 +269,7 @@ def test_normalized_actions_have_mean_0_and_standard_deviation_1(relative):
             states.append(group.state[episode, step])
             chunks.append(group.action[episode, np.minimum(step + np.arange(model.chunk), end)])
     state, chunk = np.stack(states), np.stack(chunks)
-    learned = found.normalize_actions(chunk, state)[..., found.slot_mask]
+    learned = found.normalize_actions(chunk, state)[..., found.flow_slots]
     normalized = learned if relative else learned[:, :1]
     np.testing.assert_allclose(normalized.mean(axis=(0, 1)), 0, atol=1e-5)
     np.testing.assert_allclose(normalized.std(axis=(0, 1)), 1, atol=1e-4)

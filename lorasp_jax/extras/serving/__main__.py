@@ -14,11 +14,13 @@ from typing import Any
 
 from rich.console import Console
 
-from lorasp_jax.base.arguments import pair
+from lorasp_jax.base.arguments import indices, pair, positive
 from lorasp_jax.base.errors import run_command
 
-CHECKPOINT_OPTIONS = ("statistics", "dataset", "joints", "size", "dtype", "camera", "adapter")
-"""Options that say what the files of a published checkpoint do not."""
+UNSAID = ("openpi_config", "size", "chunk", "relative", "prompt_state", "joints", "action_length")
+"""Options that say what the files of a published checkpoint do not; see `loading.Unsaid`."""
+CHECKPOINT_OPTIONS = ("statistics", "dataset", "dtype", "camera", "adapter", *UNSAID)
+"""Options for published checkpoints."""
 
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.serving") -> int:
@@ -72,8 +74,15 @@ def _add_checkpoint_options(group: Any) -> None:
     checkpoint = group.add_argument
     checkpoint("--statistics", default="", help="normalization, if not in the checkpoint")
     checkpoint("--dataset", default="", help="which statistics, if there are several")
-    checkpoint("--joints", type=int, default=0, help="the robot's number of joints")
-    checkpoint("--size", default="", help="size of an openpi checkpoint, such as base_pi05")
+    checkpoint("--openpi-config", help="openpi's training config, such as pi05_libero, "
+        "which says all that follows (default: that which the folder is named after)")  # fmt: skip
+    checkpoint("--size", help="size of the model: base or base_pi05")
+    checkpoint("--chunk", type=positive, help="actions per chunk")
+    checkpoint("--relative", type=indices, metavar="NUMBERS", help="actions that are relative to "
+        "the state: none, or their numbers, such as 0-5,7-12")  # fmt: skip
+    checkpoint("--prompt-state", choices=("yes", "no"), help="whether prompts contain the state")
+    checkpoint("--joints", type=positive, help="number of joints; states have one number more")
+    checkpoint("--action-length", type=positive, help="numbers in an action, if not as in a state")
     checkpoint("--dtype", default="", choices=("", "float32", "bfloat16"), help="of the weights")
     pairs: Any = {"action": "append", "type": pair, "default": [], "metavar": "NAME=VALUE"}
     checkpoint("--camera", **pairs, help="the backbone's camera = the robot's camera, repeatedly")
@@ -156,10 +165,13 @@ def _compiled(options: argparse.Namespace, named: dict[str, str]) -> dict[str, A
     if len(named) > 1:
         raise ValueError("several policies must all be finished runs, or all be exported")
     _refuse(options, ("base",), "is for runs")
-    names = ("tokenizer", "statistics", "dataset", "joints", "size", "dtype")
+    names = ("tokenizer", "statistics", "dataset", "dtype", *UNSAID)
+    chosen = {name: getattr(options, name) for name in names}
+    if options.prompt_state:
+        chosen["prompt_state"] = options.prompt_state == "yes"
     loaded = loading.load_checkpoint(
         *named.values(),
-        **{name: getattr(options, name) for name in names},
+        **{name: value for name, value in chosen.items() if value is not None},
         cameras=dict(options.camera),
         adapters=dict(options.adapter),
     )
@@ -169,7 +181,7 @@ def _compiled(options: argparse.Namespace, named: dict[str, str]) -> dict[str, A
 def _refuse(options: argparse.Namespace, names: Sequence[str], reason: str) -> None:
     """Raise ValueError if one of these options was given, since it would have no effect."""
     for name in names:
-        if getattr(options, name):
+        if getattr(options, name) not in (None, "", []):
             raise ValueError(f"--{name.replace('_', '-')} {reason}")
 
 

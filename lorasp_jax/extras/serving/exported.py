@@ -43,11 +43,12 @@ class PolicyInterface:
     Attributes:
         cameras: names of the robot's cameras; the third-person view comes first.
         image_size: S, height and width of pictures [pixels].
-        state_dim: J+1, the length of states and actions.
+        state_dim: J+1, the length of states.
         chunk: C, actions per call.
         masks_missing: whether the policy works without some of its cameras.
         centred: whether pictures that are not square were padded on both sides in training.
         antialias: whether they were smoothed before downsampling.
+        action_length: length of actions; 0: J+1, too.
     """
 
     cameras: tuple[str, ...]
@@ -57,6 +58,11 @@ class PolicyInterface:
     masks_missing: bool = False
     centred: bool = True
     antialias: bool = True
+    action_length: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.action_length:
+            object.__setattr__(self, "action_length", self.state_dim)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,12 +149,12 @@ class ExportedPolicy:
             state: f32 `[J+1]`, joints [rad] and gripper [m].
             instruction: one of `instructions`.
             noise: f32 `noise_shape`, standard normal; equal inputs give equal actions.
-            previous: f32 `[P, J+1]`, what remains of the previous chunk, P from 0 to C. The new one
+            previous: f32 `[P, n]`, what remains of the previous chunk, P from 0 to C. The new one
                 continues it (real-time chunking).
             delay: number of these actions that the robot executes before it switches.
 
         Returns:
-            f32 `[C, J+1]`, joint targets [rad] and gripper opening [m].
+            f32 `[C, n]`, joint targets [rad] and gripper opening [m]; n is `action_length`.
 
         Raises:
             ValueError: an input does not fit, or the policy cannot continue chunks.
@@ -172,7 +178,7 @@ class ExportedPolicy:
         return self._tokens[instruction]
 
     def run(self, batch: Mapping[str, Any]) -> np.ndarray:
-        """Return actions f32 `[B, C, J+1]`.
+        """Return actions f32 `[B, C, n]`.
 
         Args:
             batch: B rows of `build_row`, stacked, and their `noise` `[B, C, A]`; B is one of
@@ -207,7 +213,7 @@ class ExportedPolicy:
             )
         chunk, rows = self.description.chunk, np.shape(previous)[:1]
         length = rows[0] if rows and rows[0] <= chunk else chunk
-        _check("previous", previous, (length, self.description.state_dim), np.float32)
+        _check("previous", previous, (length, self.description.action_length), np.float32)
         if not isinstance(delay, int | np.integer) or not 0 <= delay <= length:
             raise ValueError(
                 f"delay must be an integer from 0 to {length}, the length of previous, got {delay}"
@@ -229,7 +235,7 @@ def build_row(
         images: as in `ExportedPolicy.act`; cameras without a picture are masked.
         state: f32 `[J+1]`.
         tokens: `ids` and `mask` `[T]` of the instruction.
-        previous: f32 `[P, J+1]`, what remains of the previous chunk; None: chunks are independent.
+        previous: f32 `[P, n]`, what remains of the previous chunk; None: chunks are independent.
         delay: number of these actions that the robot executes before it switches.
     """
     black = np.zeros((needs.image_size, needs.image_size, 3), np.uint8)
@@ -241,7 +247,7 @@ def build_row(
     }
     if previous is None:
         return row
-    padded = np.zeros((needs.chunk, needs.state_dim), np.float32)
+    padded = np.zeros((needs.chunk, needs.action_length), np.float32)
     padded[: len(previous)] = previous
     return row | {"previous": padded, "delay": np.array(delay, np.int32)}
 

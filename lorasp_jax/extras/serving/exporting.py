@@ -84,11 +84,11 @@ def _tokens(policy: Policy) -> dict[str, Any]:
 
 
 def _normalization(policy: Policy) -> dict[str, Any]:
-    """Return what processor.json contains: statistics by slot, the robot's slots, conventions."""
+    """Return what processor.json contains: statistics by slot, the action's slots, conventions."""
     processor = policy.processor
     statistics = jax.tree.map(lambda a: np.asarray(a).tolist(), _by_kind(processor.statistics))
     inputs = dataclasses.asdict(processor.inputs)
-    return {"statistics": statistics, "slots": processor.robot_slots, "inputs": inputs}
+    return {"statistics": statistics, "slots": processor.action_slots, "inputs": inputs}
 
 
 def _by_kind(statistics: Statistics) -> dict[str, dict[str, jax.Array]]:
@@ -158,7 +158,7 @@ def _with_weights(
 
 def _inputs(description: Description, tokens: int, kind: str, batch: int) -> dict[str, Any]:
     """Return the shapes of the inputs of `ExportedPolicy.run`."""
-    size, dim, chunk = description.image_size, description.state_dim, description.chunk
+    size, chunk = description.image_size, description.chunk
 
     def each(dtype: Any, *shape: int) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((batch, *shape), dtype)
@@ -166,13 +166,14 @@ def _inputs(description: Description, tokens: int, kind: str, batch: int) -> dic
     inputs = {
         "images": dict.fromkeys(description.cameras, each(np.uint8, size, size, 3)),
         "present": dict.fromkeys(description.cameras, each(np.bool_)),
-        "state": each(np.float32, dim),
+        "state": each(np.float32, description.state_dim),
         "noise": each(np.float32, chunk, description.action_dim),
         "ids": each(np.int32, tokens),
         "mask": each(np.bool_, tokens),
     }
     if kind == exported.CONTINUE:
-        inputs |= {"previous": each(np.float32, chunk, dim), "delay": each(np.int32)}
+        previous = each(np.float32, chunk, description.action_length)
+        inputs |= {"previous": previous, "delay": each(np.int32)}
     return inputs
 
 

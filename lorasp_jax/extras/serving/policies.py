@@ -92,7 +92,8 @@ def describe(policy: Policy, **settings: Any) -> Description:
     return Description(
         cameras=tuple(name for name in sources.values() if name),
         image_size=processor.image_size,
-        state_dim=len(processor.robot_slots),
+        state_dim=len(processor.state_slots),
+        action_length=len(processor.action_slots),
         action_dim=config.action_dim,
         chunk=config.chunk,
         masks_missing=processor.inputs.masks_missing,

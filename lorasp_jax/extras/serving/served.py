@@ -93,7 +93,7 @@ class ServedPolicies:
             raise ValueError("the request must contain a prompt")
         rest = None
         if execution != "naive":
-            rest = np.zeros((0, self.spec.state_dim), np.float32)
+            rest = np.zeros((0, self.spec.action_length), np.float32)
             if request.executed is not None and request.previous is not None:
                 rest = request.previous[request.executed :]
         tokens = self._policies[adapter].tokens(prompt)

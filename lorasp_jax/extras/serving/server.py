@@ -194,7 +194,7 @@ def describe(policy: "ServedPolicies") -> dict[str, Any]:
         "server": f"lorasp_jax {lorasp_jax.__version__}",
         "cameras": list(spec.cameras),
         "image_size": spec.image_size,
-        "action_dim": spec.state_dim,
+        "action_dim": spec.action_length,
         "action_horizon": spec.chunk,
         "adapters": list(policy.instructions),
         "instructions": {name: list(texts) for name, texts in policy.instructions.items()},

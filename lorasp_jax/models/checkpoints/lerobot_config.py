@@ -1,12 +1,14 @@
-"""Convert a LeRobot policy's config.json to a backbone config.
+"""Convert a LeRobot policy's config.json, and its preprocessor, to a backbone config.
 
 Each backbone package has a module `lerobot`, whose `TYPES` maps policy types to functions. They
 convert the fields to a config with the tower sizes. Fields that all policies share are read here.
+
+LeRobot runs the steps that policy_preprocessor.json lists, whatever config.json says of them.
 """
 
 import dataclasses
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, get_args
 
 from lorasp_jax.models import backbone
@@ -16,7 +18,17 @@ from lorasp_jax.models.inputs import Mode
 Fields = Mapping[str, Any]
 _MODES = {mode.upper(): mode for mode in get_args(Mode)}
 # LeRobot options for which this project's backbones support only one value.
-_FIXED: Fields = {"min_period": 4e-3, "max_period": 4.0, "adapt_to_pi_aloha": False}
+_FIXED: Fields = {
+    "min_period": 4e-3,
+    "max_period": 4.0,
+    "adapt_to_pi_aloha": False,
+    "use_delta_joint_actions_aloha": False,
+}
+PREPROCESSOR = "policy_preprocessor.json"
+EMPTY = "empty_camera_"
+"""Prefix of the cameras that LeRobot feeds with black images."""
+_STATE_PROMPT = "pi05_prepare_state_tokenizer_processor_step"
+_IDENTITY = dict.fromkeys(("VISUAL", "STATE", "ACTION"), "IDENTITY")
 
 
 def parse(fields: Fields) -> BackboneConfig:
@@ -32,6 +44,44 @@ def parse(fields: Fields) -> BackboneConfig:
     config = parse_towers(fields)
     require(fields, _FIXED)
     return dataclasses.replace(config, **_shared_fields(config, fields))
+
+
+def preprocessed(fields: Fields, preprocessor: Fields) -> dict[str, Any]:
+    """Return a policy's fields with what its preprocessor says in their place.
+
+    Args:
+        fields: contents of config.json.
+        preprocessor: contents of policy_preprocessor.json (LeRobot 0.6, processor/*.py).
+
+    Returns:
+        The fields, also with "rename_map" and "prompt_state", which config.json does not have.
+
+    Raises:
+        ValueError: an unsupported option of a step.
+        AttributeError, KeyError, TypeError: a value of the wrong type.
+    """
+    steps = {s.get("registry_name"): s.get("config", {}) for s in preprocessor["steps"]}
+    found: dict[str, Any] = {"prompt_state": _STATE_PROMPT in steps}
+    require(steps.get(_STATE_PROMPT, {}), {"include_state_in_prompt": True})
+    if relative := steps.get("relative_actions_processor"):
+        names = ("enabled", "use_relative_actions"), ("exclude_joints", "relative_exclude_joints")
+        names = (*names, ("action_names", "action_feature_names"))
+        found |= {field: relative[name] for name, field in names if name in relative}
+    if normalizer := steps.get("normalizer_processor"):
+        require(normalizer, {"eps": 1e-8})
+        if modes := normalizer.get("norm_map"):
+            found["normalization_mapping"] = {**_IDENTITY, **modes}
+    if renamed := steps.get("rename_observations_processor"):
+        found["rename_map"] = renamed["rename_map"]
+    if length := steps.get("tokenizer_processor", {}).get("max_length"):
+        found["tokenizer_max_length"] = length
+    return {**fields, **found}
+
+
+def robot_cameras(fields: Fields, cameras: Sequence[str]) -> dict[str, str]:
+    """Return the policy's cameras but the empty ones, and the robot's names for them."""
+    renamed = {_camera(new): _camera(old) for old, new in fields.get("rename_map", {}).items()}
+    return {name: renamed.get(name, name) for name in cameras if not name.startswith(EMPTY)}
 
 
 def parse_towers(fields: Fields) -> BackboneConfig:
@@ -85,6 +135,7 @@ def _shared_fields(config: BackboneConfig, fields: Fields) -> dict[str, Any]:
             state=_MODES[modes["STATE"]],
             action=_MODES[modes["ACTION"]],
             delta=_delta(fields),
+            prompt_state=fields.get("prompt_state", True) and inputs.prompt_state,
         ),
     }
 
@@ -109,6 +160,10 @@ def _cameras(fields: Fields) -> tuple[str, ...]:
     names = []
     for key, feature in (fields.get("input_features") or {}).items():
         if feature["type"] == "VISUAL":
-            names.append(key.removeprefix("observation.").removeprefix("images."))
-    empty = [f"empty_camera_{i}" for i in range(fields.get("empty_cameras", 0))]
+            names.append(_camera(key))
+    empty = [f"{EMPTY}{i}" for i in range(fields.get("empty_cameras", 0))]
     return tuple(dict.fromkeys([*names, *empty]))
+
+
+def _camera(key: str) -> str:
+    return key.removeprefix("observation.").removeprefix("images.")

@@ -11,7 +11,7 @@ from lorasp_jax.adapters.io import hugging_face
 from lorasp_jax.base import hub, json_values
 from lorasp_jax.base.files import as_value_error, read_json
 from lorasp_jax.models import backbone
-from lorasp_jax.models.checkpoints import lerobot_config, native, published
+from lorasp_jax.models.checkpoints import lerobot_config, native, openpi_configs, published
 from lorasp_jax.models.checkpoints.layouts import ModelMismatchError
 from lorasp_jax.models.checkpoints.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
 from lorasp_jax.models.config import BackboneConfig
@@ -24,6 +24,8 @@ _PARTS = (SINGLE, INDEX, hugging_face.TENSORS, f"params/{published.METADATA}")
 _UNFINISHED = "orbax-checkpoint-tmp"  # in the name of a folder that Orbax is writing
 
 Layout = Literal["ours", "openpi", "lerobot"]
+HORIZON = "action_horizon"
+"""The chunk length in config.json of openpi's PyTorch conversions."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,22 +37,44 @@ class ModelFolder:
         layout: "ours" (this project's config.json), "openpi" (Orbax folder `params`) or, for any
             other folder, "lerobot" (safetensors with LeRobot's names: a policy of LeRobot, whose
             config.json has the policy type, or openpi's PyTorch conversion).
-        fields: contents of config.json; empty if there is no such file.
+        fields: contents of config.json and, for LeRobot's, of its preprocessor; empty if there is
+            no such file.
+        source: where the folder comes from.
     """
 
     folder: Path
     layout: Layout
     fields: dict[str, Any] = dataclasses.field(repr=False)
+    source: str = ""
+
+    @property
+    def is_openpi(self) -> bool:
+        """Whether the files have weights and say little else, as openpi's and conversions do."""
+        has_weights = any(path.exists() for path in weight_files(self.folder))
+        untyped = self.layout == "lerobot" and "type" not in self.fields
+        return self.layout == "openpi" or (untyped and (has_weights or HORIZON in self.fields))
+
+    @property
+    def robot_cameras(self) -> dict[str, str]:
+        """The model's cameras and the robot's names for them; empty: the files do not say."""
+        if self.layout != "lerobot" or "type" not in self.fields:
+            return {}
+        with as_value_error(self.folder / lerobot_config.PREPROCESSOR):
+            return lerobot_config.robot_cameras(self.fields, self.config.cameras)
 
     @functools.cached_property
     def config(self) -> BackboneConfig:
         """The config that `load` uses if none is passed; no weights are read.
+
+        That of a checkpoint of openpi is the training config that it is named after.
 
         Raises:
             ValueError: the folder does not specify sizes, or its model is not supported.
         """
         if self.layout == "ours":
             return native.load_config(self.folder)
+        if self.is_openpi and (named := openpi_configs.guess(self.source)):
+            return named.config
         if self.layout == "openpi":
             return backbone.find("pi0").base()
         return _lerobot_config(self.folder, self.fields)
@@ -103,16 +127,16 @@ def find(where: str | os.PathLike[str]) -> ModelFolder:
         ValueError: `where` cannot be reached, its config.json is damaged, or it is an adapter or a
             folder of several models.
     """
-    folder = hub.local(where)
+    folder, source = hub.local(where), os.fspath(where)
     fields = _read_fields(folder)
     if "backbone" in fields:
-        return ModelFolder(folder, "ours", fields)
+        return ModelFolder(folder, "ours", fields, source)
     if published.orbax_folder(folder):
-        return ModelFolder(folder, "openpi", fields)
+        return ModelFolder(folder, "openpi", fields, source)
     if fields.get("use_peft") or not _has_weights(folder):
-        _refuse_adapter(folder, os.fspath(where))
+        _refuse_adapter(folder, source)
         _refuse_parent(folder)
-    return ModelFolder(folder, "lerobot", fields)
+    return ModelFolder(folder, "lerobot", fields, source)
 
 
 def load(where: str | os.PathLike[str], config: Any = None) -> Any:
@@ -124,7 +148,8 @@ def load(where: str | os.PathLike[str], config: Any = None) -> Any:
     Args:
         where: a folder, "hf://owner/name" or "gs://bucket/folder"; see `hub.local`.
         config: model sizes, dtype and param_dtype. None uses the sizes in config.json or, for
-            openpi, those of the published pi0.
+            openpi, the training config that the folder is named after (see `openpi_configs`),
+            otherwise the sizes of the published pi0.
 
     Raises:
         ValueError: `where` cannot be reached or has none of these layouts, files are damaged, or
@@ -143,12 +168,15 @@ def load_config(where: str | os.PathLike[str]) -> Any:
 
 
 def _read_fields(folder: Path) -> dict[str, Any]:
-    """Read config.json; empty if there is none."""
-    path = folder / native.CONFIG
+    """Read config.json, and the preprocessor of a LeRobot policy; empty if there is none."""
+    path, preprocessor = folder / native.CONFIG, folder / lerobot_config.PREPROCESSOR
     with as_value_error(path):
         fields = read_json(path) if path.exists() else {}
         json_values.check(fields, {})
-    return fields
+    if "type" not in fields or not preprocessor.exists():
+        return fields
+    with as_value_error(preprocessor):
+        return lerobot_config.preprocessed(fields, read_json(preprocessor))
 
 
 def _lerobot_config(folder: Path, fields: dict[str, Any]) -> BackboneConfig:

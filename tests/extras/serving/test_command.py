@@ -56,7 +56,7 @@ def test_a_checkpoint_is_loaded_with_and_without_adapters(dummy_base, tmp_path):
     adapted_paths = {n: len(adaptation.methods(each.policy.model)) for n, each in loaded.items()}
     assert adapted_paths == {"base": 0, "ours": 3, "theirs": 3}  # vision, language, action
     processor = loaded["base"].policy.processor
-    assert processor.robot_slots == (0, 1, 2, 3, 4, 5, 7)
+    assert processor.action_slots == (0, 1, 2, 3, 4, 5, 7)
     np.testing.assert_array_equal(np.asarray(processor.statistics.state["std"])[:6], 2)
 
 
@@ -64,8 +64,7 @@ def test_a_checkpoint_is_loaded_with_and_without_adapters(dummy_base, tmp_path):
     ("options", "refusal"),
     [
         ({"where": "assets/pi0_nano"}, "number of joints: pass --joints"),
-        ({"size": "huge"}, "unknown size 'huge'"),
-        ({"size": "base_pi05"}, "records the sizes: leave out --size"),
+        ({"size": "base"}, "--size are for checkpoints of openpi"),
         ({"where": "assets"}, "assets contains no model itself: .* such as .*assets/"),
         ({"statistics": str(ROOT / "tests" / "models")}, "no statistics in"),
         ({"cameras": {"top": "front"}}, "keys of cameras"),

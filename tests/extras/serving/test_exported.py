@@ -14,6 +14,7 @@ from rich.console import Console
 
 from lorasp_jax.extras.serving import __main__ as command
 from lorasp_jax.extras.serving import exported
+from lorasp_jax.extras.serving.exporting import write
 from lorasp_jax.extras.serving.requests import Request
 from lorasp_jax.extras.serving.served import ServedPolicies
 from tests import ROOT
@@ -21,6 +22,7 @@ from tests.extras.serving.conftest import ROBOT
 from tests.extras.serving.stand_in import connect, observation, serving
 from tests.extras.serving.test_policies import (
     INSTRUCTIONS,
+    STEPS,
     compiled,
     make_policy,
     reference,
@@ -269,3 +271,22 @@ def test_kernels_run_at_once_only_where_xla_knows_the_option(monkeypatch):
     for version, known in [((0, 10, 2), False), ((0, 11, 2), True)]:
         monkeypatch.setattr(jax, "__version_info__", version)
         assert bool(exported.sampling_options()) is known
+
+
+def test_actions_may_be_shorter_than_states(tmp_path):
+    policy = make_policy(action_dims=6)
+    write(policy, tmp_path / "short", continues=True, num_steps=STEPS, max_batch=1)
+    loaded = exported.load(tmp_path / "short")
+    given = arguments(loaded)
+    actions = loaded.act(**given)
+    assert actions.shape == (loaded.description.chunk, 6)
+    np.testing.assert_allclose(actions, in_process(policy, given), atol=1e-5)
+    continued = loaded.act(**given, previous=actions[1:], delay=1)
+    np.testing.assert_allclose(continued[0], actions[1], atol=1e-5)
+    with pytest.raises(ValueError, match=r"previous must be float32 \[\d, 6\]"):
+        loaded.act(**given, previous=np.zeros((2, 7), np.float32))
+
+
+def test_older_exports_have_actions_as_long_as_states(copy):
+    resign(copy, lambda values: values["policy"].pop("action_length"))
+    assert exported.load(copy).description.action_length == 7

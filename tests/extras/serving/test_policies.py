@@ -28,13 +28,18 @@ WORDS = tokenizer.Offline()
 STEPS = 2
 
 
-def make_policy(config=None, *, seed=0, instructions=INSTRUCTIONS, cameras=None, dims=7):
+def make_policy(
+    config=None, *, seed=0, instructions=INSTRUCTIONS, cameras=None, dims=7, action_dims=0
+):
     config = config or Pi0Config.dummy()
     rng = np.random.default_rng(1 + seed)
     moments = {"mean": rng.normal(size=dims), "std": rng.uniform(0.5, 1, dims)}
-    statistics = Statistics(*({k: np.float32(v) for k, v in moments.items()} for _ in range(2)))
+    moments = {name: np.float32(values) for name, values in moments.items()}
+    length = action_dims or dims
+    statistics = Statistics(moments, {name: values[:length] for name, values in moments.items()})
     prompts = PromptTable.of(WORDS, instructions, config, num_joints=dims - 1)
-    processor = Processor.of(config, statistics, prompts, num_joints=dims - 1, cameras=cameras)
+    sizes = {"num_joints": dims - 1, "action_length": length}
+    processor = Processor.of(config, statistics, prompts, **sizes, cameras=cameras)
     return Policy(random_backbone(config, seed=seed), processor)
 
 

@@ -3,6 +3,7 @@ import json
 
 import pytest
 
+from lorasp_jax.models.checkpoints import loading
 from lorasp_jax.models.checkpoints.lerobot_config import parse
 from lorasp_jax.models.inputs import LEROBOT_PI0, LEROBOT_PI05, LEROBOT_SMOLVLA
 from lorasp_jax.models.pi0 import Pi0Config
@@ -115,3 +116,71 @@ def test_relative_actions(names, exclusion, relative):
 def test_unsupported_fields_raise(change, name):
     with pytest.raises((ValueError, KeyError), match=name):
         parse(SMOLVLA | change)
+
+
+PREPROCESSOR = {
+    "rename_observations_processor": {
+        "rename_map": {"observation.images.front": "observation.images.base_0_rgb"}
+    },
+    "pi05_prepare_state_tokenizer_processor_step": {"max_state_dim": 32},
+    "relative_actions_processor": {
+        "enabled": True,
+        "exclude_joints": ["gripper"],
+        "action_names": ["j1.pos", "gripper.pos"],
+    },
+    "normalizer_processor": {"eps": 1e-8, "norm_map": {"STATE": "MIN_MAX", "ACTION": "MEAN_STD"}},
+    "tokenizer_processor": {"max_length": 90},
+}
+
+
+def pi05_folder(folder, changes, without=()):
+    """A pi0.5 policy without weights; its config.json says other things than its preprocessor."""
+    features = {f"observation.images.{name}": {"type": "VISUAL"} for name in ("base_0_rgb", "top")}
+    fields = {"type": "pi05", "input_features": features, "empty_cameras": 1}
+    fields |= {"output_features": {"action": {"type": "ACTION", "shape": [2]}}}
+    (folder / "config.json").write_text(json.dumps(fields))
+    steps = [
+        {"registry_name": name, "config": config | changes.get(name, {})}
+        for name, config in PREPROCESSOR.items()
+        if name not in without
+    ]
+    (folder / "policy_preprocessor.json").write_text(json.dumps({"steps": steps}))
+    return loading.find(folder)
+
+
+def test_the_preprocessor_wins(tmp_path):
+    """LeRobot runs the steps that policy_preprocessor.json lists."""
+    found = pi05_folder(tmp_path, {})
+    inputs = dataclasses.replace(LEROBOT_PI05, state="min_max", action="mean_std")
+    assert found.config.inputs == dataclasses.replace(inputs, delta=(True, False))
+    assert found.config.max_tokens == 90
+    assert found.config.cameras == ("base_0_rgb", "top", "empty_camera_0")
+    assert found.robot_cameras == {"base_0_rgb": "front", "top": "top"}
+
+
+def test_a_pipeline_without_the_state_has_prompts_without_it(tmp_path):
+    without = ("pi05_prepare_state_tokenizer_processor_step", "relative_actions_processor")
+    inputs = pi05_folder(tmp_path, {}, without).config.inputs
+    assert (inputs.prompt_state, inputs.delta) == (False, ())
+
+
+@pytest.mark.parametrize(
+    ("step", "change", "name"),
+    [
+        ("normalizer_processor", {"eps": 1e-3}, "eps"),
+        ("normalizer_processor", {"norm_map": {"STATE": "QUANTILE5"}}, "normalization"),
+        (
+            "pi05_prepare_state_tokenizer_processor_step",
+            {"include_state_in_prompt": False},
+            "include_state_in_prompt",
+        ),
+        ("rename_observations_processor", {"rename_map": ["front"]}, r"preprocessor\.json"),
+    ],
+)
+def test_unsupported_steps_raise(step, change, name, tmp_path):
+    def read():
+        found = pi05_folder(tmp_path, {step: change})
+        return found.config, found.robot_cameras
+
+    with pytest.raises(ValueError, match=name):
+        read()
