@@ -48,7 +48,7 @@ def test_held_out_episodes_are_not_trained_on(recorded):
     source = LeRobot(golden("v3"))
     learned = [source.episode(n, ()) for n in range(4) if n not in OUT]
     actions = np.concatenate([episode.action[0] for episode in learned])
-    slots = np.array(recorded.policy.processor.robot_slots)
+    slots = np.array(recorded.policy.processor.state_slots)
     known = recorded.policy.processor.statistics.action["mean"][slots]
     np.testing.assert_allclose(known, actions.mean(0), atol=1e-6)
     drawn = draw(jax.random.key(0), jax.device_put(recorded.steps), batch_size=512, chunk=1)

@@ -85,7 +85,7 @@ def test_they_train_and_act(recordings, tmp_path, monkeypatch):
     assert "left out: cam_low (not chosen)" in printed
     processor = run.policy.processor
     assert processor.cameras == tuple(zip(MODEL.cameras, cameras, strict=True))
-    assert processor.robot_slots == tuple(range(14))
+    assert processor.state_slots == tuple(range(14))
     run.devices = jax.devices()[:1]
     before = leaves(nnx.state(run.policy.model))
     train(run)
