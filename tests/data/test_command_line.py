@@ -120,7 +120,7 @@ def test_a_truncated_video(to, capsys, tmp_path):
         (["inspect", "nothing"], "nothing"),
         *[(["convert", *map(golden, VERSIONS), "--to", to], "got 2") for to in ("rlds", "lerobot")],
         (["convert", golden("v3"), "--every", "0"], "every"),
-        (["convert", golden("v3"), "--state-numbers", "0", "9"], "no state 9"),
+        (["convert", golden("v3"), "--state-numbers", "0", "9"], "state has no 9"),
     ],
 )
 def test_bad_input(arguments, sentence, capsys, tmp_path):

@@ -185,7 +185,7 @@ def test_names_that_are_numbers_are_no_order(folder):
 
 def test_state_and_action_in_another_order(folder):
     mark(folder, "action", names=["gripper", *JOINTS])
-    with pytest.raises(ValueError, match="same order, with --state-numbers"):
+    with pytest.raises(ValueError, match="one order with --state-numbers"):
         LeRobot(folder)
     LeRobot(folder, Keys(action_numbers=(*JOINTS, "gripper")))
 

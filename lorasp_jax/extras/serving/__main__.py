@@ -18,7 +18,7 @@ from lorasp_jax.base.arguments import indices, pair, positive
 from lorasp_jax.base.errors import run_command
 
 UNSAID = ("openpi_config", "size", "chunk", "relative", "prompt_state", "joints", "action_length")
-"""Options that say what the files of a published checkpoint do not; see `loading.Unsaid`."""
+"""Options that say what the files of a published checkpoint do not; see `checkpoint.Unsaid`."""
 CHECKPOINT_OPTIONS = ("statistics", "dataset", "dtype", "camera", "adapter", *UNSAID)
 """Options for published checkpoints."""
 

@@ -28,7 +28,7 @@ TOKENIZER = "gs://big_vision/paligemma_tokenizer.model"
 
 
 @dataclass(frozen=True)
-class Robot:
+class OpenPiRobot:
     """A robot as openpi's servers know it.
 
     Attributes:
@@ -49,9 +49,11 @@ class Robot:
 
 
 _ARM = (*[True] * 6, False)
-LIBERO = Robot("physical-intelligence/libero", ("image", "wrist_image"), 8, 7, _ARM)
-DROID = Robot("droid", ("exterior_image_1_left", "wrist_image_left"), 8, 8, (*[True] * 7, False))
-ALOHA = Robot(
+LIBERO = OpenPiRobot("physical-intelligence/libero", ("image", "wrist_image"), 8, 7, _ARM)
+DROID = OpenPiRobot(
+    "droid", ("exterior_image_1_left", "wrist_image_left"), 8, 8, (*[True] * 7, False)
+)
+ALOHA = OpenPiRobot(
     "trossen", ("cam_high", "cam_left_wrist", "cam_right_wrist"), 14, 14, _ARM * 2, aloha=True
 )
 _POSE = (0.0, -1.5, 1.5, 0.0, 0.0, 0.0)
@@ -66,14 +68,14 @@ class OpenPiConfig:
         robot: its robot.
         pi05: whether the model is pi0.5.
         chunk: actions per chunk.
-        relative: whether actions are relative to the state; see `Robot.relative`.
+        relative: whether actions are relative to the state; see `OpenPiRobot.relative`.
         prompt: instruction of requests that have none; "": they must have one.
         prompt_state: whether prompts of pi0.5 contain the state.
         max_tokens: length of the padded prompt; None: the model's default.
         reset_pose: joints of each arm [rad] that the server tells its clients to start from.
     """
 
-    robot: Robot
+    robot: OpenPiRobot
     pi05: bool = False
     chunk: int = 50
     relative: bool = False

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from lorasp_jax import models
 from lorasp_jax.extras.serving import __main__ as command
@@ -184,17 +185,20 @@ def test_a_default_prompt_and_the_pose_to_start_from_are_served(tmp_path, echo):
     np.testing.assert_array_equal(rows[0]["ids"], rows[1]["ids"])
 
 
-def test_a_conversion_to_pytorch_says_its_chunk_only(tmp_path, echo):
+def test_a_conversion_to_pytorch_says_its_sizes_only(tmp_path, echo):
     """openpi's conversion writes sizes, without a policy type (case of a config.json)."""
     folder = checkpoint(tmp_path / "torch", {"libero": LIBERO})
     (folder / "params" / "_METADATA").unlink()
     fields = {"action_dim": 32, "action_horizon": 10, "paligemma_variant": "gemma_2b"}
     (folder / "config.json").write_text(json.dumps(fields))
-    with pytest.raises(ValueError, match=r"else --size, --relative$"):
+    save_file({"action_in_proj.bias": np.zeros(1)}, folder / "model.safetensors")
+    with pytest.raises(ValueError, match=r"else --relative$"):
         loading.load_checkpoint(str(folder), tokenizer=WORDS)
-    given: Any = {"size": "base", "relative": ()}
-    loaded = loading.load_checkpoint(str(folder), tokenizer=WORDS, **given)["base"].policy
+    loaded = loading.load_checkpoint(str(folder), tokenizer=WORDS, relative=())["base"].policy
     assert loaded.model.config.chunk == 10
+    save_file({"time_mlp_in.weight": np.zeros(1)}, folder / "model.safetensors")
+    with pytest.raises(ValueError, match=r"else --relative, --prompt-state$"):
+        loading.load_checkpoint(str(folder), tokenizer=WORDS)
 
 
 def test_a_tokenizer_is_not_assumed(tmp_path, echo, monkeypatch):
