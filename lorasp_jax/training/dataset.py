@@ -52,6 +52,11 @@ def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
             "collect with --actions joint"
         )
     lengths = first.state.shape[-1], first.action.shape[-1]
+    if config.model.relative_actions and len({*lengths}) > 1:
+        raise ValueError(
+            f"--model.relative-actions needs states and actions of the same dimensions, but {path} "
+            f"has {lengths[0]} and {lengths[1]}"
+        )
     try:
         for length in lengths:
             robot_slots(length - 1, model.inputs)
