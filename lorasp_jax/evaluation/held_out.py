@@ -16,6 +16,8 @@ from lorasp_jax.policies.policy import Policy
 
 MAX_WINDOWS = 256
 """Largest number of windows that are measured, over all tasks."""
+Units = list[tuple[str, float]]
+"""Name of each dimension of an action with its unit, and the factor to that unit."""
 _BATCH = 16  # windows per call
 _NOISES = 4  # draws of noise and flow time per window, for the loss
 
@@ -26,19 +28,31 @@ class Windows:
 
     Attributes:
         raw: the windows, in host memory.
-        previous: f32 `[N, J+1]`, the action before each window, or at the start of an episode its
-            state [rad, m].
+        still: f32 `[N, J+1]`, the action that holds still: the state, or zeros where actions are
+            displacements, which have another length than states.
+        previous: f32 `[N, J+1]`, the action before each window; first in an episode: `still`.
         task: the task of each window.
         episode, step: int `[N]`, where each window starts.
         control_dt: time between two actions [s].
     """
 
     raw: RawBatch
+    still: np.ndarray
     previous: np.ndarray
     task: tuple[str, ...]
     episode: np.ndarray
     step: np.ndarray
     control_dt: float
+
+    @property
+    def units(self) -> Units:
+        """Degrees and mm for joint targets [rad, m]; otherwise the numbers as recorded."""
+        actions = np.abs(np.asarray(self.raw.actions)).max((0, 1))
+        joints, gripper = actions[:-1], actions[-1]
+        if self.raw.state.shape[-1] != len(actions) or joints.max() > 2 * np.pi or gripper > 1:
+            return [(f"action {i}", 1.0) for i in range(1, len(actions) + 1)]
+        degrees = [(f"joint {i} [°]", 180 / np.pi) for i in range(1, len(actions))]
+        return [*degrees, ("gripper [mm]", 1000.0)]
 
 
 @dataclass(frozen=True)
@@ -67,6 +81,7 @@ class HeldOut:
         policy: errors of the sampled chunks.
         hold, repeat: errors of holding still and of repeating the previous action.
         actions: f32 `[N, C, J+1]`, the sampled chunks [rad, m].
+        units: those of the table and of what is logged.
     """
 
     loss: float
@@ -74,26 +89,19 @@ class HeldOut:
     hold: Errors
     repeat: Errors
     actions: np.ndarray
+    units: Units
 
     @property
     def scalars(self) -> dict[str, float]:
-        """What is logged: joints in degrees, the gripper in mm."""
+        """What is logged."""
         errors = {"": self.policy, "hold_still/": self.hold, "repeat/": self.repeat}
-        values = {"validation/loss": self.loss}
-        for name, error in errors.items():
-            degrees, millimetres = in_degrees(error.action)
-            values |= {
-                f"validation/{name}action_error": error.mean,
-                f"validation/{name}joints_deg": float(degrees.mean()),
-                f"validation/{name}gripper_mm": millimetres,
-            }
-        degrees, _ = in_degrees(self.policy.action)
-        return values | {f"validation/joint_{i}_deg": float(x) for i, x in enumerate(degrees, 1)}
-
-
-def in_degrees(action: np.ndarray) -> tuple[np.ndarray, float]:
-    """Convert J joints [rad] and a gripper [m] to degrees and mm."""
-    return np.rad2deg(action[:-1]), float(1000 * action[-1])
+        values = {f"validation/{name}action_error": x.mean for name, x in errors.items()}
+        pairs = zip(self.units, self.policy.action, strict=True)
+        by_dimension = {
+            f"validation/{name.partition(' [')[0].replace(' ', '_')}": factor * float(x)
+            for (name, factor), x in pairs
+        }
+        return {"validation/loss": self.loss, **values, **by_dimension}
 
 
 def windows(
@@ -112,7 +120,7 @@ def windows(
     """
     chunk, chosen = policy.model.config.chunk, _evenly([*episodes], MAX_WINDOWS)
     share = MAX_WINDOWS // len(chosen)
-    parts, previous, where = [], [], []
+    parts, still, previous, where = [], [], [], []
     for number in chosen:
         episode = source.episode(number)
         steps = flatten([episode])
@@ -121,13 +129,14 @@ def windows(
         all_starts = [*range(0, len(steps.end), every or 1)]
         starts = np.array(_evenly(all_starts, MAX_WINDOWS if every else share), np.int32)
         parts.append(gather(steps, starts, chunk))
-        before = np.where(starts[:, None] > 0, steps.action[starts - 1], steps.state[starts])
-        previous.append(before.astype(np.float32))
+        is_target = steps.state.shape[-1] == steps.action.shape[-1]
+        still.append(steps.state[starts] if is_target else 0 * steps.action[starts])
+        previous.append(np.where(starts[:, None] > 0, steps.action[starts - 1], still[-1]))
         where += [(episode.task, number, int(start)) for start in starts]
     raw = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     task, number, start = zip(*where, strict=True)
-    numbers = np.array(number), np.array(start)
-    return Windows(raw, np.concatenate(previous), task, *numbers, source.control_dt)
+    actions = np.concatenate(still), np.concatenate(previous)
+    return Windows(raw, *actions, task, np.array(number), np.array(start), source.control_dt)
 
 
 def _evenly(values: Sequence[int], count: int) -> list[int]:
@@ -156,10 +165,9 @@ def measure(policy: Policy, found: Windows, *, num_steps: int = 10) -> HeldOut:
         losses, valid = losses + float(loss), valid + float(number)
         actions.append(np.asarray(_actions(sampling, raw, keys[1], num_steps=num_steps))[fresh])
     chunks = np.concatenate(actions)
-    hold, repeat = np.asarray(found.raw.state)[:, None], found.previous[:, None]
-    return HeldOut(
-        losses / valid, *(_errors(x, found.raw) for x in (chunks, hold, repeat)), actions=chunks
-    )
+    compared = chunks, found.still[:, None], found.previous[:, None]
+    errors = (_errors(actions, found.raw) for actions in compared)
+    return HeldOut(losses / valid, *errors, actions=chunks, units=found.units)
 
 
 @jax.jit
@@ -205,11 +213,7 @@ COLUMNS = ("first action", "chunk", "hold still", "repeat previous")
 
 
 def table(found: HeldOut) -> dict[str, list[float]]:
-    """Return the errors by joint [degrees] and of the gripper [mm], in `COLUMNS`."""
+    """Return the errors by dimension, in `COLUMNS`."""
     errors = (found.policy.first, found.policy.action, found.hold.action, found.repeat.action)
-    joints, gripper = zip(*map(in_degrees, errors), strict=True)
-    rows = {
-        f"joint {i} [°]": [float(x) for x in row]
-        for i, row in enumerate(zip(*joints, strict=True), 1)
-    }
-    return {**rows, "gripper [mm]": [*gripper]}
+    rows = zip(found.units, zip(*errors, strict=True), strict=True)
+    return {name: [factor * float(x) for x in row] for (name, factor), row in rows}

@@ -53,8 +53,7 @@ def draw(found: Windows, actions: np.ndarray) -> Figure:
     _frames(figure.add_subplot(grid[0, :]), found)
     for number in range(count):
         axes = figure.add_subplot(grid[1 + number // _COLUMNS, number % _COLUMNS])
-        last = number == count - 1
-        scale = 1000 if last else np.rad2deg(1)
+        name, scale = found.units[number]
         for row, start in enumerate(found.step):
             valid = np.asarray(found.raw.inside[row])
             time = found.control_dt * (start + np.arange(len(valid)))[valid]
@@ -63,7 +62,7 @@ def draw(found: Windows, actions: np.ndarray) -> Figure:
             axes.plot(time, scale * recorded, color=COLORS["before"], lw=2.5)
             axes.plot(time, predicted, color=COLORS["vision"], lw=1)
             axes.plot(time[:1], predicted[:1], ".", color=COLORS["vision"], ms=4)
-        axes.set_title("gripper [mm]" if last else f"joint {number + 1} [°]", loc="left")
+        axes.set_title(name, loc="left")
         if number >= count - _COLUMNS:
             axes.set_xlabel("time [s]; each chunk is predicted from the dot where it begins")
     figure.legend(figure.axes[1].lines[:2], ("recorded", "predicted"), loc="upper right", ncols=2)

@@ -96,6 +96,33 @@ class Watcher(Callback):
         self.seen.append(leaves(_adapters(run)))
 
 
+def test_displacements_hold_still_at_zero(recorded):
+    """Actions of another length than states are no joint targets."""
+
+    class Shorter(LeRobot):
+        def episode(self, number, cameras=None):
+            episode = super().episode(number, cameras)
+            return dataclasses.replace(episode, action=episode.action[..., :5])
+
+    found = windows(Shorter(golden("v3")), OUT, recorded.policy, every=10)
+    assert found.still.shape == found.previous.shape == (8, 5)
+    assert not found.still.any()
+    assert not found.previous[0].any()
+    assert found.previous[1].any()
+
+
+def test_units(recorded):
+    """Joint targets are shown in degrees and mm; displacements and other units as recorded."""
+    found = windows(LeRobot(golden("v3")), OUT, recorded.policy, every=10)
+    assert found.units[0] == ("joint 1 [°]", pytest.approx(180 / np.pi))
+    assert found.units[-1] == ("gripper [mm]", 1000)
+    for scale in (np.array([60.0] * 6 + [1]), np.array([1.0] * 6 + [500])):
+        raw = dataclasses.replace(found.raw, actions=found.raw.actions * scale)
+        assert dataclasses.replace(found, raw=raw).units[0] == ("action 1", 1)
+    raw = dataclasses.replace(found.raw, actions=found.raw.actions[..., 1:])
+    assert len(dataclasses.replace(found, raw=raw).units) == 6
+
+
 def test_a_run_measures_keeps_the_best_and_resumes(recorded, tmp_path, monkeypatch):
     """The error rises after step 2: its adapters are evaluated and exported, also on a resume."""
     errors = iter([0.5, 0.9, 0.5, 0.9, 0.9, 0.9])
@@ -129,7 +156,7 @@ def test_a_run_measures_keeps_the_best_and_resumes(recorded, tmp_path, monkeypat
         assert read_json(folder / "validation.json")["kept"] == 2
         row = read_metrics(folder)[-1]
         assert row["validation/action_error"] == 0.9
-        assert {"validation/loss", "validation/joint_6_deg", "validation/gripper_mm"} <= row.keys()
+        assert {"validation/loss", "validation/joint_6", "validation/gripper"} <= row.keys()
         page = write_report(folder).read_text()
         assert "Held-out episodes" in page
         assert page.count('alt="recorded and predicted joints"') == 1
