@@ -13,7 +13,7 @@ from envs.names import check
 from lorasp_jax import peft
 from lorasp_jax.config import SCALES, Config
 from lorasp_jax.peft import LoRASP
-from lorasp_jax.training import experiment_file, rules
+from lorasp_jax.training import experiment_file
 
 HELP = {"-h", "--help"}
 
@@ -69,8 +69,8 @@ def parse(arguments: Sequence[str], program: str = "python train.py") -> Command
     if known.resume and known.dry_run:
         raise ValueError("--resume and --dry-run cannot be combined")
     config = override(config, rest, program)
-    _check_rules(config, ["--method"] * bool(known.method) + rest)
     _check_simulated(config)
+    _check_rules(config, ["--method"] * bool(known.method) + rest)
     return Command(config, known.resume, known.dry_run, known.wandb)
 
 
@@ -153,6 +153,8 @@ def override(config: Config, arguments: Sequence[str], program: str = "") -> Con
 
 def _check_rules(config: Config, arguments: Sequence[str]) -> None:
     """Raise ValueError for invalid rules or targets, and for options that `adapt` would ignore."""
+    from lorasp_jax.training import rules  # imports models, which is slow
+
     rules.named_rules(config)
     if not config.adapt:
         return

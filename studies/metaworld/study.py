@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from configs.metaworld import get_config
-from lorasp_jax.config import Config
+from lorasp_jax.config import AugmentConfig, Config
 from lorasp_jax.extras.study import Cell, Study
 from lorasp_jax.extras.study.study import Results
 from lorasp_jax.peft import AdaLoRA, FullFineTuning, LoRA, LoRASP, Method
@@ -128,7 +128,12 @@ def _config(name: str, seed: int, rate: float) -> Config:
         config,
         peft=METHODS[method],
         model=model,
-        data=dataclasses.replace(config.data, source=f"data/{stage.tasks}"),
+        data=dataclasses.replace(
+            config.data,
+            source=f"data/{stage.tasks}",
+            augment=AugmentConfig("none"),
+            validation=("0",),
+        ),
         optim=dataclasses.replace(config.optim, steps=stage.steps, learning_rate=rate),
         seed=seed,
     )

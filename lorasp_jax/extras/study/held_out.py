@@ -7,8 +7,9 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from lorasp_jax.base.locks import locked
-from lorasp_jax.config import Config
+from lorasp_jax.config import Config, DataConfig
 from lorasp_jax.training.demonstrations import Demonstrations, Progress, demonstrations, map_threads
+from lorasp_jax.training.run_folder import to_json
 
 EPISODES = 32
 """Held-out episodes per task."""
@@ -41,8 +42,8 @@ def settings(config: Config) -> Config:
     """
     if config.seed == SEED:
         raise ValueError(f"seed {SEED} is reserved for held-out episodes")
-    changes = {"source": "", "cameras": (), "fresh_every": 0, "episodes": EPISODES}
-    data = dataclasses.replace(config.data, **changes)
+    kept = {name: getattr(config.data, name) for name in ("num_envs", "action_noise")}
+    data = DataConfig(episodes=EPISODES, **kept)
     return dataclasses.replace(config, data=data, seed=SEED)
 
 
@@ -50,7 +51,7 @@ def _shared(root: Path, config: Config, progress: Progress = lambda *_: None) ->
     """Load each task's episodes from a folder named after the settings, or collect them there."""
     settings = {
         "robot": config.robot,
-        "data": dataclasses.asdict(config.data),
+        "data": to_json(config)["data"],
         "image_size": config.image_size,
         "control_dt": config.control_dt,
     }
