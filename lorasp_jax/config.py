@@ -155,7 +155,8 @@ class AugmentConfig:
         fields.check_fields(self)
         for name, value in self.given.items():
             _require(value >= 0, f"data.augment.{name} must be at least 0", value)
-        _require(0 < (self.crop or 1) <= 1, "data.augment.crop must lie in (0, 1]", self.crop)
+        crop = 1 if self.crop is None else self.crop
+        _require(0 < crop <= 1, "data.augment.crop must lie in (0, 1]", crop)
         if self.preset != "auto":
             self.chosen(simulated=False)
 

@@ -38,7 +38,10 @@ def held_out(choice: Sequence[str], tasks: Sequence[str], *, recorded: bool) -> 
             f"data.validation must be a share below 1 or a number of episodes below {len(tasks)}, "
             f"which is how many there are, got {choice[0]}"
         )
-    return _spread(count, tasks)
+    chosen = _spread(count, tasks)
+    if count and not chosen:
+        raise ValueError("data.validation can hold out nothing: every task has few episodes")
+    return chosen
 
 
 def _is_number(text: str) -> bool:

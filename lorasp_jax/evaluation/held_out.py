@@ -63,7 +63,8 @@ class Errors:
         action: over the chunk, by dimension, `[J+1]` [rad, m].
         first: of the first action, by dimension, `[J+1]` [rad, m].
         horizon: by step of the chunk, `[C]`, in standard deviations of the recorded actions.
-        mean: over the chunk and all dimensions, in standard deviations of the recorded actions.
+        mean: over the chunk and all dimensions, in standard deviations of the recorded actions, at
+            least a tenth of their median.
     """
 
     action: np.ndarray
@@ -116,13 +117,16 @@ def windows(
         every: take the windows this many steps apart instead.
 
     Raises:
-        ValueError: the policy has no prompt for an instruction, or an episode is damaged.
+        ValueError: the policy has no prompt for an instruction, an episode is damaged, or its
+            actions are not what policies give.
     """
     chunk, chosen = policy.model.config.chunk, _evenly([*episodes], MAX_WINDOWS)
     share = MAX_WINDOWS // len(chosen)
     parts, still, previous, where = [], [], [], []
     for number in chosen:
         episode = source.episode(number)
+        if episode.actions != "joint":
+            raise ValueError(f"policies give joint targets, but {episode.actions} was recorded")
         steps = flatten([episode])
         rows = policy.processor.prompts.rows(episode.instructions)
         steps = dataclasses.replace(steps, instruction=rows[steps.instruction])
@@ -200,12 +204,12 @@ def _errors(actions: np.ndarray, raw: RawBatch) -> Errors:
     distance = np.abs(actions - recorded) * inside
     rows = recorded[np.asarray(raw.inside)]
     spread = rows.std(0)
-    moving = spread > 1e-6  # a joint that never moved has no scale
+    # What hardly moves must not decide: its standard deviation is the noise of its sensor.
+    spread = np.maximum(spread, max(0.1 * float(np.median(spread)), 1e-6))
     by_step = distance.sum(0) / np.maximum(inside.sum(0), 1)
-    relative = by_step[:, moving] / spread[moving]
     action = distance.sum((0, 1)) / inside.sum()
-    mean = float((action[moving] / spread[moving]).mean()) if moving.any() else 0.0
-    return Errors(action, distance[:, 0].mean(0), relative.mean(-1), mean)
+    horizon, mean = (by_step / spread).mean(-1), float((action / spread).mean())
+    return Errors(action, distance[:, 0].mean(0), horizon, mean)
 
 
 COLUMNS = ("first action", "chunk", "hold still", "repeat previous")

@@ -1,10 +1,8 @@
 """Measure a run on its held-out episodes while it trains, and keep its best adapters."""
 
-from lorasp_jax.data.cache import Cache
 from lorasp_jax.evaluation import held_out_figure
 from lorasp_jax.evaluation.held_out import HeldOut, Windows, measure, table, windows
 from lorasp_jax.training import best
-from lorasp_jax.training.dataset import CACHE
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import VALIDATION, write_json
 
@@ -42,7 +40,7 @@ class Validation(Callback):
         if not run.held_out:
             return
         kept = run.config.optim.steps
-        if run.config.keep == "best":
+        if run.config.keep == "best" and best.error(run.folder) < float("inf"):
             kept, run.policy = best.load(run.folder, run.policy)
             run.console.print(f"kept the adapters of step {kept}, the best on held-out episodes")
         found = self._last if self._last and kept == run.config.optim.steps else self._measure(run)
@@ -53,12 +51,14 @@ class Validation(Callback):
             "horizon": found.policy.horizon.tolist(),
         }
         write_json(run.folder / VALIDATION, content)
-        source, steps = Cache(run.folder / CACHE), run.config.evaluation.denoise_steps
+        source, steps = run.recordings, run.config.evaluation.denoise_steps
+        assert source is not None
         held_out_figure.write(run.folder, run.policy, source, run.held_out, num_steps=steps)
 
     def _measure(self, run: Run) -> HeldOut:
         with run.timed("validate"):
             if self._windows is None:
-                self._windows = windows(Cache(run.folder / CACHE), run.held_out, run.policy)
+                assert run.recordings is not None  # episodes are held out of a dataset
+                self._windows = windows(run.recordings, run.held_out, run.policy)
             steps = run.config.evaluation.denoise_steps
             return measure(run.policy, self._windows, num_steps=steps)

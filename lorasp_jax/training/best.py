@@ -44,8 +44,11 @@ def load(folder: Path, policy: Policy) -> tuple[int, Policy]:
         if not best or digest(leaves) != best["weights"]:
             raise ValueError(f"it does not match {BEST}")
     graphdef, adapters, frozen = adaptation.split(policy.model)
-    names = [jax.tree_util.keystr(p) for p, _ in jax.tree_util.tree_leaves_with_path(adapters)]
-    adapters = jax.tree.unflatten(jax.tree.structure(adapters), [leaves[name] for name in names])
+    placed = [
+        jax.device_put(leaves[jax.tree_util.keystr(path)], leaf.sharding)
+        for path, leaf in jax.tree_util.tree_leaves_with_path(adapters)
+    ]
+    adapters = jax.tree.unflatten(jax.tree.structure(adapters), placed)
     return best["step"], Policy(nnx.merge(graphdef, adapters, frozen), policy.processor)
 
 

@@ -105,11 +105,10 @@ def without(steps: Steps, held_out: Collection[int]) -> Steps:
     return dataclasses.replace(steps, starts=starts)
 
 
-def is_simulated(dataset: Cache) -> bool:
+def is_simulated(tasks: Collection[str], robot: str, physics_dt: float) -> bool:
     """Whether a dataset was recorded in simulation and its tasks and robot are available.
 
     Matching names do not suffice: recordings of a real robot may use the same names.
     """
-    metadata = dataset.metadata
-    is_known = set(metadata["tasks"]) <= set(names("task")) and metadata["robot"] in names("robot")
-    return is_known and metadata["physics_dt"] > 0
+    is_known = set(tasks) <= set(names("task")) and robot in names("robot")
+    return is_known and physics_dt > 0

@@ -52,6 +52,7 @@ def _from_json(recorded: Mapping[str, Any], tasks: tuple[str, ...]) -> Config:
     augment, validation = ("none", "0") if data["source"] else ("auto", "auto")
     data["augment"] = AugmentConfig(**data.get("augment", {"preset": augment}))
     data["validation"] = tuple(data.get("validation", [validation]))
+    data["cameras"] = tuple(data.get("cameras", ()))
     fields["data"] = data
     for name, group in _GROUPS.items():
         fields[name] = group(**fields[name])

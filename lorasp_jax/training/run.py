@@ -13,6 +13,7 @@ from envs.datasets.episodes import Episodes
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import AugmentConfig, Config
 from lorasp_jax.data.batches import Steps, flatten
+from lorasp_jax.data.cache import Cache
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training import records
 from lorasp_jax.training.distributed import processes
@@ -26,7 +27,8 @@ class Run:
     Attributes:
         episodes: demonstrations per task; those of a dataset repeat one image per camera.
         dataset: all steps of a dataset, stored on disk; None: train on `episodes`.
-        held_out: numbers of the dataset's episodes that are not trained on.
+        recordings: the dataset; None: train on `episodes`.
+        held_out: numbers of its episodes that are not trained on.
         streams: whether batches are read from disk because the dataset does not fit on the device.
         devices: devices to train on; None: all.
         simulated: whether the tasks can be evaluated in simulation.
@@ -44,6 +46,7 @@ class Run:
     started: float = field(default_factory=time.perf_counter)
     episodes: dict[str, Episodes] = field(default_factory=dict)
     dataset: Steps | None = None
+    recordings: Cache | None = None
     held_out: Sequence[int] = ()
     streams: bool = False
     devices: Sequence[Any] | None = None

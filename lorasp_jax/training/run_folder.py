@@ -126,7 +126,10 @@ def open_run(config: Config, root: Path, *, resume: bool | Literal["auto"]) -> I
     with _locked(folder):
         if (folder / CONFIG_FILE).exists() if resume == "auto" else resume:
             check_only_files(folder, folder)
-            if changed := changed_settings(_recorded(folder), to_json(config)):
+            recorded = _recorded(folder)
+            if changed := changed_settings(recorded, to_json(config)):
+                if "data.validation" in changed and "validation" not in recorded["data"]:
+                    changed += ["an older run has --data.validation 0 --data.augment.preset none"]
                 raise ValueError(
                     f"{folder} contains a run with different settings ({', '.join(changed)}): "
                     "resume with the original settings or use another --name"

@@ -343,7 +343,8 @@ def _load_dataset(run: Run, source: Source, free_bytes: float) -> None:
             cache.verify_images()
         progress.update(bar, completed=cache.num_steps, total=cache.num_steps)
     metadata = cache.metadata
-    run.simulated = is_simulated(cache)
+    facts = (metadata[name] for name in ("tasks", "robot", "physics_dt"))
+    run.recordings, run.simulated = cache, is_simulated(*facts)
     tasks = [cache.episode(number, ()).task for number in range(len(cache))]
     run.held_out = held_out(run.config.data.validation, tasks, recorded=not run.simulated)
     run.dataset, run.episodes = without(cache.steps, run.held_out), outline(cache, run.held_out)

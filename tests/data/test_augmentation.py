@@ -109,6 +109,7 @@ def test_default_recipe():
         ({"preset": "openpi", "sharpness": 0.5}, "sharpness.*openpi.*crop"),
         ({"preset": "none", "crop": 0.9}, "crop.*none"),
         ({"crop": 1.5}, r"crop.*1\.5"),
+        ({"crop": 0.0}, "crop.*0"),
         ({"hue": -0.1}, r"hue.*-0\.1"),
         ({"preset": "fast"}, "preset.*openpi.*lerobot"),
     ],

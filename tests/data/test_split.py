@@ -36,6 +36,7 @@ def test_a_task_of_one_episode_is_learned_from():
     ("choice", "named"),
     [
         (["30"], "below 30.*30"),
+        (["0.01", "x"], "episode_29"),
         (["1.5"], r"1\.5"),
         (["-1"], "-1"),
         (["nan"], "episode_0 to episode_29.*nan"),
@@ -49,3 +50,8 @@ def test_a_task_of_one_episode_is_learned_from():
 def test_impossible_choices(choice, named):
     with pytest.raises(ValueError, match=named):
         held_out(choice, TASKS, recorded=True)
+
+
+def test_what_cannot_be_held_out_is_said():
+    with pytest.raises(ValueError, match="every task"):
+        held_out(["3"], [f"task {number}" for number in range(20)], recorded=True)

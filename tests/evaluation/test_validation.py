@@ -9,6 +9,7 @@ import pytest
 
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import DataConfig
+from lorasp_jax.data import cache
 from lorasp_jax.data.batches import RawBatch, draw
 from lorasp_jax.data.lerobot import LeRobot
 from lorasp_jax.evaluation import held_out, validation
@@ -36,12 +37,14 @@ CONFIG = dataclasses.replace(
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """A run on two of the four golden episodes, with the dummy backbone."""
+    """A run on two of the four golden episodes, in a user's cache, with the dummy backbone."""
     folder = tmp_path_factory.mktemp("recorded")
+    cache.write([LeRobot(golden("v3"))], folder / "mine", lambda *_: None)
+    data = dataclasses.replace(DATA, source=str(folder / "mine"))
     with pytest.MonkeyPatch.context() as patch:
-        run = prepare(folder, patch, DATA.source, config=CONFIG)
-    write_json(folder / "config.json", to_json(run.config))
-    return run
+        config = dataclasses.replace(CONFIG, data=data)
+        (folder / "run").mkdir()
+        return prepare(folder / "run", patch, data.source, config=config)
 
 
 def test_held_out_episodes_are_not_trained_on(recorded):
@@ -60,16 +63,26 @@ def test_held_out_episodes_are_not_trained_on(recorded):
 
 def test_errors_by_hand():
     """Two windows of two actions, the last of which lies past the end of its episode."""
-    recorded = np.array([[[0.0, 0.0], [2.0, 0.1]], [[4.0, 0.2], [9.0, 9.0]]], np.float32)
+    recorded = np.array([[[0.0, 0.0], [2.0, 0.8]], [[4.0, 1.6], [9.0, 9.0]]], np.float32)
     inside = np.array([[True, True], [True, False]])
     raw = RawBatch({}, np.zeros((2, 2)), recorded, inside, np.zeros(2, np.int32))
     found = held_out._errors(np.array([[[1.0, 0.0], [2.0, 0.0]], [[4.0, 0.0], [0.0, 0.0]]]), raw)
-    np.testing.assert_allclose(found.action, [1 / 3, 0.1], rtol=1e-6)
-    np.testing.assert_allclose(found.first, [0.5, 0.1], rtol=1e-6)
-    spread = np.std([0, 2, 4]), np.std([0, 0.1, 0.2])
-    expected = [(0.5 / spread[0] + 0.1 / spread[1]) / 2, (0.1 / spread[1]) / 2]
+    np.testing.assert_allclose(found.action, [1 / 3, 0.8], rtol=1e-6)
+    np.testing.assert_allclose(found.first, [0.5, 0.8], rtol=1e-6)
+    spread = np.std([0, 2, 4]), np.std([0, 0.8, 1.6])
+    expected = [(0.5 / spread[0] + 0.8 / spread[1]) / 2, (0.8 / spread[1]) / 2]
     np.testing.assert_allclose(found.horizon, expected, rtol=1e-6)
-    assert found.mean == pytest.approx((1 / 3 / spread[0] + 0.1 / spread[1]) / 2)
+    assert found.mean == pytest.approx((1 / 3 / spread[0] + 0.8 / spread[1]) / 2)
+
+
+def test_a_dimension_that_hardly_moves_does_not_decide():
+    """Sensor noise of 10 µm: 1 mm off there is little, .3 rad off elsewhere is much."""
+    rng = np.random.default_rng(0)
+    recorded = rng.normal(size=(64, 4, 7)).astype(np.float32) * np.array([0.3] * 6 + [1e-5])
+    raw = RawBatch({}, recorded[:, 0], recorded, np.ones((64, 4), bool), np.zeros(64, np.int32))
+    close = held_out._errors(recorded + np.array([0.01] * 6 + [1e-3]), raw)
+    far = held_out._errors(recorded + np.array([0.3] * 6 + [0.8e-3]), raw)
+    assert close.mean < 0.1 < 0.8 < far.mean
 
 
 def test_windows(recorded):
@@ -94,6 +107,15 @@ class Watcher(Callback):
 
     def on_log(self, run, step, metrics):
         self.seen.append(leaves(_adapters(run)))
+
+
+def test_poses_are_no_joint_targets(recorded):
+    class Poses(LeRobot):
+        def episode(self, number, cameras=None):
+            return dataclasses.replace(super().episode(number, cameras), actions="end_effector")
+
+    with pytest.raises(ValueError, match="end_effector"):
+        windows(Poses(golden("v3")), OUT, recorded.policy)
 
 
 def test_displacements_hold_still_at_zero(recorded):
@@ -138,8 +160,7 @@ def test_a_run_measures_keeps_the_best_and_resumes(recorded, tmp_path, monkeypat
     kept = []
     for name in ("whole", "halved"):
         folder = tmp_path / name
-        (folder / "cache").mkdir(parents=True)
-        (folder / "cache" / "steps").symlink_to(recorded.folder / "cache" / "steps")
+        folder.mkdir()
         run = dataclasses.replace(recorded, folder=folder)
         run.policy = recorded.policy
         write_json(folder / "config.json", to_json(run.config))

@@ -78,10 +78,10 @@ class Checkpoint:
     def config(self) -> BackboneConfig:
         """The config of the model and of its inputs."""
         given = self.given
-        config = self.found.resized(sized("pi0", given.size)) if given.size else None
+        config = sized("pi0", given.size) if given.size else None
         if self.named:
             config = self.named.apply(config) if config else self.named.config
-        config = config or self.found.config
+        config = self.found.resized(config) if config else self.found.config
         inputs: dict[str, Any] = {}
         if given.relative is not None:
             size = max(given.relative, default=-1) + 1

@@ -74,7 +74,7 @@ class ModelFolder:
         if self.layout == "ours":
             return native.load_config(self.folder)
         if self.is_openpi and (named := openpi_configs.guess(self.source)):
-            return named.config
+            return self.resized(named.config)
         if self.layout == "openpi":
             return backbone.find("pi0").base()
         return _lerobot_config(self.folder, self.fields)

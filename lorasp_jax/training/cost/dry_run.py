@@ -10,6 +10,7 @@ from lorasp_jax.config import Config
 from lorasp_jax.training import early, setup
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.cost.preflight import byte_unit
+from lorasp_jax.training.dataset import is_simulated
 from lorasp_jax.training.run import Run
 
 
@@ -27,6 +28,9 @@ def dry_run(config: Config, folder: Path, console: Console) -> None:
         console.print(f"not downloaded for a dry run: {', '.join(names)}", soft_wrap=True)
     console.print(setup.headline(config, built.model))
     run = Run(config, folder, console, built.base_hash)
+    if built.source:
+        first = built.source.episode(0, ())
+        run.simulated = is_simulated([first.task], first.robot, first.physics_dt)
     held, batches = early.data_shapes(run, built)
     compiled = early.compile_steps(run, built, batches)
     console.print(f"memory per device, estimated: {built.memory}", soft_wrap=True)
