@@ -14,8 +14,9 @@ from lorasp_jax.config import AugmentConfig
 from lorasp_jax.policies.policy import Observation
 from lorasp_jax.policies.processor import Processor
 
-WRIST = "wrist"
-"""A camera with this in its name moves with the hand: openpi neither crops nor rotates it."""
+WRIST = ("wrist", "gripper", "hand")
+"""A camera with one of these in its name moves with the hand, so it is neither cropped nor rotated;
+openpi knows "wrist" alone."""
 _GRAY = (0.299, 0.587, 0.114)  # ITU-R BT.601, as in torchvision
 
 Augment = Callable[[jax.Array, jax.Array], jax.Array]
@@ -41,9 +42,14 @@ def augment(
     for number, (slot, camera) in enumerate(sources.items()):
         if camera is not None:
             keys = jax.random.split(jax.random.fold_in(key, number), len(images[slot]))
-            change = jax.vmap(recipe(settings, wrist=WRIST in camera))
+            change = jax.vmap(recipe(settings, wrist=on_wrist(camera)))
             images[slot] = 2 * change(keys, images[slot] / 2 + 0.5) - 1
     return dataclasses.replace(observation, images=images)
+
+
+def on_wrist(camera: str) -> bool:
+    """Whether a camera moves with the hand, by its name."""
+    return any(name in camera for name in WRIST)
 
 
 def recipe(settings: AugmentConfig, *, wrist: bool = False) -> Augment:

@@ -18,7 +18,7 @@ from envs.datasets.episodes import Episodes
 from envs.rendering.video import side_by_side
 from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.config import AugmentConfig
-from lorasp_jax.data.augmentation import WRIST, recipe
+from lorasp_jax.data.augmentation import on_wrist, recipe
 from lorasp_jax.data.lerobot import LeRobot
 from lorasp_jax.data.source import Source, describe_left_out
 from lorasp_jax.data.video import downscale
@@ -204,7 +204,7 @@ def _row(source: Source, number: int, preset: str) -> np.ndarray:
 
 def changed(image: np.ndarray, camera: str, preset: str, seed: int) -> np.ndarray:
     """Return one of the images `[H, W, 3]` uint8 that training makes of a camera's."""
-    change = jax.jit(recipe(AugmentConfig(preset), wrist=WRIST in camera))  # type: ignore[arg-type]
+    change = jax.jit(recipe(AugmentConfig(preset), wrist=on_wrist(camera)))  # type: ignore[arg-type]
     unit = change(jax.random.key(seed), np.float32(image / 255))
     return np.asarray(255 * unit).round().astype(np.uint8)
 

@@ -61,9 +61,11 @@ def evaluate(options: argparse.Namespace, console: Console) -> None:
     source = open_source(options.data, keys_of(options))
     period = export.describe(options.run)["control_dt"]
     if abs(source.control_dt / period - 1) > _DT_TOLERANCE:
+        shorter = source.control_dt < period
+        remedy = "pass --every N to keep every N-th frame" if shorter else "record more often"
         raise ValueError(
             f"{options.data} has a control period of {source.control_dt:.4g} s, but {options.run} "
-            f"was trained with {period:.4g} s: pass --every N to keep every N-th frame"
+            f"was trained with {period:.4g} s: {remedy}"
         )
     numbers = options.episodes or [*range(len(source))]
     if wrong := [number for number in numbers if not 0 <= number < len(source)]:

@@ -1,7 +1,7 @@
 """Measure a run on its held-out episodes while it trains, and keep its best adapters."""
 
 from lorasp_jax.evaluation import held_out_figure
-from lorasp_jax.evaluation.held_out import HeldOut, Windows, measure, table, windows
+from lorasp_jax.evaluation.held_out import COLUMNS, HeldOut, Windows, measure, table, windows
 from lorasp_jax.training import best
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import VALIDATION, write_json
@@ -29,7 +29,8 @@ class Validation(Callback):
         error = self._last.policy.mean
         run.console.print(
             f"held-out episodes at step {step}: action error {error:.3f}, holding still "
-            f"{self._last.hold.mean:.3f} (standard deviations); loss {self._last.loss:.4f}"
+            f"{self._last.hold.mean:.3f}, repeating {self._last.repeat.mean:.3f} (standard "
+            f"deviations); loss {self._last.loss:.4f}"
         )
         if run.config.keep == "best" and error < best.error(run.folder):
             best.save(run.folder, run.policy, step, error)
@@ -47,6 +48,7 @@ class Validation(Callback):
         content = {
             "episodes": [*run.held_out],
             "kept": kept,
+            "columns": [*COLUMNS],
             "errors": table(found),
             "horizon": found.policy.horizon.tolist(),
         }

@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 
 from lorasp_jax.base.files import join_inside, read_bytes
 from lorasp_jax.base.writing import write_text
-from lorasp_jax.evaluation.held_out import COLUMNS
 from lorasp_jax.models import presets
 from lorasp_jax.report import figures
 from lorasp_jax.training import records
@@ -148,7 +147,7 @@ def _held_out(folder: Path, rows: figures.Rows) -> Iterable[str]:
     yield _image(figures.held_out(rows))
     yield f"<p>{held_out_verdict(measured)}</p>"
     if found := read_json(folder / VALIDATION, records.VALIDATION):
-        header = (f"mean error at step {found['kept']}", *COLUMNS)
+        header = (f"mean error at step {found['kept']}", *found["columns"])
         errors = found["errors"].items()
         yield _table(header, ((k, *(f"{x:.2f}" for x in v)) for k, v in errors))
     for picture in sorted(folder.glob("held_out_*.png")):
@@ -178,13 +177,19 @@ def _subtitle(config: dict[str, Any], results: dict[str, Any]) -> str:
     line = (
         f"{' '.join(config.get('adapt', ())) or config['peft']['method']} on "
         f"{config['model']['backbone']} {config['model']['size']}, "
-        f"robot {config['robot']}"
+        f"{_learned_from(config)}"
     )
     if "total_parameters" in results:
         trainable, total = results["trainable_parameters"], results["total_parameters"]
         percentage = 100 * trainable / total
         line += f": {trainable:,} trainable of {total:,} parameters ({percentage:.1f} %)"
     return html.escape(f"{line}, scale {config['scale']}")
+
+
+def _learned_from(config: dict[str, Any]) -> str:
+    """Name the recordings; a dataset also sets the robot, which the config then does not know."""
+    source = config.get("data", {}).get("source")
+    return f"recordings {source}" if source else f"robot {config['robot']}"
 
 
 def _success(results: dict[str, Any]) -> Iterable[str]:

@@ -23,7 +23,13 @@ RESULTS: Schema = {
 ROW: Schema = {"step": float, str: float}
 DATASET: Schema = {"facts": {}, "streams": bool}
 BEST: Schema = {"step": int, "error": float, "weights": str}
-VALIDATION: Schema = {"episodes": [int], "kept": int, "errors": {str: [float]}, "horizon": [float]}
+VALIDATION: Schema = {
+    "episodes": [int],
+    "kept": int,
+    "columns": [str],
+    "errors": {str: [float]},
+    "horizon": [float],
+}
 STOPPED: Schema = {"reason": str}
 CONFIG: Schema = {
     "name": str,

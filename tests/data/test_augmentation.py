@@ -96,6 +96,11 @@ def test_each_camera_and_row_has_its_own_changes(tmp_path):
     assert ((side >= -1.001) & (side <= 1.001)).all()
 
 
+def test_cameras_on_the_wrist():
+    named = ("wrist", "left_wrist_0_rgb", "gripper_cam", "hand", "overhead", "side", "base_0_rgb")
+    assert [augmentation.on_wrist(name) for name in named] == 4 * [True] + 3 * [False]
+
+
 def test_default_recipe():
     assert AugmentConfig().chosen(simulated=True) is None
     assert AugmentConfig().chosen(simulated=False).preset == "openpi"

@@ -235,3 +235,6 @@ def test_evaluate_on_another_dataset(recorded, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(export, "describe", lambda _: {"control_dt": 0.2})
     assert main(arguments) == 2
     assert "--every" in capsys.readouterr().err
+    monkeypatch.setattr(export, "describe", lambda _: {"control_dt": 0.05})
+    assert main(arguments) == 2
+    assert "more often" in capsys.readouterr().err
