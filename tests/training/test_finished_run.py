@@ -3,6 +3,7 @@ import dataclasses
 import pytest
 
 from envs.scene.ranges import Randomization
+from lorasp_jax.config import AugmentConfig, DataConfig
 from lorasp_jax.extras.study import progress
 from lorasp_jax.extras.study.progress import CellState
 from lorasp_jax.extras.study.study import Derived, Study
@@ -20,6 +21,10 @@ TASKS = {task: RESULTS["tasks"]["press"] for task in CONFIG.tasks}
         {"peft": LoRASP(rank=4, energy_target=0.5)},
         {"peft": AdaLoRA(rank=4, target_rank=2), "scene": Randomization(turn=(0.0, 0.1))},
         {"peft": FullFineTuning(), "optim": dataclasses.replace(CONFIG.optim, rtc_max_delay=3)},
+        {"data": DataConfig(source="x", cameras=("a", "b"), validation=("0.1",))},
+        {"data": DataConfig(source="x", augment=AugmentConfig("lerobot", hue=0.1))},
+        {"data": DataConfig(source="x", augment=AugmentConfig("none"), validation=("0",))},
+        {"adapt": ("language=lora:4", "action=full")},
     ],
 )
 def test_configs_are_read_as_written(tmp_path, changes):

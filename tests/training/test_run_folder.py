@@ -11,7 +11,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from envs.scene.ranges import Randomization
 from lorasp_jax.base.errors import DISK_FULL
-from lorasp_jax.config import Config, DataConfig
+from lorasp_jax.config import AugmentConfig, Config, DataConfig
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.training import run_folder
 from lorasp_jax.training.run_folder import (
@@ -85,6 +85,21 @@ def test_settings_that_earlier_versions_lack_are_recorded_only_if_used():
     config = dataclasses.replace(CONFIG, model=dataclasses.replace(CONFIG.model, chunk=16))
     assert run_folder.changed_settings(plain, run_folder.to_json(config)) == ["model.chunk"]
     assert not run_folder.changed_settings(plain, run_folder.to_json(CONFIG))
+
+
+def test_a_run_from_before_held_out_episodes_says_how_to_resume(tmp_path):
+    """It trained on all recordings, without augmentation."""
+    recorded = dataclasses.replace(
+        CONFIG,
+        data=DataConfig(source="x", validation=("0",), augment=AugmentConfig("none")),
+    )
+    plain = run_folder.to_json(recorded)
+    assert not {"validation", "augment"} & plain["data"].keys()
+    open_run(recorded, tmp_path, resume=False)
+    default = dataclasses.replace(CONFIG, data=DataConfig(source="x"))
+    with pytest.raises(ValueError, match=r"--data\.validation 0 --data\.augment\.preset none"):
+        open_run(default, tmp_path, resume=True)
+    open_run(recorded, tmp_path, resume=True)
 
 
 def test_only_ranges_that_change_something_are_recorded(tmp_path):

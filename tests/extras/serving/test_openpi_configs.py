@@ -201,6 +201,18 @@ def test_a_conversion_to_pytorch_says_its_sizes_only(tmp_path, echo):
         loading.load_checkpoint(str(folder), tokenizer=WORDS)
 
 
+def test_a_recorded_chunk_wins_over_the_folders_name(tmp_path, echo):
+    """pi05_libero has 10; this one was trained with 30."""
+    folder = checkpoint(tmp_path / "pi05_libero", {"libero": LIBERO})
+    (folder / "params" / "_METADATA").unlink()
+    fields = {"action_dim": 32, "action_horizon": 30, "paligemma_variant": "gemma_2b"}
+    (folder / "config.json").write_text(json.dumps(fields))
+    save_file({"time_mlp_in.weight": np.zeros(1)}, folder / "model.safetensors")
+    loaded = loading.load_checkpoint(str(folder), tokenizer=WORDS)["base"].policy
+    assert loaded.model.config.chunk == 30
+    assert checkpoints.find(folder).config.chunk == 30
+
+
 def test_a_tokenizer_is_not_assumed(tmp_path, echo, monkeypatch):
     """openpi's checkpoints have openpi's; for others of a published vocabulary it must be given."""
     asked = []

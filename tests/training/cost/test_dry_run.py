@@ -100,6 +100,19 @@ def test_published_models_need_no_download(file, monkeypatch):
     assert adaptation.count(built.model).trainable > 0
 
 
+def test_recordings_change_their_images_as_in_the_run(config, tmp_path, monkeypatch):
+    """Simulated episodes do not, by default."""
+    seen = []
+    monkeypatch.setattr(early, "compile_steps", lambda run, *_: seen.append(run) or 1 / 0)
+    for number, physics_dt in enumerate((0.005, 0.0)):
+        path = tmp_path / str(number)
+        rlds.write(dataclasses.replace(random_episodes("press", 0), physics_dt=physics_dt), path)
+        changed = dataclasses.replace(config, data=DataConfig(source=str(path)))
+        with pytest.raises(ZeroDivisionError):
+            dry_run.dry_run(changed, tmp_path / "run", Console(quiet=True))
+    assert [bool(run.augmentation) for run in seen] == [False, True]
+
+
 def test_a_dataset_larger_than_the_free_memory_streams(config, tmp_path):
     """Each call then takes a single batch, and no dataset is on the device."""
     rlds.write(random_episodes("press", 0), tmp_path / "rlds")
