@@ -2,12 +2,14 @@
 
 import collections
 import dataclasses
+import functools
 import hashlib
 import math
 import os
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from PIL import Image, ImageDraw
 from rich.console import Console
@@ -18,7 +20,7 @@ from envs.datasets.episodes import Episodes
 from envs.rendering.video import side_by_side
 from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.config import AugmentConfig
-from lorasp_jax.data.augmentation import on_wrist, recipe
+from lorasp_jax.data.augmentation import Augment, on_wrist, recipe
 from lorasp_jax.data.lerobot import LeRobot
 from lorasp_jax.data.source import Source, describe_left_out
 from lorasp_jax.data.video import downscale
@@ -204,9 +206,16 @@ def _row(source: Source, number: int, preset: str) -> np.ndarray:
 
 def changed(image: np.ndarray, camera: str, preset: str, seed: int) -> np.ndarray:
     """Return one of the images `[H, W, 3]` uint8 that training makes of a camera's."""
-    change = jax.jit(recipe(AugmentConfig(preset), wrist=on_wrist(camera)))  # type: ignore[arg-type]
-    unit = change(jax.random.key(seed), np.float32(image / 255))
+    unit = _recipe(preset, on_wrist(camera))(
+        jax.random.key(seed), jnp.asarray(image / 255, jnp.float32)
+    )
     return np.asarray(255 * unit).round().astype(np.uint8)
+
+
+@functools.cache
+def _recipe(preset: str, wrist: bool) -> Augment:
+    """Return the jitted recipe: all tiles of a size share its program."""
+    return jax.jit(recipe(AugmentConfig(preset), wrist=wrist))  # type: ignore[arg-type]
 
 
 def _spread(count: int, number: int) -> list[int]:

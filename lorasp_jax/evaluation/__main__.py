@@ -16,8 +16,6 @@ from lorasp_jax.data.__main__ import add_keys, keys_of
 if TYPE_CHECKING:
     from lorasp_jax.evaluation.held_out import HeldOut
 
-_DT_TOLERANCE = 0.01  # relative, as in training
-
 
 def main(arguments: Sequence[str], program: str = "lorasp-jax evaluate") -> int:
     """Run the command and return its exit code: 0, or one of `lorasp_jax.base.errors`."""
@@ -56,11 +54,12 @@ def evaluate(options: argparse.Namespace, console: Console) -> None:
     from lorasp_jax.data.opening import open_source
     from lorasp_jax.evaluation import held_out, held_out_figure
     from lorasp_jax.training import export
+    from lorasp_jax.training.dataset import has_period
 
     cache.enable()
     source = open_source(options.data, keys_of(options))
     period = export.describe(options.run)["control_dt"]
-    if abs(source.control_dt / period - 1) > _DT_TOLERANCE:
+    if not has_period(source, period):
         shorter = source.control_dt < period
         remedy = "pass --every N to keep every N-th frame" if shorter else "record more often"
         raise ValueError(

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -157,21 +157,31 @@ def measure(policy: Policy, found: Windows, *, num_steps: int = 10) -> HeldOut:
         found: from `windows`.
         num_steps: Euler steps of the flow-matching sampler.
     """
-    sampling, key = policy.with_sampler(), jax.random.key(0)
-    count = len(found.task)
-    losses, valid, actions = 0.0, 0.0, []
-    for first in range(0, count, _BATCH):
-        rows = np.arange(first, first + _BATCH) % count  # the last batch begins again
-        raw = jax.tree.map(lambda x, rows=rows: x[rows], found.raw)
-        fresh = np.arange(first, first + _BATCH) < count
-        keys = jax.random.split(jax.random.fold_in(key, first), 2)
-        loss, number = _loss(policy, raw, fresh, keys[0])
-        losses, valid = losses + float(loss), valid + float(number)
-        actions.append(np.asarray(_actions(sampling, raw, keys[1], num_steps=num_steps))[fresh])
-    chunks = np.concatenate(actions)
+    chunks = sample(policy, found, num_steps=num_steps)
+    sums = [_loss(policy, raw, fresh, keys[0]) for raw, fresh, keys in _batches(found)]
+    loss, valid = np.array(jax.device_get(sums), np.float64).T.sum(axis=1).tolist()
     compared = chunks, found.still[:, None], found.previous[:, None]
     errors = (_errors(actions, found.raw) for actions in compared)
-    return HeldOut(losses / valid, *errors, actions=chunks, units=found.units)
+    return HeldOut(loss / valid, *errors, actions=chunks, units=found.units)
+
+
+def sample(policy: Policy, found: Windows, *, num_steps: int = 10) -> np.ndarray:
+    """Return the chunks `[N, C, J+1]` that `measure` compares; same arguments."""
+    sampling = policy.with_sampler()
+    chunks = [
+        np.asarray(_actions(sampling, raw, keys[1], num_steps=num_steps))[fresh]
+        for raw, fresh, keys in _batches(found)
+    ]
+    return np.concatenate(chunks)
+
+
+def _batches(found: Windows) -> Iterator[tuple[RawBatch, np.ndarray, jax.Array]]:
+    """Yield batches of windows, which of their rows are new, and two keys."""
+    count, key = len(found.task), jax.random.key(0)
+    for first in range(0, count, _BATCH):
+        rows = np.arange(first, first + _BATCH)
+        raw = jax.tree.map(lambda x, rows=rows: x[rows % count], found.raw)  # the last wraps around
+        yield raw, rows < count, jax.random.split(jax.random.fold_in(key, first), 2)
 
 
 @jax.jit

@@ -13,7 +13,7 @@ from lorasp_jax.base.files import join_inside
 from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.data.source import Source
 from lorasp_jax.evaluation.figure_style import COLORS, STYLE
-from lorasp_jax.evaluation.held_out import Windows, measure, windows
+from lorasp_jax.evaluation.held_out import Windows, sample, windows
 from lorasp_jax.policies.policy import Policy
 
 _FRAMES = 5
@@ -36,7 +36,7 @@ def write(
     for task, number in first.items():
         every = max(policy.model.config.chunk // 2, 1)
         found = windows(source, [number], policy, every=every)
-        figure = draw(found, measure(policy, found, num_steps=num_steps).actions)
+        figure = draw(found, sample(policy, found, num_steps=num_steps))
         paths.append(path(folder, task))
         with atomic_file(paths[-1]) as unfinished:
             figure.savefig(unfinished, format="png", dpi=100)

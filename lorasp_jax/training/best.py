@@ -12,6 +12,7 @@ from lorasp_jax.base.files import as_value_error
 from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training import records
+from lorasp_jax.training.checkpoint import by_path
 from lorasp_jax.training.run_folder import read_json, write_json
 
 BEST, WEIGHTS = "best.json", "best.safetensors"
@@ -25,7 +26,7 @@ def error(folder: Path) -> float:
 
 def save(folder: Path, policy: Policy, step: int, error: float) -> None:
     """Replace the best parameters; a crash meanwhile leaves the earlier ones or none."""
-    leaves = _leaves(policy)
+    leaves = by_path(adaptation.split(policy.model)[1])
     (folder / BEST).unlink(missing_ok=True)
     with atomic_file(folder / WEIGHTS) as unfinished:
         save_file(leaves, unfinished)
@@ -44,14 +45,7 @@ def load(folder: Path, policy: Policy) -> tuple[int, Policy]:
         if not best or digest(leaves) != best["weights"]:
             raise ValueError(f"it does not match {BEST}")
     graphdef, adapters, frozen = adaptation.split(policy.model)
-    placed = [
-        jax.device_put(leaves[jax.tree_util.keystr(path)], leaf.sharding)
-        for path, leaf in jax.tree_util.tree_leaves_with_path(adapters)
-    ]
+    old = by_path(adapters)
+    placed = [jax.device_put(leaves[path], leaf.sharding) for path, leaf in old.items()]
     adapters = jax.tree.unflatten(jax.tree.structure(adapters), placed)
     return best["step"], Policy(nnx.merge(graphdef, adapters, frozen), policy.processor)
-
-
-def _leaves(policy: Policy) -> dict[str, jax.Array]:
-    leaves = jax.tree_util.tree_leaves_with_path(adaptation.split(policy.model)[1])
-    return {jax.tree_util.keystr(path): leaf for path, leaf in leaves}

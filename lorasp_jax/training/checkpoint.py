@@ -47,7 +47,7 @@ class Checkpoints:
         Raises:
             ValueError: this or the previous checkpoint could not be written.
         """
-        step, leaves = int(state.step), _by_path(state)
+        step, leaves = int(state.step), by_path(state)
         if self._manager.latest_step() == step:
             return
         meta = {"base_hash": self._base_hash, "digest": digest(leaves, self._base_hash)}
@@ -75,7 +75,7 @@ class Checkpoints:
         for step in sorted(self._manager.all_steps(), reverse=True):
             leaves, reason = {}, ""
             try:
-                leaves = self._read(step, _by_path(like))
+                leaves = self._read(step, by_path(like))
             except _CorruptError as error:
                 reason = str(error)
             if processes.any_process(bool(reason)):
@@ -183,7 +183,7 @@ class _CorruptError(Exception):
     """A checkpoint is corrupt; the message states the symptom."""
 
 
-def _by_path(tree: Any) -> dict[str, jax.Array]:
+def by_path(tree: Any) -> dict[str, jax.Array]:
     """Flatten a tree to a dict from path to leaf, so that files do not depend on node types."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path): leaf for path, leaf in leaves}

@@ -33,7 +33,7 @@ def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
     cache_folder = folder / CACHE
     path = cache_folder if cache_folder.exists() else config.data.source
     source = open_source(path, Keys(image_size=model.image_size), config.data.cameras)
-    if abs(source.control_dt / config.control_dt - 1) > _DT_TOLERANCE:
+    if not has_period(source, config.control_dt):
         raise ValueError(
             f"{path} has a control period of {source.control_dt:.4g} s, but this run has "
             f"--control-dt {config.control_dt:g}: pass --control-dt {source.control_dt:.4g}, or "
@@ -67,6 +67,11 @@ def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
             "python -m lorasp_jax.data convert --state-numbers and --action-numbers"
         ) from error
     return source
+
+
+def has_period(source: Source, control_dt: float) -> bool:
+    """Whether the time between two actions is `control_dt` [s]."""
+    return abs(source.control_dt / control_dt - 1) <= _DT_TOLERANCE
 
 
 def as_cache(source: Source, folder: Path, progress: Progress) -> Cache:

@@ -142,11 +142,14 @@ def _require(found: loading.ModelFolder, where: str, given: Unsaid) -> None:
 
     Its conversions to PyTorch record sizes and chunk.
     """
-    says_sizes = loading.HORIZON in found.fields
-    config: Any = sized("pi0", given.size) if given.size else found.config if says_sizes else None
+    config: Any = None
+    if given.size:
+        config = sized("pi0", given.size)
+    elif found.records_lengths:
+        config = found.config
     missing = {
         "--size": config is None,
-        "--chunk": not given.chunk and not says_sizes,
+        "--chunk": not given.chunk and not found.records_lengths,
         "--relative": given.relative is None,
         "--prompt-state": config is not None and config.pi05 and given.prompt_state is None,
     }

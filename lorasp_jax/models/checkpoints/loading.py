@@ -24,8 +24,6 @@ _PARTS = (SINGLE, INDEX, hugging_face.TENSORS, f"params/{published.METADATA}")
 _UNFINISHED = "orbax-checkpoint-tmp"  # in the name of a folder that Orbax is writing
 
 Layout = Literal["ours", "openpi", "lerobot"]
-HORIZON = "action_horizon"
-"""The chunk length in config.json of openpi's PyTorch conversions."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,9 +48,14 @@ class ModelFolder:
     @property
     def is_openpi(self) -> bool:
         """Whether the files have weights and say little else, as openpi's and conversions do."""
-        has_weights = any(path.exists() for path in weight_files(self.folder))
         untyped = self.layout == "lerobot" and "type" not in self.fields
-        return self.layout == "openpi" or (untyped and (has_weights or HORIZON in self.fields))
+        says_little = self.records_lengths or _has_weights(self.folder)
+        return self.layout == "openpi" or (untyped and says_little)
+
+    @property
+    def records_lengths(self) -> bool:
+        """Whether config.json is that of openpi's PyTorch conversion, with sizes and chunk."""
+        return pi0_files.is_conversion(self.fields)
 
     @property
     def robot_cameras(self) -> dict[str, str]:

@@ -58,6 +58,16 @@ def checkpoint(folder, stats):
     return folder
 
 
+def conversion(folder, *, chunk, tensor):
+    """Make a folder look like openpi's PyTorch conversion, with one tensor."""
+    checkpoint(folder, {"libero": LIBERO})
+    (folder / "params" / "_METADATA").unlink()
+    fields = {"action_dim": 32, "action_horizon": chunk, "paligemma_variant": "gemma_2b"}
+    (folder / "config.json").write_text(json.dumps(fields))
+    save_file({tensor: np.zeros(1)}, folder / "model.safetensors")
+    return folder
+
+
 @pytest.fixture
 def echo(monkeypatch):
     monkeypatch.setattr(checkpoints.ModelFolder, "load", lambda _, config=None: Echo(config))
@@ -187,11 +197,7 @@ def test_a_default_prompt_and_the_pose_to_start_from_are_served(tmp_path, echo):
 
 def test_a_conversion_to_pytorch_says_its_sizes_only(tmp_path, echo):
     """openpi's conversion writes sizes, without a policy type (case of a config.json)."""
-    folder = checkpoint(tmp_path / "torch", {"libero": LIBERO})
-    (folder / "params" / "_METADATA").unlink()
-    fields = {"action_dim": 32, "action_horizon": 10, "paligemma_variant": "gemma_2b"}
-    (folder / "config.json").write_text(json.dumps(fields))
-    save_file({"action_in_proj.bias": np.zeros(1)}, folder / "model.safetensors")
+    folder = conversion(tmp_path / "torch", chunk=10, tensor="action_in_proj.bias")
     with pytest.raises(ValueError, match=r"else --relative$"):
         loading.load_checkpoint(str(folder), tokenizer=WORDS)
     loaded = loading.load_checkpoint(str(folder), tokenizer=WORDS, relative=())["base"].policy
@@ -203,11 +209,7 @@ def test_a_conversion_to_pytorch_says_its_sizes_only(tmp_path, echo):
 
 def test_a_recorded_chunk_wins_over_the_folders_name(tmp_path, echo):
     """pi05_libero has 10; this one was trained with 30."""
-    folder = checkpoint(tmp_path / "pi05_libero", {"libero": LIBERO})
-    (folder / "params" / "_METADATA").unlink()
-    fields = {"action_dim": 32, "action_horizon": 30, "paligemma_variant": "gemma_2b"}
-    (folder / "config.json").write_text(json.dumps(fields))
-    save_file({"time_mlp_in.weight": np.zeros(1)}, folder / "model.safetensors")
+    folder = conversion(tmp_path / "pi05_libero", chunk=30, tensor="time_mlp_in.weight")
     loaded = loading.load_checkpoint(str(folder), tokenizer=WORDS)["base"].policy
     assert loaded.model.config.chunk == 30
     assert checkpoints.find(folder).config.chunk == 30
