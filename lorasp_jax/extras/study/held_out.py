@@ -6,6 +6,8 @@ import json
 from contextlib import nullcontext
 from pathlib import Path
 
+import numpy as np
+
 from lorasp_jax.base.locks import locked
 from lorasp_jax.config import Config, DataConfig
 from lorasp_jax.training.demonstrations import Demonstrations, Progress, demonstrations, map_threads
@@ -18,15 +20,23 @@ SEED = 2**32 - 1
 
 
 def shared_demonstrations(
-    study_folder: Path, config: Config, _folder: Path, progress: Progress
+    study_folder: Path, pool: int, config: Config, _folder: Path, progress: Progress
 ) -> Demonstrations:
     """Load the demonstrations that cells with the same robot, scene and data settings share.
 
     They do not depend on the seed, and a task has the same ones whatever tasks it is trained with.
-    The first cell that needs them collects them.
+    The first cell that needs them collects them. With a `pool`, that many are collected, and each
+    seed takes its own at random.
     """
-    shared = dataclasses.replace(config, seed=0)
-    return _shared(study_folder / "demonstrations", shared, progress)
+    count = config.data.episodes
+    shared = dataclasses.replace(
+        config, seed=0, data=dataclasses.replace(config.data, episodes=pool or count)
+    )
+    found = _shared(study_folder / "demonstrations", shared, progress)
+    if not pool:
+        return found
+    own = np.sort(np.random.default_rng(config.seed).permutation(pool)[:count])
+    return {task: episodes.select(own) for task, episodes in found.items()}
 
 
 def held_out_demonstrations(study_folder: Path, config: Config) -> Demonstrations:
@@ -42,13 +52,14 @@ def settings(config: Config) -> Config:
     """
     if config.seed == SEED:
         raise ValueError(f"seed {SEED} is reserved for held-out episodes")
-    kept = {name: getattr(config.data, name) for name in ("num_envs", "action_noise")}
-    data = DataConfig(episodes=EPISODES, **kept)
+    data = dataclasses.replace(config.data, episodes=EPISODES)
     return dataclasses.replace(config, data=data, seed=SEED)
 
 
 def _shared(root: Path, config: Config, progress: Progress = lambda *_: None) -> Demonstrations:
     """Load each task's episodes from a folder named after the settings, or collect them there."""
+    kept = {name: getattr(config.data, name) for name in ("episodes", "num_envs", "action_noise")}
+    config = dataclasses.replace(config, data=DataConfig(**kept))
     settings = {
         "robot": config.robot,
         "data": to_json(config)["data"],

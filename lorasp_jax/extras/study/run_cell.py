@@ -26,6 +26,9 @@ WIDTH = 120
 _source = functools.lru_cache(maxsize=1)(load_policy)
 """The policy that the last derived cell started from; most start from the same one."""
 
+_programs: dict[Any, Any] = {}
+"""Traced training programs of this process, which the cells of a group share."""
+
 
 def run_cell(job: Job) -> dict[str, Any]:
     """Run a cell and return what cell.json records about it, except the settings.
@@ -46,10 +49,11 @@ def _train(job: Job) -> dict[str, Any]:
     assert isinstance(job.cell, Cell)
     _source.cache_clear()
     console, started = Console(width=WIDTH), time.perf_counter()
-    collect = functools.partial(shared_demonstrations, job.study_folder)
+    collect = functools.partial(shared_demonstrations, job.study_folder, job.cell.pool)
     callbacks = [Export()] if job.cell.evaluate else [Export(), Evaluation(media=False)]
     with open_run(job.config, job.folder.parent, resume="auto"):
         run = setup.prepare(job.config, job.folder, console, started, collect=collect)
+        run.programs = _programs
         loop.train(run, callbacks, resume=True)
         return _finish(job, run, None)
 

@@ -47,6 +47,8 @@ class Cell:
         measured: whether to call the study's `measure`.
         evaluate: evaluates the trained policy; by default, in simulation.
         source: name of a cell whose folder the run needs, such as one whose base it starts from.
+        pool: demonstrations per task of which each seed takes its own `data.episodes` at random; 0:
+            all seeds train on the same ones.
     """
 
     name: str
@@ -56,6 +58,7 @@ class Cell:
     measured: bool = True
     evaluate: Evaluate | None = None
     source: str = ""
+    pool: int = 0
 
     @property
     def needs(self) -> tuple[str, ...]:

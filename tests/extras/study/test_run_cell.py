@@ -13,6 +13,7 @@ from rich.console import Console
 
 from envs.datasets.episodes import Episodes
 from envs.scene.ranges import Randomization
+from lorasp_jax.config import AugmentConfig
 from lorasp_jax.extras.study import held_out, results, run_cell
 from lorasp_jax.extras.study.held_out import EPISODES, SEED
 from lorasp_jax.extras.study.runner import Job
@@ -48,7 +49,7 @@ def collected(monkeypatch):
 
 def load(folder, **changes):
     config = dataclasses.replace(CONFIG, **changes)
-    return held_out.shared_demonstrations(folder, config, folder, lambda *_: None)
+    return held_out.shared_demonstrations(folder, 0, config, folder, lambda *_: None)
 
 
 def test_cells_share_demonstrations(tmp_path, collected):
@@ -109,6 +110,31 @@ def test_other_settings_need_other_demonstrations(tmp_path, collected, changes):
 def test_the_folder_of_demonstrations_keeps_its_name(tmp_path, collected):
     load(tmp_path, tasks=("press",))
     assert [path.name for path in (tmp_path / "demonstrations").iterdir()] == ["piper_caef2654"]
+
+
+def test_each_seed_takes_its_own_demonstrations_from_a_pool(tmp_path, monkeypatch):
+    settings = []
+
+    def demonstrations(config, *_):
+        settings.append((config.seed, config.data.episodes, config.data.augment.preset))
+        return {task: random_episodes(task, 0) for task in config.tasks}
+
+    monkeypatch.setattr(held_out, "demonstrations", demonstrations)
+
+    def taken(count, seed, preset="none"):
+        data = dataclasses.replace(CONFIG.data, episodes=count, augment=AugmentConfig(preset))
+        config = dataclasses.replace(CONFIG, data=data, seed=seed, tasks=("press", "pour"))
+        found = held_out.shared_demonstrations(tmp_path, 3, config, tmp_path, lambda *_: None)
+        return {task: episodes.state[:, 0].tolist() for task, episodes in found.items()}
+
+    pool, two = taken(3, 0), taken(2, 0)
+    for task, states in two.items():
+        assert len(states) == 2
+        assert all(state in pool[task] for state in states)
+    assert all(state in two["press"] for state in taken(1, 0, "openpi")["press"])
+    assert two == taken(2, 0)
+    assert any(taken(1, seed) != taken(1, 0) for seed in range(1, 9))
+    assert {*settings} == {(0, 3, "auto")}  # collected alike, whatever the cell
 
 
 def test_cells_at_the_same_time_collect_once(tmp_path, collected):

@@ -1,0 +1,1 @@
+"""How many demonstrations does a policy need, and which method makes the most of them?"""

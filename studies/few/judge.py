@@ -1,0 +1,66 @@
+"""Success of a policy as recorded, and in a scene that was shifted."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import envs
+from envs import Env, Randomization
+from envs.physics import physics
+from lorasp_jax.evaluation.programs import Rollout, make_rollout
+from lorasp_jax.evaluation.results import evaluate
+from lorasp_jax.training.demonstrations import map_threads
+from lorasp_jax.training.random_streams import RandomStream
+from lorasp_jax.training.run import Run
+from studies.few.page import SCENES
+
+SHIFT = Randomization(
+    camera_position=(-0.01, 0.01),
+    camera_turn=(-0.035, 0.035),
+    light_turn=(-0.5, 0.5),
+    brightness=(0.7, 1.2),
+    colour=(-0.1, 0.1),
+    table_height=(-0.01, 0.01),
+)
+"""What every episode of the shifted scene draws: cameras moved by up to 1 cm and turned by up to
+2 degrees, other light and colors, another height of the table."""
+DISTRACTORS = 2
+"""Unrelated objects on the table of the shifted scene."""
+
+
+def judge(run: Run) -> dict[str, Any]:
+    """Return the outcomes of the policy by scene and task, such as "shifted/pour".
+
+    Both scenes have layouts that no demonstration has; policies of one seed share them.
+    """
+    policy = run.policy.with_sampler()
+    settings = run.config.evaluation
+
+    def one(case: tuple[str, str]) -> str:
+        scene, task = case
+        env, rollout = _rollout(
+            scene, task, run.config.robot, settings.worlds, run.config.image_size
+        )
+        key = RandomStream.FINAL_EVALUATION.key(run.config.seed, task)
+        result = evaluate(policy, env, key, settings.episodes, rollout=rollout)
+        return "".join("01"[succeeded] for succeeded in result.outcomes)
+
+    cases = [(scene, task) for scene in SCENES for task in run.config.tasks]
+    # Warp is not thread-safe.
+    run_all = map if physics.default_backend() == "warp" else map_threads
+    found = run_all(one, cases)
+    trainable, total = run.parameters
+    return {
+        "outcomes": dict(zip(map("/".join, cases), found, strict=True)),
+        "trainable_parameters": trainable,
+        "total_parameters": total,
+    }
+
+
+@functools.cache
+def _rollout(
+    scene: str, task: str, robot: str, worlds: int, size: int
+) -> tuple[Env, Callable[..., Rollout]]:
+    distractors, ranges = (DISTRACTORS, SHIFT) if scene == "shifted" else (0, None)
+    env = envs.make(task, robot=robot, num_envs=worlds, image_size=size, distractors=distractors)
+    return env, make_rollout(env, ranges=ranges)

@@ -1,0 +1,140 @@
+"""The tables of README.md, from the results of all policies alone."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from lorasp_jax.extras.study import Study, page, statistics
+from lorasp_jax.extras.study.statistics import Estimate
+from lorasp_jax.extras.study.study import Results
+from studies.few import figure
+
+BACKBONES = {"pi0": "π0"}
+LABELS = {
+    "lora_r16": "LoRA, r = 16",
+    "lora_r64": "LoRA, r = 64",
+    "lora_sp": "LoRA-SP, R = 64",
+    "vlm_lora": "LoRA on the VLM, full expert",
+    "full": "full fine-tuning",
+}
+AUGMENT = {"none": "no", "openpi": "openpi's"}
+"""Preset of augmentation -> its label."""
+COUNTS = (10, 25, 50, 120, 512)
+STEPS, OTHER_STEPS = 2000, (500, 8000)
+STEPPED, STEPPED_COUNTS = "lora_r64", (10, 50, 512)
+"""Method and numbers of demonstrations that train for other numbers of steps, too."""
+SEEDS = (0, 1, 2)
+SCENES = {"recorded": "as recorded", "shifted": "shifted"}
+DRAWS = 2_000
+"""Resamplings of policies for the interval of a correlation."""
+
+
+def cell(backbone: str, method: str, kind: str, count: int, seed: int) -> str:
+    """Return the name of a policy; `kind` is a preset of augmentation or the number of steps."""
+    return f"{backbone}/{method}/{kind}/n{count}/s{seed}"
+
+
+def success(result: Mapping[str, Any], scene: str = "recorded") -> float:
+    """Return the success rate of a policy over all tasks of a scene."""
+    return float(_outcomes([result], scene).mean())
+
+
+def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
+    """Write the figure into `folder`; return the tables."""
+    points = {
+        (backbone, scene, kind): {
+            method: [_estimate(results, backbone, method, kind, n, scene) for n in COUNTS]
+            for method in LABELS
+        }
+        for backbone in BACKBONES
+        for scene in SCENES
+        for kind in AUGMENT
+    }
+    figure.write(folder / "success.svg", points)
+    made = {}
+    for backbone in BACKBONES:
+        for scene in SCENES:
+            made[f"{backbone} {scene}"] = _success_table(points, backbone, scene)
+        made[f"{backbone} steps"] = _steps_table(results, backbone)
+        made[f"{backbone} error"] = _error_table(results, backbone)
+    return made
+
+
+def _success_table(points: Mapping[Any, Any], backbone: str, scene: str) -> str:
+    head = [f"{BACKBONES[backbone]}, {SCENES[scene]} [%]", "augmentation"]
+    head += [f"N = {n}" for n in COUNTS]
+    rows = [
+        [LABELS[method], AUGMENT[kind], *map(page.percent, points[backbone, scene, kind][method])]
+        for method in LABELS
+        for kind in AUGMENT
+    ]
+    return page.table(head, rows)
+
+
+def _steps_table(results: Results, backbone: str) -> str:
+    """Return success and held-out error of `STEPPED` by number of steps."""
+    kinds = {OTHER_STEPS[0]: "", STEPS: "none", OTHER_STEPS[1]: ""}
+    rows = []
+    for n in STEPPED_COUNTS:
+        cells = []
+        for steps, kind in kinds.items():
+            at = backbone, STEPPED, kind or f"steps{steps}", n
+            errors = [results[cell(*at, seed)]["action_error"] for seed in SEEDS]
+            shown = page.percent(_estimate(results, *at, "recorded"))
+            cells.append(f"{shown}; {np.mean(errors):.3f}")
+        rows.append([f"{n}", *cells])
+    head = [f"{BACKBONES[backbone]}, N", *(f"{steps:,} steps" for steps in kinds)]
+    return page.table(head, rows)
+
+
+def _error_table(results: Results, backbone: str) -> str:
+    """Return how well measures of held-out demonstrations rank policies by success."""
+    rows = []
+    names = {
+        n: [cell(backbone, m, a, n, s) for m in LABELS for a in AUGMENT for s in SEEDS]
+        for n in COUNTS
+    }
+    everything = [name for group in names.values() for name in group]
+    for label, group in ({f"N = {n}": g for n, g in names.items()} | {"all": everything}).items():
+        found = [results[name] for name in group]
+        row = [label]
+        for scene in SCENES:
+            rates = [success(result, scene) for result in found]
+            for measure in ("action_error", "loss"):
+                row.append(_correlation([result[measure] for result in found], rates))
+        rows.append(row)
+    pairs = [f"{m}, {label}" for label in SCENES.values() for m in ("action error", "loss")]
+    return page.table([f"{BACKBONES[backbone]}, policies", *pairs], rows)
+
+
+def _correlation(errors: Sequence[float], rates: Sequence[float]) -> str:
+    """Return Spearman's correlation with its interval from a bootstrap over policies."""
+    pairs = np.array([errors, rates])
+    # The raw stream of PCG64 is one that NumPy promises not to change.
+    raw = np.random.PCG64(0).random_raw(DRAWS * len(errors)) % np.uint64(len(errors))
+    chosen = raw.astype(np.int64).reshape(DRAWS, -1)
+    drawn = [stats.spearmanr(*pairs[:, rows]).statistic for rows in chosen]
+    low, high = np.nanquantile(drawn, [0.025, 0.975])
+    value, low, high = (
+        page.signed(float(x), 2) for x in (stats.spearmanr(*pairs).statistic, low, high)
+    )
+    return f"{value} [{low}, {high}]"
+
+
+def _estimate(
+    results: Results, backbone: str, method: str, kind: str, count: int, scene: str
+) -> Estimate:
+    found = [results[cell(backbone, method, kind, count, seed)] for seed in SEEDS]
+    return statistics.success(_outcomes(found, scene))
+
+
+def _outcomes(found: Iterable[Mapping[str, Any]], scene: str) -> np.ndarray:
+    """Stack the episodes of some policies in a scene, bool `[S, T, N]`."""
+    texts = [
+        {case: text for case, text in result["outcomes"].items() if case.startswith(f"{scene}/")}
+        for result in found
+    ]
+    return statistics.outcomes([[{"outcomes": text}] for text in texts])
