@@ -12,7 +12,7 @@ from lorasp_jax.extras.study.statistics import Estimate
 from lorasp_jax.extras.study.study import Results
 from studies.few import figure
 
-BACKBONES = {"pi0": "π0"}
+BACKBONES = {"pi0": "π0", "smolvla": "SmolVLA"}
 LABELS = {
     "lora_r16": "LoRA, r = 16",
     "lora_r64": "LoRA, r = 64",
@@ -115,12 +115,12 @@ def _correlation(errors: Sequence[float], rates: Sequence[float]) -> str:
     pairs = np.array([errors, rates])
     # The raw stream of PCG64 is one that NumPy promises not to change.
     raw = np.random.PCG64(0).random_raw(DRAWS * len(errors)) % np.uint64(len(errors))
-    chosen = raw.astype(np.int64).reshape(DRAWS, -1)
-    drawn = [stats.spearmanr(*pairs[:, rows]).statistic for rows in chosen]
-    low, high = np.nanquantile(drawn, [0.025, 0.975])
-    value, low, high = (
-        page.signed(float(x), 2) for x in (stats.spearmanr(*pairs).statistic, low, high)
-    )
+    chosen = [np.arange(len(errors)), *raw.astype(np.int64).reshape(DRAWS, -1)]
+    ranks = stats.rankdata(pairs[:, np.array(chosen)], axis=-1)
+    ranks -= ranks.mean(-1, keepdims=True)
+    products = (ranks[0] * ranks[1]).sum(-1) / np.sqrt((ranks**2).sum(-1).prod(0))
+    low, high = np.nanquantile(products[1:], [0.025, 0.975])
+    value, low, high = (page.signed(float(x), 2) for x in (products[0], low, high))
     return f"{value} [{low}, {high}]"
 
 

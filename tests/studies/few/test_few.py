@@ -1,0 +1,84 @@
+"""The study of few demonstrations: its cells, and what its page makes of results."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from lorasp_jax.config import Config
+from lorasp_jax.extras.study import statistics
+from lorasp_jax.peft import FullFineTuning
+from studies.few import measure, page, study
+from tests.runs import random_episodes
+
+STUDY = study.get_study("accelerator")
+
+
+@pytest.fixture(scope="module")
+def results():
+    """Results in which success rises with N, the action error ranks policies, and the loss not."""
+    rng, found = np.random.default_rng(0), {}
+    for cell in STUDY.cells:
+        config = cell.config if isinstance(cell.config, Config) else cell.config(found)
+        rate = min(0.9, 0.1 + 0.13 * np.log(config.data.episodes))
+        rate -= 0.5 * (config.optim.learning_rate == 1e-3) + 0.03 * (config.seed % 3)
+        outcomes = {
+            f"{scene}/{task}": "1" * round(40 * share * rate)
+            + "0" * (40 - round(40 * share * rate))
+            for scene, share in (("recorded", 1.0), ("shifted", 0.5))
+            for task in config.tasks
+        }
+        measures = {"action_error": 1 - rate, "loss": rng.normal(), "config": config}
+        found[cell.name] = {"outcomes": outcomes, **measures}
+    return found
+
+
+def test_policies_differ_in_what_their_names_say(results):
+    for cell in STUDY.cells:
+        config = results[cell.name]["config"]
+        assert cell.pool == 512
+        if "/pilot/" in cell.name:
+            continue
+        backbone, method, kind, count, seed = cell.name.split("/")
+        assert config.model.backbone == backbone
+        assert f"n{config.data.episodes}" == count
+        assert f"s{config.seed}" == seed
+        assert config.data.augment.preset == (kind if kind in page.AUGMENT else "none")
+        assert f"steps{config.optim.steps}" == (kind if kind.startswith("steps") else "steps2000")
+        assert isinstance(config.peft, FullFineTuning) == (method == "full")
+        assert bool(config.adapt) == (method == "vlm_lora")
+        assert config.optim.learning_rate == 3e-4  # the better one of the pilots
+
+
+def test_page(results, tmp_path, monkeypatch):
+    monkeypatch.setattr(statistics, "DRAWS", 100)
+    monkeypatch.setattr(page, "DRAWS", 100)
+    statistics._counts.cache_clear()
+    made = page.blocks(STUDY, results, tmp_path)
+    made = {name: table.replace("\u00a0", " ") for name, table in made.items()}
+    assert (tmp_path / "success.svg").read_text().count("LoRA-SP, R = 64") >= 1
+    line = next(x for x in made["pi0 recorded"].splitlines() if x.startswith("| LoRA, r = 16 | no"))
+    rates = [float(cell.split()[0]) for cell in line.split("|")[3:-1]]
+    expected = [100 * min(0.9, 0.1 + 0.13 * np.log(n)) - 3 for n in page.COUNTS]
+    assert rates == pytest.approx(expected, abs=1.3)
+    everything = made["smolvla error"].splitlines()[-1].split("|")[2:-1]
+    error, loss = (float(cell.split()[0].replace("−", "-")) for cell in everything[:2])
+    assert error < -0.99 < -0.5 < loss
+
+
+def test_correlation_is_spearmans():
+    rng = np.random.default_rng(1)
+    errors = rng.integers(0, 8, 30) / 8.0  # with ties
+    rates = rng.normal(size=30) - errors
+    value = page._correlation(errors, rates).replace("−", "-").split()[0]
+    assert float(value) == pytest.approx(stats.spearmanr(errors, rates).statistic, abs=0.005)
+
+
+def test_demonstrations_are_measured_as_a_dataset():
+    groups = {task: random_episodes(task, seed) for seed, task in enumerate(("press", "pour"))}
+    source = measure._Source(groups)
+    assert len(source) == 6
+    for number, (group, row) in enumerate((g, r) for g in groups.values() for r in range(3)):
+        episode = source.episode(number)
+        assert episode.task == group.task
+        np.testing.assert_array_equal(episode.state[0], group.state[row])
+    assert source.control_dt == 0.1
