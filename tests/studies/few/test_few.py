@@ -69,7 +69,7 @@ def test_correlation_is_spearmans():
     rng = np.random.default_rng(1)
     errors = rng.integers(0, 8, 30) / 8.0  # with ties
     rates = rng.normal(size=30) - errors
-    value = page._correlation(errors, rates).replace("−", "-").split()[0]
+    value = page._correlation(errors.tolist(), rates.tolist()).replace("−", "-").split()[0]
     assert float(value) == pytest.approx(stats.spearmanr(errors, rates).statistic, abs=0.005)
 
 
