@@ -63,9 +63,13 @@ class ModelConfig:
     """Quantize the matrices of the three towers: 8 bits per weight (float8, int8) or 4.5 (nf4). On
     NVIDIA GPUs since Ada and Hopper, large matrix products are then in float8 too. Empty: keep
     them in param_dtype."""
-    relative_actions: bool = False
-    """Learn joint targets relative to the state at the start of the chunk, as openpi does for
-    pi0."""
+    openpi_config: str = ""
+    """Training config of an openpi checkpoint, such as pi05_libero, whose chunk, relative actions,
+    prompts and units are then kept; none: those of the size; empty: the config that the folder is
+    named after."""
+    relative_actions: bool | None = None
+    """Learn joint targets relative to the state at the start of the chunk, but for grippers; None:
+    as the base was trained, if it says so."""
     remat: Literal["auto", "none", "products", "narrow", "full"] = "auto"
     """Rematerialization: the backward pass recomputes nothing (none), everything except matrix
     products (products) or narrow ones (narrow), or the whole layer (full); auto: the first that

@@ -115,7 +115,7 @@ def add_keys(parser: argparse.ArgumentParser) -> None:
     text = "dimensions to use, by name or index: joints first, gripper last (default: all)"
     add("--state-numbers", nargs="+", default=(), metavar="NAME", help=text)
     add("--action-numbers", nargs="+", default=(), metavar="NAME", help=text)
-    text = "gripper openings among the dimensions in use (default: the last one)"
+    text = "gripper openings among the dimensions in use (default: those so named, or the last)"
     add("--grippers", nargs="+", default=(), metavar="NAME", help=text)
     text = "cameras to use, with names of your choice (default: all)"
     add("--cameras", nargs="+", default=(), metavar="NAME=FEATURE", type=_camera, help=text)

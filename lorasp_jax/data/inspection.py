@@ -21,7 +21,6 @@ from envs.rendering.video import side_by_side
 from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.config import AugmentConfig
 from lorasp_jax.data.augmentation import Augment, on_wrist, recipe
-from lorasp_jax.data.lerobot import LeRobot
 from lorasp_jax.data.source import Source, describe_left_out
 from lorasp_jax.data.video import downscale
 
@@ -66,7 +65,7 @@ def summarize(source: Source) -> Summary:
         state=np.concatenate([np.asarray(e.state[0]) for e in episodes]),
         action=np.concatenate([np.asarray(e.action[0]) for e in episodes]),
         length=np.array([e.num_steps for e in episodes]),
-        names=source.names if isinstance(source, LeRobot) else _names(episodes[0]),
+        names=getattr(source, "names", {}) or _names(episodes[0]),
         phrases=dict(phrases.most_common()),
         robot=episodes[0].robot,
         tasks=tuple(dict.fromkeys(e.task for e in episodes)),

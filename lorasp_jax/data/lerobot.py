@@ -56,6 +56,7 @@ class LeRobot:
         control_dt: time between two steps [s].
         names: "state" and "action" -> names of the selected dimensions, in order; their indices if
             the dataset has no names.
+        grippers: "state" and "action" -> which of these are grippers.
     """
 
     def __init__(
@@ -90,7 +91,9 @@ class LeRobot:
         self._columns: dict[str, list[int]] = {}
         self.names: dict[str, list[str]] = {}
         self._select_dimensions()
-        self._grippers = {kind: self._select_grippers(kind) for kind in self.names}
+        self.grippers: dict[str, list[int]] = {
+            kind: self._select_grippers(kind) for kind in self.names
+        }
         images = [key for key in self.cameras.values() if not self._is_video(key)]
         needed = (self.keys.state, self.keys.action, *_COLUMNS, *images)
         self._needed = list(dict.fromkeys(needed))  # state and action may be the same feature
@@ -189,7 +192,7 @@ class LeRobot:
     def _select_grippers(self, kind: str) -> list[int]:
         """Return which of the selected dimensions of state or action are grippers."""
         if not self.keys.grippers:
-            return [len(self.names[kind]) - 1]
+            return lerobot_features.grippers(self.names[kind])
         what = f"{self.path}: the selected {kind}"
         return lerobot_features.select(self.names[kind], self.keys.grippers, what)
 
@@ -225,7 +228,7 @@ class LeRobot:
                 values = lerobot_features.rows(table[key], self._sizes[kind])[:, columns]
             except ValueError as error:
                 raise ValueError(f"{key} of episode {entry.number}: {error}") from error
-        is_gripper = np.isin(np.arange(len(columns)), self._grippers[kind])
+        is_gripper = np.isin(np.arange(len(columns)), self.grippers[kind])
         angle = np.deg2rad(1) if self.keys.angles == "degrees" else 1
         length = 1e-3 if self.keys.gripper == "millimetres" else 1
         values = values * np.where(is_gripper, length, angle)
