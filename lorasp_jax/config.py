@@ -174,7 +174,8 @@ class DataConfig:
     hf://owner/name), RLDS, or a cache (python -m lorasp_jax.data convert). Empty: collect
     demonstrations with the scripted expert."""
     cameras: tuple[str, ...] = ()
-    """Cameras of the dataset to use, in the order of the backbone's; empty: all, by name."""
+    """Cameras of the dataset to use, in the order of the backbone's; the last part of a dotted
+    name is enough. Empty: all, by name."""
     episodes: int = 512
     """Successful demonstrations per task."""
     num_envs: int = 256
@@ -287,7 +288,8 @@ class EvaluationConfig:
     before: bool = True
     """Evaluate the base before training."""
     validate_every: int = 500
-    """Steps between measurements on held-out episodes, rounded up to the next log step."""
+    """Steps between measurements on held-out episodes, rounded up to a multiple of log_every. Each
+    is on up to 256 windows, or 64 unless the scale is accelerator."""
     every: int = 0
     """Steps between evaluations during training, rounded up to the next log step; each runs
     num_envs episodes per task. 0: do not evaluate during training."""

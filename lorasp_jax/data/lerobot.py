@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from envs.datasets.episodes import Episodes, check_camera, choose_cameras
+from envs.datasets.episodes import Episodes, check_camera, choose_cameras, full_name
 from lorasp_jax.base import hub
 from lorasp_jax.base.files import (
     RefusedError,
@@ -146,9 +146,10 @@ class LeRobot:
         """Return `cameras` and `left_out`."""
         with as_value_error(self._info):
             pictures, reasons = lerobot_features.pictures(self.index.features)
-        selected = dict(self.keys.cameras) or pictures
+        given = {n: full_name(key, pictures.values()) for n, key in self.keys.cameras.items()}
+        selected = given or pictures
         known = [key for key in pictures.values() if key not in reasons]
-        if wrong := [key for key in self.keys.cameras.values() if key not in known]:
+        if wrong := [key for key in given.values() if key not in known]:
             why = f", it is marked as {reasons[wrong[0]]}" if wrong[0] in reasons else ""
             raise ValueError(
                 f"{self.path} has no color camera {wrong[0]}{why}: choose from {', '.join(known)}"

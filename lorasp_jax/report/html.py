@@ -74,7 +74,7 @@ def write_report(folder: Path) -> Path:
         *_training(rows),
         *_held_out(folder, rows),
         *_rules(results),
-        *_active_rank(results, rows, folder, config),
+        *_active_rank(results, rows, config),
         *_media(folder, [t for t in results["tasks"] if finished or _video(folder, t).exists()]),
         "<h2>Time</h2>",
         _table(
@@ -150,6 +150,9 @@ def _held_out(folder: Path, rows: figures.Rows) -> Iterable[str]:
         header = (f"mean error at step {found['kept']}", *found["columns"])
         errors = found["errors"].items()
         yield _table(header, ((k, *(f"{x:.2f}" for x in v)) for k, v in errors))
+        if len(phrases := found.get("instructions", {})) > 1:  # the worst ones, see `held_out`
+            header = ("instruction, mean error [std]", "policy", "hold still", "repeat previous")
+            yield _table(header, ((k, *(f"{x:.3f}" for x in v)) for k, v in phrases.items()))
     for picture in sorted(folder.glob("held_out_*.png")):
         data = base64.b64encode(read_bytes(picture, folder)).decode()
         yield f'<img alt="recorded and predicted joints" src="data:image/png;base64,{data}">'
@@ -253,21 +256,21 @@ def _rule_cells(row: dict[str, Any]) -> tuple[str, ...]:
     return f"{row['layers']:,}", f"{row['parameters']:,}", rank
 
 
-def _largest_rank(folder: Path, config: dict[str, Any]) -> int:
+def _largest_rank(config: dict[str, Any]) -> int:
     """Return the largest rank of the run's methods."""
     if "adapt" not in config:
-        return read_json(folder / CONFIG_FILE, records.WITH_RANK)["peft"]["rank"]
+        return config["peft"]["rank"]
     named = presets.parse(config["adapt"], recorded_method(config["peft"]))
     return max(getattr(method, "rank", 0) for _, method in named.values())
 
 
 def _active_rank(
-    results: dict[str, Any], rows: figures.Rows, folder: Path, config: dict[str, Any]
+    results: dict[str, Any], rows: figures.Rows, config: dict[str, Any]
 ) -> Iterable[str]:
     """Show active rank in training and in closed loop, if a method has one."""
     if not _has_rank(rows):
         return
-    rank = _largest_rank(folder, config)
+    rank = _largest_rank(config)
     yield "<h2>Active rank</h2>"
     yield _image(figures.active_rank(rows, rank))
     if not results["layer_active_rank"]:  # not evaluated

@@ -29,16 +29,16 @@ VALIDATION: Schema = {
     "columns": [str],
     "errors": {str: [float]},
     "horizon": [float],
+    "instructions?": {str: [float]},
 }
 STOPPED: Schema = {"reason": str}
 CONFIG: Schema = {
     "name": str,
     "scale": str,
     "robot": str,
-    "peft": {"method": str},
+    "peft": {"method": str, "rank?": int},
     "model": {"backbone": str, "size": str},
     "optim": {"steps": int},
     "scene?": {str: (float, float)},
     "adapt?": [str],
 }
-WITH_RANK: Schema = CONFIG | {"peft": {"method": str, "rank": int}}

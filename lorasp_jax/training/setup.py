@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import TaskID
 
 import envs
-from envs.datasets.episodes import Episodes
+from envs.datasets.episodes import Episodes, full_name
 from envs.env import Env
 from lorasp_jax import peft
 from lorasp_jax.adapters import adaptation, paths, summary
@@ -326,7 +326,8 @@ def processor(
     statistics = Statistics.measure(
         state, action, valid, slots=slots, dim=dim, action_slots=action_slots
     )
-    ordered = cameras or sorted(episodes[0].image)
+    images = episodes[0].image
+    ordered = [full_name(name, images) for name in cameras] or sorted(images)
     return Processor.of(
         model_config,
         statistics,
