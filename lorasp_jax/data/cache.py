@@ -290,8 +290,8 @@ class Cache:
             if not np.isfinite(self._columns[name]).all():
                 raise ValueError(f"{name} has values that are not finite")
             count = self._columns[name].shape[-1]
-            named = len(self.names.get(name, "x" * count)) == count
-            if not named or not {*self.grippers.get(name, [])} <= {*range(count)}:
+            named = len(self.names[name]) if self.names else count
+            if named != count or not {*self.grippers.get(name, [])} <= {*range(count)}:
                 raise ValueError(f"names and grippers of {name} must be those of {count} numbers")
         self.episode(0, ()).validate_numbers()
 

@@ -10,7 +10,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from lorasp_jax.base.files import join_inside, read_bytes
+from lorasp_jax.base.files import as_value_error, join_inside, read_bytes
+from lorasp_jax.base.json_values import check
 from lorasp_jax.base.writing import write_text
 from lorasp_jax.models import presets
 from lorasp_jax.report import figures
@@ -74,7 +75,7 @@ def write_report(folder: Path) -> Path:
         *_training(rows),
         *_held_out(folder, rows),
         *_rules(results),
-        *_active_rank(results, rows, config),
+        *_active_rank(results, rows, folder, config),
         *_media(folder, [t for t in results["tasks"] if finished or _video(folder, t).exists()]),
         "<h2>Time</h2>",
         _table(
@@ -256,21 +257,23 @@ def _rule_cells(row: dict[str, Any]) -> tuple[str, ...]:
     return f"{row['layers']:,}", f"{row['parameters']:,}", rank
 
 
-def _largest_rank(config: dict[str, Any]) -> int:
+def _largest_rank(folder: Path, config: dict[str, Any]) -> int:
     """Return the largest rank of the run's methods."""
     if "adapt" not in config:
+        with as_value_error(folder / CONFIG_FILE):
+            check(config, records.WITH_RANK)
         return config["peft"]["rank"]
     named = presets.parse(config["adapt"], recorded_method(config["peft"]))
     return max(getattr(method, "rank", 0) for _, method in named.values())
 
 
 def _active_rank(
-    results: dict[str, Any], rows: figures.Rows, config: dict[str, Any]
+    results: dict[str, Any], rows: figures.Rows, folder: Path, config: dict[str, Any]
 ) -> Iterable[str]:
     """Show active rank in training and in closed loop, if a method has one."""
     if not _has_rank(rows):
         return
-    rank = _largest_rank(config)
+    rank = _largest_rank(folder, config)
     yield "<h2>Active rank</h2>"
     yield _image(figures.active_rank(rows, rank))
     if not results["layer_active_rank"]:  # not evaluated

@@ -36,9 +36,10 @@ CONFIG: Schema = {
     "name": str,
     "scale": str,
     "robot": str,
-    "peft": {"method": str, "rank?": int},
+    "peft": {"method": str},
     "model": {"backbone": str, "size": str},
     "optim": {"steps": int},
     "scene?": {str: (float, float)},
     "adapt?": [str],
 }
+WITH_RANK: Schema = CONFIG | {"peft": {"method": str, "rank": int}}
