@@ -44,13 +44,19 @@ from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
 from lorasp_jax.training.step import init_state, train_step
 
-CAMERAS = {"pi0": 3, "smolvla": 2}
+CAMERAS = {"pi05": 3, "pi0": 3, "smolvla": 2}
 STEPS = 10
+
+
+def of_size(name: str, size: str) -> BackboneConfig:
+    """Return the config of a size of a backbone in `CAMERAS`."""
+    family, suffix = ("pi0", "_pi05") if name == "pi05" else (name, "")
+    return getattr(backbone.find(family), size + suffix)()
 
 
 def sized(name: str, options: argparse.Namespace, remat: Remat = "none") -> BackboneConfig:
     """Return the backbone's config of the chosen size, with parameters in the compute dtype."""
-    config = getattr(backbone.find(name), options.size)()
+    config = of_size(name, options.size)
     return dataclasses.replace(
         config,
         cameras=config.cameras[: CAMERAS[name]],
@@ -239,7 +245,7 @@ def main() -> None:
     """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--backbones", nargs="+", default=list(CAMERAS))
-    parser.add_argument("--size", default="base", help="nano, small or base")
+    parser.add_argument("--size", default="base", help="nano, small (not pi05) or base")
     parser.add_argument("--batch", type=int, default=32)
     parser.add_argument(
         "--sampled", type=int, nargs="+", default=[1, 8], help="batch sizes for sampling"

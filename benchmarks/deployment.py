@@ -41,13 +41,12 @@ import ml_dtypes
 import numpy as np
 from flax import nnx
 
-from benchmarks.backbones import CAMERAS, noise, run_config
+from benchmarks.backbones import CAMERAS, noise, of_size, run_config
 from benchmarks.measuring import best, machine
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.layers import prepared
 from lorasp_jax.dense import AdaptedLayer, AdapterParam
 from lorasp_jax.extras.serving.exported import sampling_options
-from lorasp_jax.models import backbone
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.sampling import Sampler
@@ -93,7 +92,7 @@ def cases(backbones: Sequence[str]) -> tuple[list[Case], list[Case]]:
 
 def sized(name: str, options: argparse.Namespace) -> BackboneConfig:
     """Return the backbone's config of the chosen size, with parameters in the compute dtype."""
-    config = getattr(backbone.find(name), options.size)()
+    config = of_size(name, options.size)
     cameras = config.cameras[: options.cameras or CAMERAS[name]]
     dtypes = {"dtype": options.dtype, "param_dtype": options.dtype}
     return dataclasses.replace(config, cameras=cameras, remat="none", **dtypes)
@@ -228,7 +227,7 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark from the command line; return the exit code."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--backbones", nargs="+", default=list(CAMERAS), choices=list(CAMERAS))
+    parser.add_argument("--backbones", nargs="+", default=["pi0", "smolvla"], choices=list(CAMERAS))
     parser.add_argument("--size", default="base", help="dummy, nano, small or base")
     parser.add_argument("--rank", type=int, default=128)
     parser.add_argument("--dtype", default="bfloat16", choices=["bfloat16", "float32"])

@@ -3,13 +3,11 @@
     python train.py --config configs/multitask_pi0.py
     python train.py --config configs/multitask_pi0.py --model.checkpoint FOLDER \\
         --model.tokenizer FILE
-    python train.py --config configs/multitask_pi0.py --model.size base_pi05 \\
-        --model.checkpoint gs://openpi-assets/checkpoints/pi05_base
 
-The last command adapts pi0.5. Weights and tokenizer are downloaded from public buckets unless you
-pass your own; weights may be in openpi's or LeRobot's layout. Needs a GPU with 24 GB, and there
-XLA_PYTHON_CLIENT_MEM_FRACTION=0.95 in the environment; with more memory it recomputes less and
-trains faster. `--fsdp N` shards the base over N devices. The third of pi0's camera slots is masked.
+Weights and tokenizer are downloaded from public buckets unless you pass your own; weights may be in
+openpi's or LeRobot's layout. Needs a GPU with 24 GB, and there XLA_PYTHON_CLIENT_MEM_FRACTION=0.95
+in the environment; with more memory it recomputes less and trains faster. `--fsdp N` shards the
+base over N devices. The third of pi0's camera slots is masked.
 """
 
 from lorasp_jax.config import Config, DataConfig, EvaluationConfig, ModelConfig, OptimConfig

@@ -63,9 +63,13 @@ class ModelConfig:
     """Quantize the matrices of the three towers: 8 bits per weight (float8, int8) or 4.5 (nf4). On
     NVIDIA GPUs since Ada and Hopper, large matrix products are then in float8 too. Empty: keep
     them in param_dtype."""
-    relative_actions: bool = False
-    """Learn joint targets relative to the state at the start of the chunk, as openpi does for
-    pi0."""
+    openpi_config: str = ""
+    """Training config of an openpi checkpoint, such as pi05_libero, whose chunk, relative actions,
+    prompts and units are then kept; none: those of the size; empty: the config that the folder is
+    named after."""
+    relative_actions: bool | None = None
+    """Learn joint targets relative to the state at the start of the chunk, but for grippers; None:
+    as the base was trained, if it says so."""
     remat: Literal["auto", "none", "products", "narrow", "full"] = "auto"
     """Rematerialization: the backward pass recomputes nothing (none), everything except matrix
     products (products) or narrow ones (narrow), or the whole layer (full); auto: the first that
@@ -170,7 +174,8 @@ class DataConfig:
     hf://owner/name), RLDS, or a cache (python -m lorasp_jax.data convert). Empty: collect
     demonstrations with the scripted expert."""
     cameras: tuple[str, ...] = ()
-    """Cameras of the dataset to use, in the order of the backbone's; empty: all, by name."""
+    """Cameras of the dataset to use, in the order of the backbone's; the last part of a dotted
+    name is enough. Empty: all, by name."""
     episodes: int = 512
     """Successful demonstrations per task."""
     num_envs: int = 256
@@ -283,7 +288,8 @@ class EvaluationConfig:
     before: bool = True
     """Evaluate the base before training."""
     validate_every: int = 500
-    """Steps between measurements on held-out episodes, rounded up to the next log step."""
+    """Steps between measurements on held-out episodes, rounded up to a multiple of log_every. Each
+    is on up to 256 windows, or 64 unless the scale is accelerator."""
     every: int = 0
     """Steps between evaluations during training, rounded up to the next log step; each runs
     num_envs episodes per task. 0: do not evaluate during training."""

@@ -201,6 +201,13 @@ def check_camera(name: str) -> None:
         raise ValueError(f"camera name {name[:80]!r} must have letters, digits, - _ . and spaces")
 
 
+def full_name(name: str, names: Iterable[str]) -> str:
+    """Return the one of `names` that ends in the dotted `name`, or it in them; else `name`."""
+    names = [*names]
+    alike = [x for x in names if f".{x}".endswith(f".{name}") or f".{name}".endswith(f".{x}")]
+    return alike[0] if len(alike) == 1 and name not in names else name
+
+
 def choose_cameras(
     available: Mapping[str, T],
     chosen: Sequence[str],
@@ -211,7 +218,7 @@ def choose_cameras(
 
     Args:
         available: camera -> anything.
-        chosen: names of the cameras to use; empty: all.
+        chosen: names of the cameras to use, see `full_name`; empty: all.
         path: the dataset.
         others: picture -> why it is not available.
 
@@ -221,6 +228,7 @@ def choose_cameras(
     Raises:
         ValueError: a camera is unknown or chosen twice, or there is none.
     """
+    chosen = [full_name(name, available) for name in chosen]
     left = "".join(f"; {name} is left out ({reason})" for name, reason in others.items())
     if not available:
         raise ValueError(f"{path} has no color camera{left}")

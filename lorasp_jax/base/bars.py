@@ -62,14 +62,14 @@ def collecting(progress: Progress, title: str, stop: threading.Event) -> Report:
 
 
 class _Rate(ProgressColumn):
-    """Units per second; empty before the second update."""
+    """The bar's field `rate`, or else units per second; empty before the second update."""
 
     def __init__(self, unit: str, per_step: int) -> None:
         super().__init__()
         self._unit, self._per_step = unit, per_step
 
     def render(self, task: Task) -> Text:
-        if not (speed := task.finished_speed or task.speed):
+        measured = (task.finished_speed or task.speed or 0) * self._per_step
+        if not (rate := task.fields.get("rate", measured)):
             return Text("")
-        rate = speed * self._per_step
         return Text(f"{rate:,.3g} {self._unit}/s" if rate < 100 else f"{rate:,.0f} {self._unit}/s")

@@ -115,10 +115,11 @@ def add_keys(parser: argparse.ArgumentParser) -> None:
     text = "dimensions to use, by name or index: joints first, gripper last (default: all)"
     add("--state-numbers", nargs="+", default=(), metavar="NAME", help=text)
     add("--action-numbers", nargs="+", default=(), metavar="NAME", help=text)
-    text = "gripper openings among the dimensions in use (default: the last one)"
+    text = "gripper openings among the dimensions in use (default: those so named, or the last)"
     add("--grippers", nargs="+", default=(), metavar="NAME", help=text)
-    text = "cameras to use, with names of your choice (default: all)"
-    add("--cameras", nargs="+", default=(), metavar="NAME=FEATURE", type=_camera, help=text)
+    text = "cameras to use, also by the last part of their names, and names of your choice for "
+    text += "them (default: all)"
+    add("--cameras", nargs="+", default=(), metavar="[NAME=]FEATURE", type=_camera, help=text)
     text = f"unit of the joints {default}"
     add("--angles", choices=("radians", "degrees"), default=Keys.angles, help=text)
     text = f"unit of the gripper opening {default}"
@@ -142,11 +143,11 @@ def keys_of(options: argparse.Namespace) -> Keys:
 
 
 def _camera(text: str) -> tuple[str, str]:
-    """Parse NAME=FEATURE."""
+    """Parse NAME=FEATURE, or FEATURE, whose name is its last part."""
     name, equals, feature = text.partition("=")
-    if not (name and equals and feature):
-        raise argparse.ArgumentTypeError(f"must be NAME=FEATURE, got {text}")
-    return name, feature
+    if not name or (equals and not feature):
+        raise argparse.ArgumentTypeError(f"must be FEATURE or NAME=FEATURE, got {text}")
+    return (name, feature) if equals else (text.rpartition(".")[2], text)
 
 
 @contextmanager

@@ -31,7 +31,7 @@ from lorasp_jax.base.locks import locked
 from lorasp_jax.base.writing import atomic_folder
 from lorasp_jax.data.batches import Steps
 from lorasp_jax.data.cache_writer import Column, map_column
-from lorasp_jax.data.source import Progress, Source
+from lorasp_jax.data.source import Progress, Source, dimension_names, grippers
 
 FORMAT = "lorasp-cache-2"
 HEADER = "cache.json"
@@ -49,6 +49,8 @@ _HEADER_TYPES: dict[str, Any] = {
     "instructions": [str],
     "cameras": {str: (int, int)},
     "crc32": {str: int},
+    "names?": {"state": [str], "action": [str]},
+    "grippers?": {"state": [int], "action": [int]},
 }
 
 
@@ -68,13 +70,14 @@ def write(sources: Sequence[Source], path: str | os.PathLike[str], progress: Pro
     total = sum(source.num_steps for source in sources)
     with locked(Path(path)):
         shared = _metadata(sources[0].episode(0)) if sources[1:] else {}
+        dimensions = _dimensions(sources)
         for source in sources[1:]:  # fail now, not after hours of reading images
             _check_compatible(shared, source.episode(0))
         for source in sources:  # the copy's checksums would declare damaged images valid
             if isinstance(source, Cache):
                 source.verify_images()
         with atomic_folder(path) as folder, ThreadPoolExecutor(1) as reader:
-            writer = _Writer(folder)
+            writer = _Writer(folder, dimensions)
             for episode in _prefetch(sources, reader):
                 writer.append(episode)
                 progress(writer.num_steps, total)
@@ -97,8 +100,8 @@ def _prefetch(sources: Sequence[Source], reader: ThreadPoolExecutor) -> Iterator
 class _Writer:
     """Writes a cache episode by episode into an existing folder."""
 
-    def __init__(self, folder: Path) -> None:
-        self.num_steps = 0
+    def __init__(self, folder: Path, dimensions: dict[str, Any]) -> None:
+        self.num_steps, self._dimensions = 0, dimensions
         self._folder, self._metadata = folder, {}
         self._tasks: list[str] = []
         self._instructions: list[str] = []
@@ -110,7 +113,7 @@ class _Writer:
             raise ValueError("there are no episodes to write")
         for column in self._columns.values():
             column.complete()
-        header = {"format": FORMAT, **self._metadata, "steps": self.num_steps}
+        header = {"format": FORMAT, **self._metadata, **self._dimensions, "steps": self.num_steps}
         header |= {"tasks": self._tasks, "instructions": self._instructions}
         header["crc32"] = {name: column.crc32 for name, column in self._columns.items()}
         (self._folder / HEADER).write_text(json.dumps(with_digest(header), indent=1))
@@ -156,6 +159,23 @@ def _check_compatible(shared: dict[str, Any], episode: Episodes) -> None:
             )
 
 
+def _dimensions(sources: Sequence[Source]) -> dict[str, Any]:
+    """Return the grippers of all sources, and the names of dimensions if they are the same.
+
+    Raises:
+        ValueError: the sources have different grippers.
+    """
+    found = [{kind: grippers(s, kind) for kind in ("state", "action")} for s in sources]
+    if wrong := [other for other in found if other != found[0]]:
+        raise ValueError(
+            f"all episodes of a cache must have the same grippers, got dimensions {found[0]} in "
+            f"the first dataset and {wrong[0]} in another"
+        )
+    names = [dimension_names(source) for source in sources]
+    same = any(names) and names == names[:1] * len(names)
+    return {"grippers": found[0], **({"names": names[0]} if same else {})} if found else {}
+
+
 def _metadata(episode: Episodes) -> dict[str, Any]:
     """Return the metadata that all episodes of a cache must share."""
     metadata = {name: getattr(episode, name) for name in METADATA}
@@ -173,6 +193,7 @@ class Cache:
         metadata: content of cache.json, including robot, tasks, instructions and control_dt.
         cameras: name -> height and width.
         left_out: camera -> why it is not among the cameras.
+        names, grippers: as in `LeRobot`; empty if the cache does not say.
     """
 
     kind = "cache"
@@ -200,6 +221,8 @@ class Cache:
             del self.metadata["crc32"][_IMAGE + name]
         self.control_dt: float = self.metadata["control_dt"]
         self.num_steps: int = self.metadata["steps"]
+        self.names: dict[str, list[str]] = self.metadata.get("names", {})
+        self.grippers: dict[str, list[int]] = self.metadata.get("grippers", {})
         self.instructions: tuple[str, ...] = tuple(self.metadata["instructions"])
         self._images: dict[str, Any] = {
             name: self._map(_IMAGE + name, (self.num_steps, *size, 3))
@@ -266,6 +289,10 @@ class Cache:
         for name in ("state", "action"):
             if not np.isfinite(self._columns[name]).all():
                 raise ValueError(f"{name} has values that are not finite")
+            count = self._columns[name].shape[-1]
+            named = len(self.names[name]) if self.names else count
+            if named != count or not {*self.grippers.get(name, [])} <= {*range(count)}:
+                raise ValueError(f"names and grippers of {name} must be those of {count} numbers")
         self.episode(0, ()).validate_numbers()
 
     def _map(self, name: str, shape: tuple[int, ...] | None = None) -> np.ndarray:

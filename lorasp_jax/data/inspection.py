@@ -6,6 +6,7 @@ import functools
 import hashlib
 import math
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 import jax
@@ -21,9 +22,10 @@ from envs.rendering.video import side_by_side
 from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.config import AugmentConfig
 from lorasp_jax.data.augmentation import Augment, on_wrist, recipe
-from lorasp_jax.data.lerobot import LeRobot
 from lorasp_jax.data.source import Source, describe_left_out
 from lorasp_jax.data.video import downscale
+from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.policies.offline_tokenizer import num_tokens
 
 EPISODES, FRAMES, TILE, LINE = 6, 5, 128, 14
 """Contact sheet: episodes, time steps per episode, longer image side [px], caption height [px]."""
@@ -66,7 +68,7 @@ def summarize(source: Source) -> Summary:
         state=np.concatenate([np.asarray(e.state[0]) for e in episodes]),
         action=np.concatenate([np.asarray(e.action[0]) for e in episodes]),
         length=np.array([e.num_steps for e in episodes]),
-        names=source.names if isinstance(source, LeRobot) else _names(episodes[0]),
+        names=getattr(source, "names", {}) or _names(episodes[0]),
         phrases=dict(phrases.most_common()),
         robot=episodes[0].robot,
         tasks=tuple(dict.fromkeys(e.task for e in episodes)),
@@ -108,7 +110,7 @@ def report(source: Source, console: Console) -> None:
     if len(summary.phrases) > _MAX_INSTRUCTIONS:
         console.print(f"         and {len(summary.phrases) - _MAX_INSTRUCTIONS} more")
     console.print(_value_table(summary))
-    for hint in hints(summary):
+    for hint in [*hints(summary), *prompt_hints(summary.phrases)]:
         console.print(hint, style="yellow", soft_wrap=True, highlight=False, markup=False)
 
 
@@ -128,6 +130,18 @@ def hints(summary: Summary) -> list[str]:
             f"the gripper opens to {gripper:.4g} m; if that is in mm, add --gripper millimetres"
         )
     return texts
+
+
+def prompt_hints(phrases: Iterable[str]) -> list[str]:
+    """Return a hint if instructions are longer than prompts of the bundled bases."""
+    kept, lengths = Pi0Config.nano().max_tokens, {text: num_tokens(text) for text in phrases}
+    longest = max(lengths, key=lambda text: lengths[text])
+    if lengths[longest] <= kept:
+        return []
+    return [
+        f"{longest!r} has {lengths[longest]} tokens, but the nano and small sizes keep {kept}: "
+        f"train them with --model.max-tokens {lengths[longest]}"
+    ]
 
 
 def _value_table(summary: Summary) -> Table:

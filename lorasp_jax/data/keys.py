@@ -18,8 +18,8 @@ class Keys:
         action: feature with the commanded joints and gripper.
         state_numbers: names or indices of the state dimensions to use, in order; all if empty.
         action_numbers: the same for the action.
-        grippers: names or indices of the gripper openings among the state dimensions in use; the
-            last one if empty. Two arms have two.
+        grippers: names or indices of the gripper openings among the dimensions in use, of which two
+            arms have two; if empty, those with "gripper" in their names, or else the last one.
         cameras: camera -> feature; if empty, all image features, named without the prefix
             "observation.images.".
         angles: unit of the joints.

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from envs.datasets.episodes import Episodes, check_camera, choose_cameras
+from envs.datasets.episodes import Episodes, check_camera, choose_cameras, full_name
 from lorasp_jax.base import hub
 from lorasp_jax.base.files import (
     RefusedError,
@@ -56,6 +56,7 @@ class LeRobot:
         control_dt: time between two steps [s].
         names: "state" and "action" -> names of the selected dimensions, in order; their indices if
             the dataset has no names.
+        grippers: "state" and "action" -> which of these are grippers.
     """
 
     def __init__(
@@ -90,7 +91,9 @@ class LeRobot:
         self._columns: dict[str, list[int]] = {}
         self.names: dict[str, list[str]] = {}
         self._select_dimensions()
-        self._grippers = {kind: self._select_grippers(kind) for kind in self.names}
+        self.grippers: dict[str, list[int]] = {
+            kind: self._select_grippers(kind) for kind in self.names
+        }
         images = [key for key in self.cameras.values() if not self._is_video(key)]
         needed = (self.keys.state, self.keys.action, *_COLUMNS, *images)
         self._needed = list(dict.fromkeys(needed))  # state and action may be the same feature
@@ -143,9 +146,10 @@ class LeRobot:
         """Return `cameras` and `left_out`."""
         with as_value_error(self._info):
             pictures, reasons = lerobot_features.pictures(self.index.features)
-        selected = dict(self.keys.cameras) or pictures
+        given = {n: full_name(key, pictures.values()) for n, key in self.keys.cameras.items()}
+        selected = given or pictures
         known = [key for key in pictures.values() if key not in reasons]
-        if wrong := [key for key in self.keys.cameras.values() if key not in known]:
+        if wrong := [key for key in given.values() if key not in known]:
             why = f", it is marked as {reasons[wrong[0]]}" if wrong[0] in reasons else ""
             raise ValueError(
                 f"{self.path} has no color camera {wrong[0]}{why}: choose from {', '.join(known)}"
@@ -189,7 +193,7 @@ class LeRobot:
     def _select_grippers(self, kind: str) -> list[int]:
         """Return which of the selected dimensions of state or action are grippers."""
         if not self.keys.grippers:
-            return [len(self.names[kind]) - 1]
+            return lerobot_features.grippers(self.names[kind])
         what = f"{self.path}: the selected {kind}"
         return lerobot_features.select(self.names[kind], self.keys.grippers, what)
 
@@ -225,7 +229,7 @@ class LeRobot:
                 values = lerobot_features.rows(table[key], self._sizes[kind])[:, columns]
             except ValueError as error:
                 raise ValueError(f"{key} of episode {entry.number}: {error}") from error
-        is_gripper = np.isin(np.arange(len(columns)), self._grippers[kind])
+        is_gripper = np.isin(np.arange(len(columns)), self.grippers[kind])
         angle = np.deg2rad(1) if self.keys.angles == "degrees" else 1
         length = 1e-3 if self.keys.gripper == "millimetres" else 1
         values = values * np.where(is_gripper, length, angle)

@@ -88,6 +88,14 @@ def _flat(names: Any) -> list[str]:
     return [f"{group}.{name}" for group, part in groups.items() for name in part]
 
 
+def grippers(names: Sequence[str]) -> list[int]:
+    """Return the dimensions named after a gripper, as in LeRobot 0.6, or else the last one.
+
+    (processor/relative_action_processor.py)
+    """
+    return [i for i, name in enumerate(names) if "gripper" in name.lower()] or [len(names) - 1]
+
+
 def select(names: Sequence[str], wanted: Sequence[str], what: str) -> list[int]:
     """Return the indices of dimensions given by name or index; all if `wanted` is empty.
 

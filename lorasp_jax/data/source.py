@@ -46,6 +46,22 @@ class Source(Protocol):
         ...
 
 
+def dimension_names(source: Source) -> dict[str, list[str]]:
+    """Return the names of the dimensions of "state" and "action", as the recordings have them.
+
+    Empty if they have none.
+    """
+    names: dict[str, list[str]] = getattr(source, "names", {})
+    named = not all(name.isdecimal() for row in names.values() for name in row)
+    return names if named else {}
+
+
+def grippers(source: Source, kind: str = "action") -> list[int]:
+    """Return which dimensions of states or actions are grippers: the last, if nothing says so."""
+    known: dict[str, list[int]] = getattr(source, "grippers", {})
+    return known.get(kind) or [getattr(source.episode(0, ()), kind).shape[-1] - 1]
+
+
 def describe_left_out(source: Source) -> str:
     """Name the pictures that are not used, on one line; empty if all are."""
     texts = [f"{name} ({reason})" for name, reason in source.left_out.items()]

@@ -10,15 +10,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lorasp_jax.data.batches import RawBatch, encode, flatten, gather
-from lorasp_jax.data.source import Source
+from lorasp_jax.data.batches import Batch, RawBatch, encode, flatten, gather
+from lorasp_jax.data.source import Source, dimension_names, grippers
+from lorasp_jax.models.observation import Observation
 from lorasp_jax.policies.policy import Policy
+from lorasp_jax.policies.processor import Processor
 
-MAX_WINDOWS = 256
-"""Largest number of windows that are measured, over all tasks."""
+MAX_WINDOWS, FEW_WINDOWS = 256, 64
+"""Largest number of windows that are measured, over all tasks; the second while a CPU trains."""
+MAX_INSTRUCTIONS = 8
+"""Largest number of instructions whose errors are shown."""
 Units = list[tuple[str, float]]
 """Name of each dimension of an action with its unit, and the factor to that unit."""
 _BATCH = 16  # windows per call
+_DEGREES, _MILLIMETRES = " [°]", " [mm]"
+_MAX_NAME = 40  # characters of a dimension's name
 _NOISES = 4  # draws of noise and flow time per window, for the loss
 
 
@@ -31,28 +37,46 @@ class Windows:
         still: f32 `[N, J+1]`, the action that holds still: the state, or zeros where actions are
             displacements, which have another length than states.
         previous: f32 `[N, J+1]`, the action before each window; first in an episode: `still`.
-        task: the task of each window.
+        task, phrase: the task of each window, and its instruction.
         episode, step: int `[N]`, where each window starts.
         control_dt: time between two actions [s].
+        names: those that the dataset has for the dimensions of actions; empty: none.
+        grippers: which of these are grippers.
     """
 
     raw: RawBatch
     still: np.ndarray
     previous: np.ndarray
     task: tuple[str, ...]
+    phrase: tuple[str, ...]
     episode: np.ndarray
     step: np.ndarray
     control_dt: float
+    names: tuple[str, ...]
+    grippers: tuple[int, ...]
 
     @property
     def units(self) -> Units:
         """Degrees and mm for joint targets [rad, m]; otherwise the numbers as recorded."""
         actions = np.abs(np.asarray(self.raw.actions)).max((0, 1))
-        joints, gripper = actions[:-1], actions[-1]
-        if self.raw.state.shape[-1] != len(actions) or joints.max() > 2 * np.pi or gripper > 1:
-            return [(f"action {i}", 1.0) for i in range(1, len(actions) + 1)]
-        degrees = [(f"joint {i} [°]", 180 / np.pi) for i in range(1, len(actions))]
-        return [*degrees, ("gripper [mm]", 1000.0)]
+        is_gripper = np.isin(np.arange(len(actions)), self.grippers)
+        limits = np.where(is_gripper, 1.0, 2 * np.pi)
+        if self.raw.state.shape[-1] != len(actions) or (actions > limits).any():
+            titles = self._titles([f"action {i}" for i in range(1, len(actions) + 1)])
+            return [(title, 1.0) for title in titles]
+        joints = iter(f"joint {i}" for i in range(1, len(actions) + 1))
+        titles = self._titles(["gripper" if gripper else next(joints) for gripper in is_gripper])
+        return [
+            (title + _MILLIMETRES, 1000.0) if gripper else (title + _DEGREES, 180 / np.pi)
+            for title, gripper in zip(titles, is_gripper, strict=True)
+        ]
+
+    def _titles(self, default: list[str]) -> list[str]:
+        """Return unique names of the dimensions: the dataset's, or else the default ones."""
+        printed = ["".join(filter(str.isprintable, name))[:_MAX_NAME] for name in self.names]
+        names = printed or default
+        repeated = {name for name in names if names.count(name) > 1}
+        return [f"{name} ({i})" if name in repeated else name for i, name in enumerate(names, 1)]
 
 
 @dataclass(frozen=True)
@@ -83,6 +107,8 @@ class HeldOut:
         hold, repeat: errors of holding still and of repeating the previous action.
         actions: f32 `[N, C, J+1]`, the sampled chunks [rad, m].
         units: those of the table and of what is logged.
+        instructions: instruction -> mean errors of the policy, of holding still and of repeating,
+            as `Errors.mean`; the worst first.
     """
 
     loss: float
@@ -91,37 +117,45 @@ class HeldOut:
     repeat: Errors
     actions: np.ndarray
     units: Units
+    instructions: dict[str, list[float]]
 
     @property
     def scalars(self) -> dict[str, float]:
         """What is logged."""
         errors = {"": self.policy, "hold_still/": self.hold, "repeat/": self.repeat}
         values = {f"validation/{name}action_error": x.mean for name, x in errors.items()}
-        pairs = zip(self.units, self.policy.action, strict=True)
+        titles = (name.removesuffix(_DEGREES).removesuffix(_MILLIMETRES) for name, _ in self.units)
         by_dimension = {
-            f"validation/{name.partition(' [')[0].replace(' ', '_')}": factor * float(x)
-            for (name, factor), x in pairs
+            f"validation/{title.replace(' ', '_')}": factor * float(x)
+            for title, (_, factor), x in zip(titles, self.units, self.policy.action, strict=True)
         }
-        return {"validation/loss": self.loss, **values, **by_dimension}
+        # Last, as a dimension may have any name.
+        return {**by_dimension, "validation/loss": self.loss, **values}
 
 
 def windows(
-    source: Source, episodes: Sequence[int], policy: Policy, *, every: int | None = None
+    source: Source,
+    episodes: Sequence[int],
+    policy: Policy,
+    *,
+    every: int | None = None,
+    limit: int = MAX_WINDOWS,
 ) -> Windows:
     """Choose windows of some episodes: evenly spaced, equally many per episode.
 
     Args:
         source: the dataset.
-        episodes: their numbers; if there are more than `MAX_WINDOWS`, only some are used.
+        episodes: their numbers; if there are more than `limit`, only some are used.
         policy: gives the length of the chunk and the prompts.
         every: take the windows this many steps apart instead.
+        limit: largest number of windows; of an episode, with `every`.
 
     Raises:
         ValueError: the policy has no prompt for an instruction, an episode is damaged, or its
             actions are not what policies give.
     """
-    chunk, chosen = policy.model.config.chunk, _evenly([*episodes], MAX_WINDOWS)
-    share = MAX_WINDOWS // len(chosen)
+    chunk, chosen = policy.model.config.chunk, _evenly([*episodes], limit)
+    share = limit // len(chosen)
     parts, still, previous, where = [], [], [], []
     for number in chosen:
         episode = source.episode(number)
@@ -131,16 +165,27 @@ def windows(
         rows = policy.processor.prompts.rows(episode.instructions)
         steps = dataclasses.replace(steps, instruction=rows[steps.instruction])
         all_starts = [*range(0, len(steps.end), every or 1)]
-        starts = np.array(_evenly(all_starts, MAX_WINDOWS if every else share), np.int32)
+        starts = np.array(_evenly(all_starts, limit if every else share), np.int32)
         parts.append(gather(steps, starts, chunk))
         is_target = steps.state.shape[-1] == steps.action.shape[-1]
         still.append(steps.state[starts] if is_target else 0 * steps.action[starts])
         previous.append(np.where(starts[:, None] > 0, steps.action[starts - 1], still[-1]))
-        where += [(episode.task, number, int(start)) for start in starts]
+        phrase = episode.instructions[int(episode.instruction[0])]
+        where += [(episode.task, phrase, number, int(start)) for start in starts]
     raw = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    task, number, start = zip(*where, strict=True)
-    actions = np.concatenate(still), np.concatenate(previous)
-    return Windows(raw, *actions, task, np.array(number), np.array(start), source.control_dt)
+    task, phrases, number, start = zip(*where, strict=True)
+    return Windows(
+        raw,
+        np.concatenate(still),
+        np.concatenate(previous),
+        task,
+        phrases,
+        np.array(number),
+        np.array(start),
+        source.control_dt,
+        tuple(dimension_names(source).get("action", ())),
+        tuple(grippers(source)),
+    )
 
 
 def _evenly(values: Sequence[int], count: int) -> list[int]:
@@ -157,69 +202,103 @@ def measure(policy: Policy, found: Windows, *, num_steps: int = 10) -> HeldOut:
         found: from `windows`.
         num_steps: Euler steps of the flow-matching sampler.
     """
-    chunks = sample(policy, found, num_steps=num_steps)
-    sums = [_loss(policy, raw, fresh, keys[0]) for raw, fresh, keys in _batches(found)]
+    sampling, chunks, sums = policy.with_sampler(), [], []
+    for batch, state, fresh, keys in _batches(policy, found):
+        sums.append(_loss(policy.model, batch, fresh, keys[0]))
+        actions = _actions(sampling, batch.observation, state, keys[1], num_steps=num_steps)
+        chunks.append(np.asarray(actions)[fresh])
     loss, valid = np.array(jax.device_get(sums), np.float64).T.sum(axis=1).tolist()
-    compared = chunks, found.still[:, None], found.previous[:, None]
-    errors = (_errors(actions, found.raw) for actions in compared)
-    return HeldOut(loss / valid, *errors, actions=chunks, units=found.units)
+    actions = np.concatenate(chunks)
+    compared = actions, found.still[:, None], found.previous[:, None]
+    errors = (_errors(values, found.raw) for values in compared)
+    return HeldOut(
+        loss / valid,
+        *errors,
+        actions=actions,
+        units=found.units,
+        instructions=_by_instruction(compared, found),
+    )
 
 
 def sample(policy: Policy, found: Windows, *, num_steps: int = 10) -> np.ndarray:
     """Return the chunks `[N, C, J+1]` that `measure` compares; same arguments."""
     sampling = policy.with_sampler()
     chunks = [
-        np.asarray(_actions(sampling, raw, keys[1], num_steps=num_steps))[fresh]
-        for raw, fresh, keys in _batches(found)
+        np.asarray(_actions(sampling, b.observation, state, keys[1], num_steps=num_steps))[fresh]
+        for b, state, fresh, keys in _batches(policy, found)
     ]
     return np.concatenate(chunks)
 
 
-def _batches(found: Windows) -> Iterator[tuple[RawBatch, np.ndarray, jax.Array]]:
-    """Yield batches of windows, which of their rows are new, and two keys."""
+def _batches(
+    policy: Policy, found: Windows
+) -> Iterator[tuple[Batch, jax.Array, np.ndarray, jax.Array]]:
+    """Yield batches of windows, their raw states, which of their rows are new, and two keys."""
     count, key = len(found.task), jax.random.key(0)
     for first in range(0, count, _BATCH):
         rows = np.arange(first, first + _BATCH)
         raw = jax.tree.map(lambda x, rows=rows: x[rows % count], found.raw)  # the last wraps around
-        yield raw, rows < count, jax.random.split(jax.random.fold_in(key, first), 2)
+        keys = jax.random.split(jax.random.fold_in(key, first), 2)
+        yield _encode(policy.processor, raw), raw.state, rows < count, keys
+
+
+@jax.jit
+def _encode(processor: Processor, raw: RawBatch) -> Batch:
+    return encode(jax.random.key(0), raw, processor, state_noise=0.0)
 
 
 @jax.jit
 def _loss(
-    policy: Policy, raw: RawBatch, fresh: jax.Array, key: jax.Array
+    model: Any, batch: Batch, fresh: jax.Array, key: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Return the sum of the flow-matching loss over valid elements, and their number."""
-    batch = encode(key, raw, policy.processor, state_noise=0.0)
     mask = batch.action_mask & jnp.asarray(fresh)[:, None, None]
 
     def one(key: jax.Array) -> jax.Array:
         observed, actions = batch.observation, batch.actions
-        loss, _ = policy.model.loss(key, observed, actions, action_mask=batch.action_mask)
+        loss, _ = model.loss(key, observed, actions, action_mask=batch.action_mask)
         return jnp.sum(loss * mask)
 
     return jax.lax.map(one, jax.random.split(key, _NOISES)).sum(), _NOISES * mask.sum()
 
 
 @functools.partial(jax.jit, static_argnames="num_steps")
-def _actions(policy: Policy, raw: RawBatch, key: jax.Array, *, num_steps: int) -> jax.Array:
-    observed: Any = {"image": raw.image, "state": raw.state}
-    observed = jax.tree.map(jnp.asarray, observed)
-    return policy.sample(key, observed, jnp.asarray(raw.instruction), num_steps=num_steps)
+def _actions(
+    policy: Policy, observation: Observation, state: jax.Array, key: jax.Array, *, num_steps: int
+) -> jax.Array:
+    slots = policy.processor.flow_slots
+    chunk = policy.model.sample_actions(key, observation, num_steps=num_steps, slots=slots)
+    return policy.processor.decode(chunk, jnp.asarray(state))
 
 
 def _errors(actions: np.ndarray, raw: RawBatch) -> Errors:
     """Compare actions `[N, C, J+1]` (or broadcast to it) with the recorded ones."""
     inside = np.asarray(raw.inside)[..., None]
-    recorded = np.asarray(raw.actions, np.float64)
-    distance = np.abs(actions - recorded) * inside
-    rows = recorded[np.asarray(raw.inside)]
-    spread = rows.std(0)
-    # What hardly moves must not decide: its standard deviation is the noise of its sensor.
-    spread = np.maximum(spread, max(0.1 * float(np.median(spread)), 1e-6))
+    distance, spread = np.abs(actions - np.asarray(raw.actions, np.float64)) * inside, _spread(raw)
     by_step = distance.sum(0) / np.maximum(inside.sum(0), 1)
     action = distance.sum((0, 1)) / inside.sum()
     horizon, mean = (by_step / spread).mean(-1), float((action / spread).mean())
     return Errors(action, distance[:, 0].mean(0), horizon, mean)
+
+
+def _spread(raw: RawBatch) -> np.ndarray:
+    """Return the standard deviations of the recorded actions, `[J+1]`."""
+    spread = np.asarray(raw.actions, np.float64)[np.asarray(raw.inside)].std(0)
+    # What hardly moves must not decide: its standard deviation is the noise of its sensor.
+    return np.maximum(spread, max(0.1 * float(np.median(spread)), 1e-6))
+
+
+def _by_instruction(compared: Sequence[np.ndarray], found: Windows) -> dict[str, list[float]]:
+    """Return `HeldOut.instructions` of actions `[N, C, J+1]`, the policy's first."""
+    inside = np.asarray(found.raw.inside)[..., None] / _spread(found.raw)
+    recorded = np.asarray(found.raw.actions, np.float64)
+    errors: dict[str, list[float]] = {}
+    for phrase in dict.fromkeys(found.phrase):
+        rows = [i for i, other in enumerate(found.phrase) if other == phrase]
+        valid = np.asarray(found.raw.inside)[rows].sum()
+        distances = (np.abs(np.broadcast_to(x, recorded.shape) - recorded)[rows] for x in compared)
+        errors[phrase] = [float((x * inside[rows]).sum((0, 1)).mean() / valid) for x in distances]
+    return dict(sorted(errors.items(), key=lambda item: -item[1][0])[:MAX_INSTRUCTIONS])
 
 
 COLUMNS = ("first action", "chunk", "hold still", "repeat previous")

@@ -62,7 +62,7 @@ def draw(found: Windows, actions: np.ndarray) -> Figure:
             axes.plot(time, scale * recorded, color=COLORS["before"], lw=2.5)
             axes.plot(time, predicted, color=COLORS["vision"], lw=1)
             axes.plot(time[:1], predicted[:1], ".", color=COLORS["vision"], ms=4)
-        axes.set_title(name, loc="left")
+        axes.set_title(name, loc="left", parse_math=False)
         if number >= count - _COLUMNS:
             axes.set_xlabel("time [s]; each chunk is predicted from the dot where it begins")
     figure.legend(figure.axes[1].lines[:2], ("recorded", "predicted"), loc="upper right", ncols=2)

@@ -1,7 +1,16 @@
 """Measure a run on its held-out episodes while it trains, and keep its best adapters."""
 
 from lorasp_jax.evaluation import held_out_figure
-from lorasp_jax.evaluation.held_out import COLUMNS, HeldOut, Windows, measure, table, windows
+from lorasp_jax.evaluation.held_out import (
+    COLUMNS,
+    FEW_WINDOWS,
+    MAX_WINDOWS,
+    HeldOut,
+    Windows,
+    measure,
+    table,
+    windows,
+)
 from lorasp_jax.training import best
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import VALIDATION, write_json
@@ -51,6 +60,7 @@ class Validation(Callback):
             "columns": [*COLUMNS],
             "errors": table(found),
             "horizon": found.policy.horizon.tolist(),
+            "instructions": found.instructions,
         }
         write_json(run.folder / VALIDATION, content)
         source, steps = run.recordings, run.config.evaluation.denoise_steps
@@ -61,6 +71,7 @@ class Validation(Callback):
         with run.timed("validate"):
             if self._windows is None:
                 assert run.recordings is not None  # episodes are held out of a dataset
-                self._windows = windows(run.recordings, run.held_out, run.policy)
+                limit = MAX_WINDOWS if run.config.scale == "accelerator" else FEW_WINDOWS
+                self._windows = windows(run.recordings, run.held_out, run.policy, limit=limit)
             steps = run.config.evaluation.denoise_steps
             return measure(run.policy, self._windows, num_steps=steps)

@@ -13,7 +13,8 @@ import numpy as np
 NUMBERS = 14
 """Length of states and actions."""
 _SIGNS = np.array([1, -1, -1, 1, 1, 1, 1] * 2, np.float32)
-_GRIPPERS = np.array([6, 13])
+GRIPPERS = 6, 13
+"""Dimensions that are grippers."""
 _LINEAR = 0.01844, 0.05800  # position of a closed and an open gripper [m]
 _HORN, _ARM = 0.022, 0.036  # lengths in the gripper's linkage [m]
 _PI0 = 0.5476, 1.6296  # angles that pi0 has as 0 and 1 [rad]
@@ -24,11 +25,11 @@ def state_to_pi0(state: jax.Array) -> jax.Array:
     """Convert measured states `[..., 14]`."""
     state = jnp.asarray(state) * _SIGNS
     low, high = _LINEAR
-    position = state[..., _GRIPPERS] * (high - low) + low
+    position = state[..., GRIPPERS] * (high - low) + low
     sine = (_HORN**2 + position**2 - _ARM**2) / (2 * _HORN * position)
     closed, opened = _PI0
     angle = (jnp.arcsin(jnp.clip(sine, -1, 1)) - closed) / (opened - closed)
-    return state.at[..., _GRIPPERS].set(angle)
+    return state.at[..., GRIPPERS].set(angle)
 
 
 def actions_from_pi0(actions: jax.Array) -> jax.Array:
@@ -37,10 +38,10 @@ def actions_from_pi0(actions: jax.Array) -> jax.Array:
     A predicted gripper is shifted, not scaled, as in openpi.
     """
     actions, (low, high) = jnp.asarray(actions) * _SIGNS, _COMMANDED
-    return actions.at[..., _GRIPPERS].set((actions[..., _GRIPPERS] + _PI0[0] - low) / (high - low))
+    return actions.at[..., GRIPPERS].set((actions[..., GRIPPERS] + _PI0[0] - low) / (high - low))
 
 
 def actions_to_pi0(actions: jax.Array) -> jax.Array:
     """Invert `actions_from_pi0`."""
     actions, (low, high) = jnp.asarray(actions) * _SIGNS, _COMMANDED
-    return actions.at[..., _GRIPPERS].set(actions[..., _GRIPPERS] * (high - low) + low - _PI0[0])
+    return actions.at[..., GRIPPERS].set(actions[..., GRIPPERS] * (high - low) + low - _PI0[0])

@@ -50,6 +50,11 @@ def _tokenizer() -> tokenizers.Tokenizer:
     return tokenizer
 
 
+def num_tokens(text: str) -> int:
+    """Return the number of tokens of an instruction."""
+    return len(_tokenizer().encode(text).ids)
+
+
 class Offline:
     """The offline tokenizer; see `tokenizer.Tokenizer`."""
 

@@ -85,6 +85,18 @@ def check_delta(mask: Sequence[bool], state_length: int, action_length: int) -> 
         )
 
 
+def known_state(state: jax.Array, inputs: InputConfig) -> jax.Array:
+    """Return raw states `[..., J+1]` in the joint space that the weights know."""
+    return aloha.state_to_pi0(state) if inputs.aloha else state
+
+
+def known_actions(actions: jax.Array, state: Any, inputs: InputConfig) -> jax.Array:
+    """Return raw actions `[..., C, n]` in that space, those of `inputs.delta` as relative."""
+    if inputs.aloha:
+        actions = aloha.actions_to_pi0(actions)
+    return to_delta(actions, known_state(state, inputs), inputs.delta) if inputs.delta else actions
+
+
 def _offset(actions: jax.Array, state: jax.Array, mask: Sequence[bool]) -> jax.Array:
     """Return the state f32 where the mask is True, else zero, as long as actions, `[..., 1, n]`."""
     offset = jnp.where(np.array(mask, bool), state[..., : len(mask)], 0).astype(jnp.float32)
@@ -214,7 +226,7 @@ class Processor:
 
         `[..., J+1]` [rad, m] -> `[..., A]`.
         """
-        return self._to_slots("state", self.state_slots, self._known_state(state))
+        return self._to_slots("state", self.state_slots, known_state(state, self.inputs))
 
     def normalize_actions(self, actions: jax.Array, state: jax.Array | None = None) -> jax.Array:
         """Normalize actions and put them into the backbone's slots.
@@ -226,11 +238,10 @@ class Processor:
         Returns:
             `[..., C, A]`.
         """
-        if self.inputs.aloha:
-            actions = aloha.actions_to_pi0(actions)
         if self.inputs.delta:
-            actions = to_delta(actions, self._known_state(state), self.inputs.delta)
-        return self._to_slots("action", self.action_slots, actions)
+            self._require(state)
+        known = known_actions(actions, state, self.inputs)
+        return self._to_slots("action", self.action_slots, known)
 
     def decode(self, actions: jax.Array, state: jax.Array | None = None) -> jax.Array:
         """Invert `normalize_actions`: `[..., C, A]` -> `[..., C, J+1]` f32 [rad, m]."""
@@ -238,14 +249,14 @@ class Processor:
         stats = {name: array[slots] for name, array in self.statistics.action.items()}
         actions = unnormalize(actions[..., slots], stats, inputs.action, inputs.convention)
         if inputs.delta:
-            actions = to_absolute(actions, self._known_state(state), inputs.delta)
+            actions = to_absolute(actions, known_state(self._require(state), inputs), inputs.delta)
         return aloha.actions_from_pi0(actions) if inputs.aloha else actions
 
-    def _known_state(self, state: jax.Array | None) -> jax.Array:
-        """Return the raw state in the joint space that the weights know."""
+    def _require(self, state: jax.Array | None) -> jax.Array:
+        """Return the state; raise ValueError if there is none."""
         if state is None:
             raise ValueError("this backbone uses relative actions: pass the raw state")
-        return aloha.state_to_pi0(state) if self.inputs.aloha else state
+        return state
 
     def _mask(self, slots: Sequence[int]) -> np.ndarray:
         """Return the mask of these slots, `[A]` bool."""

@@ -10,7 +10,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from lorasp_jax.base.files import join_inside, read_bytes
+from lorasp_jax.base.files import as_value_error, join_inside, read_bytes
+from lorasp_jax.base.json_values import check
 from lorasp_jax.base.writing import write_text
 from lorasp_jax.models import presets
 from lorasp_jax.report import figures
@@ -150,6 +151,9 @@ def _held_out(folder: Path, rows: figures.Rows) -> Iterable[str]:
         header = (f"mean error at step {found['kept']}", *found["columns"])
         errors = found["errors"].items()
         yield _table(header, ((k, *(f"{x:.2f}" for x in v)) for k, v in errors))
+        if len(phrases := found.get("instructions", {})) > 1:  # the worst ones, see `held_out`
+            header = ("instruction, mean error [std]", "policy", "hold still", "repeat previous")
+            yield _table(header, ((k, *(f"{x:.3f}" for x in v)) for k, v in phrases.items()))
     for picture in sorted(folder.glob("held_out_*.png")):
         data = base64.b64encode(read_bytes(picture, folder)).decode()
         yield f'<img alt="recorded and predicted joints" src="data:image/png;base64,{data}">'
@@ -256,7 +260,9 @@ def _rule_cells(row: dict[str, Any]) -> tuple[str, ...]:
 def _largest_rank(folder: Path, config: dict[str, Any]) -> int:
     """Return the largest rank of the run's methods."""
     if "adapt" not in config:
-        return read_json(folder / CONFIG_FILE, records.WITH_RANK)["peft"]["rank"]
+        with as_value_error(folder / CONFIG_FILE):
+            check(config, records.WITH_RANK)
+        return config["peft"]["rank"]
     named = presets.parse(config["adapt"], recorded_method(config["peft"]))
     return max(getattr(method, "rank", 0) for _, method in named.values())
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import sys
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,11 +15,11 @@ from lorasp_jax import models
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.compress import quantization
 from lorasp_jax.base import hub
-from lorasp_jax.config import Config
+from lorasp_jax.config import Config, ModelConfig
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models import backbone
 from lorasp_jax.models.backbone import Backbone
-from lorasp_jax.models.checkpoints import loading
+from lorasp_jax.models.checkpoints import loading, openpi_configs
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run_folder import read_json
@@ -50,9 +51,19 @@ def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str
         cameras = model_config.cameras[: len(envs.Env.cameras)]
         model_config = dataclasses.replace(model_config, cameras=cameras)
     if abstract and (not options.source or hub.is_remote(options.source)):
+        if options.openpi_config or hub.BUCKET.fullmatch(options.source):  # openpi's are there
+            model_config = _as_trained(options, model_config)
         return nnx.eval_shape(lambda: model_config.create(nnx.Rngs(0))), ""
     if options.source:
         checkpoint = loading.find(options.source)
+        if checkpoint.is_openpi:
+            model_config = checkpoint.resized(model_config)
+            trained = _as_trained(options, model_config, has_chunk=checkpoint.records_lengths)
+            model_config = checkpoint.resized(trained)
+        elif options.openpi_config:
+            raise ValueError(
+                f"--model.openpi-config is for checkpoints of openpi, and {options.source} is none"
+            )
         inputs = checkpoint.inputs or model_config.inputs
         model = checkpoint.load(dataclasses.replace(model_config, inputs=inputs))
         # Actions of recordings may mean anything, and a base can learn another period from them.
@@ -61,6 +72,33 @@ def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str
         return model, models.weights_hash(model)
     model = model_config.create(nnx.Rngs(RandomStream.BASE.key(config.seed)))
     return model, models.weights_hash(model)
+
+
+def _as_trained(
+    options: ModelConfig, config: BackboneConfig, *, has_chunk: bool = False
+) -> BackboneConfig:
+    """Return the config of an openpi checkpoint as its training config says; print what is taken.
+
+    With `has_chunk`, the files say how long the chunk is.
+
+    Raises:
+        ValueError: the training config is unknown, or of another model.
+    """
+    name, where = options.openpi_config, options.source
+    if name == "none":
+        return config
+    if named := openpi_configs.find(name) if name else openpi_configs.guess(where):
+        return named.apply(config)
+    assumed = [f"chunks of {config.chunk}"] * (not options.chunk and not has_chunk)
+    assumed += ["absolute actions"] * (options.relative_actions is None)
+    assumed += ["the state in prompts"] * config.inputs.prompt_state
+    if assumed:
+        print(
+            f"the files of {where} do not say how it was trained: taking {', '.join(assumed)}; "
+            "--model.openpi-config names its training config",
+            file=sys.stderr,
+        )
+    return config
 
 
 def sized(name: str, size: str) -> BackboneConfig:

@@ -16,7 +16,7 @@ from lorasp_jax.data.lerobot import Keys
 from lorasp_jax.data.opening import open_source
 from lorasp_jax.data.source import Progress, Source
 from lorasp_jax.models.config import BackboneConfig
-from lorasp_jax.policies.processor import check_delta, robot_slots
+from lorasp_jax.policies.processor import robot_slots
 
 CACHE = Path("cache", "steps")
 _DT_TOLERANCE = 0.01  # relative; 1/30 s has no exact decimal representation
@@ -52,15 +52,9 @@ def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
             "collect with --actions joint"
         )
     lengths = first.state.shape[-1], first.action.shape[-1]
-    if config.model.relative_actions and len({*lengths}) > 1:
-        raise ValueError(
-            f"--model.relative-actions needs states and actions of the same dimensions, but {path} "
-            f"has {lengths[0]} and {lengths[1]}"
-        )
     try:
         for length in lengths:
             robot_slots(length - 1, model.inputs)
-        check_delta(model.inputs.delta, *lengths)
     except ValueError as error:
         raise ValueError(
             f"{path} does not fit the backbone: {error}; select entries with "

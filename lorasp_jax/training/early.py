@@ -68,8 +68,8 @@ def data_shapes(run: Run, built: setup.RunSetup) -> tuple[int, Any]:
 def _blank_processor(config: Config, built: setup.RunSetup) -> Processor:
     """Return the run's processor with the statistics of one episode."""
     episode = _first_episode(config, built)
-    options = {"relative": config.model.relative_actions, "cameras": config.data.cameras}
-    return setup.processor([episode], built.base.config, built.prompts, **options)
+    cameras = config.data.cameras
+    return setup.processor([episode], built.base.config, built.prompts, cameras=cameras)
 
 
 def _first_episode(config: Config, built: setup.RunSetup) -> Episodes:

@@ -153,7 +153,9 @@ def _loop(
         deferred() as stop,
         bars(run.console, "samples", per_step=config.optim.batch_size) as progress,
     ):
-        bar = progress.add_task("compiling train step ...", total=total, completed=saved)
+        text = f"resumed at step {saved}, " * bool(saved) + "compiling train step ..."
+        text = text if saved < total else "trained"
+        bar = progress.add_task(text, total=total, completed=saved)
         while (done := int(state.step)) < total and not stopped:
             count = _log_interval(config, done)
             state, metrics = program(state, key, done, count)
@@ -164,7 +166,9 @@ def _loop(
                 log.write(done, values)
                 raise error
             text = f"training, loss {values.get('task', math.nan):.4f}"
-            progress.update(bar, completed=done, description=text)
+            # The bar's own rate would include callbacks, such as measurements on held-out episodes.
+            rate = values["speed/samples_per_second"]
+            progress.update(bar, completed=done, description=text, rate=rate)
             run.policy = policy(state)
             values = _call_on_log(callbacks, run, done, values)
             log.write(done, values, {name: mean for name, mean in means.items() if mean.ndim})

@@ -29,6 +29,7 @@ VALIDATION: Schema = {
     "columns": [str],
     "errors": {str: [float]},
     "horizon": [float],
+    "instructions?": {str: [float]},
 }
 STOPPED: Schema = {"reason": str}
 CONFIG: Schema = {

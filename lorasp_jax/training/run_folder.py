@@ -41,7 +41,7 @@ STOPPED = "stopped.json"
 
 
 _OPTIONAL = (
-    *(("data", "cameras"), ("model", "base_dtype"), ("model", "chunk")),
+    *(("data", "cameras"), ("model", "base_dtype"), ("model", "chunk"), ("model", "openpi_config")),
     ("optim", "rtc_max_delay"),
 )
 """Settings that `to_json` omits at their defaults, which are 0 or empty, as it omits `adapt`:
@@ -54,6 +54,7 @@ def to_json(config: Config) -> dict[str, Any]:
     `scene` has only the ranges that differ from the defaults, and is absent if none do.
     """
     fields = json.loads(json.dumps(dataclasses.asdict(config)))
+    fields["model"]["relative_actions"] = bool(config.model.relative_actions)  # as it once was
     for group, name in _OPTIONAL:
         if not fields[group][name]:
             del fields[group][name]

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import TaskID
 
 import envs
-from envs.datasets.episodes import Episodes
+from envs.datasets.episodes import Episodes, full_name
 from envs.env import Env
 from lorasp_jax import peft
 from lorasp_jax.adapters import adaptation, paths, summary
@@ -30,7 +30,13 @@ from lorasp_jax.data.stream import Stream
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.policies.policy import Policy
-from lorasp_jax.policies.processor import Processor, Statistics, check_delta, robot_slots, to_delta
+from lorasp_jax.policies.processor import (
+    Processor,
+    Statistics,
+    known_actions,
+    known_state,
+    robot_slots,
+)
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Tokenizer, load_tokenizer
 from lorasp_jax.training import rules
@@ -41,6 +47,7 @@ from lorasp_jax.training.demonstrations import Demonstrations, Progress, demonst
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.random_streams import RandomStream
+from lorasp_jax.training.relative import for_robot
 from lorasp_jax.training.run import Run
 from lorasp_jax.training.run_folder import record_dataset
 
@@ -109,8 +116,9 @@ def build(config: Config, folder: Path, *, abstract: bool = False) -> RunSetup:
     prompts, joints = _prompts_and_joints(source, environments, tokenizer, base.config)
     _check_sizes(config, base.config.chunk)
     if not source:
-        check_delta(base.config.inputs.delta, joints + 1, joints + 1)
         robot_slots(joints, base.config.inputs)
+    relative = config.model.relative_actions
+    base = with_config(base, inputs=for_robot(base.config.inputs, relative, source, joints))
     available = preflight.available_bytes()
     remat, memory = preflight.choose_remat(config, base.config, available)
     base = with_config(base, remat=remat)
@@ -150,8 +158,8 @@ def prepare(
     console.print(f"memory per device: {built.memory}; rematerialization: {base.config.remat}")
     run = Run(config, folder, console, built.base_hash, started)
     _load_or_collect(run, built, collect, meanwhile)
-    options = {"relative": config.model.relative_actions, "cameras": config.data.cameras}
-    inputs = processor([*run.episodes.values()], model.config, built.prompts, **options)
+    groups, cameras = [*run.episodes.values()], config.data.cameras
+    inputs = processor(groups, model.config, built.prompts, cameras=cameras)
     if any(method.needs_statistics for method in rules.methods(config)):
         model = _adapt(config, base, rules.rules(config), input_moments(run, base, inputs))
     if built.source:
@@ -297,31 +305,29 @@ def processor(
     model_config: BackboneConfig,
     prompts: PromptTable,
     *,
-    relative: bool = False,
     cameras: Sequence[str] = (),
 ) -> Processor:
     """Build the processor from the prompts and the statistics of the demonstrations.
 
-    `cameras`, by default all sorted by name, fill the backbone's camera slots in order. With
-    `relative`, joint targets are relative to the state at the start of the chunk; otherwise the
-    model's config decides.
+    `cameras`, by default all sorted by name, fill the backbone's camera slots in order. Statistics
+    are those of the values that the model's config has: ALOHA's converted, and relative actions.
     """
     joints, length = episodes[0].state.shape[-1] - 1, episodes[0].action.shape[-1]
-    slots, dim = robot_slots(joints, model_config.inputs), model_config.action_dim
-    action_slots = robot_slots(length - 1, model_config.inputs)
-    delta = (*[True] * (length - 1), False) if relative else model_config.inputs.delta
+    inputs, dim = model_config.inputs, model_config.action_dim
+    slots, action_slots = robot_slots(joints, inputs), robot_slots(length - 1, inputs)
     steps = flatten([dataclasses.replace(group, image={}) for group in episodes])
-    chunk = model_config.chunk if delta else 1
+    chunk = model_config.chunk if inputs.delta else 1
     window, _ = windows(steps, jnp.arange(len(steps.end)), chunk)
-    action = np.asarray(
-        to_delta(jnp.asarray(steps.action[window]), jnp.asarray(steps.state), delta)
-    ).reshape(-1, length)
-    state = np.repeat(np.asarray(steps.state), chunk, axis=0)
+    state = jnp.asarray(steps.state)
+    action = np.asarray(known_actions(jnp.asarray(steps.action[window]), state, inputs))
+    action = action.reshape(-1, length)
+    state = np.repeat(np.asarray(known_state(state, inputs)), chunk, axis=0)
     valid = np.ones(len(state), bool)
     statistics = Statistics.measure(
         state, action, valid, slots=slots, dim=dim, action_slots=action_slots
     )
-    ordered = cameras or sorted(episodes[0].image)
+    images = episodes[0].image
+    ordered = [full_name(name, images) for name in cameras] or sorted(images)
     return Processor.of(
         model_config,
         statistics,
@@ -329,7 +335,6 @@ def processor(
         num_joints=joints,
         action_length=length,
         cameras=dict(zip(model_config.cameras, ordered, strict=False)),
-        delta=delta,
     )
 
 

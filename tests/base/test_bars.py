@@ -22,7 +22,10 @@ from lorasp_jax.base.bars import bars, collecting
 )
 def test_rate_counts_units_not_steps(per_step, speed, finished, text):
     rate = bars(Console(file=io.StringIO()), "samples", per_step=per_step).columns[-1]
-    assert rate.render(SimpleNamespace(speed=speed, finished_speed=finished)).plain == text
+    task = SimpleNamespace(speed=speed, finished_speed=finished, fields={})
+    assert rate.render(task).plain == text
+    measured = SimpleNamespace(**vars(task) | {"fields": {"rate": 50.0}})  # without callbacks
+    assert rate.render(measured).plain == "50 samples/s"
 
 
 def test_slow_steps_have_a_rate_too():

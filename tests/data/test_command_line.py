@@ -9,7 +9,8 @@ import pytest
 from PIL import Image
 
 from envs.datasets import rlds
-from lorasp_jax.data import rlds_export
+from envs.datasets.episodes import full_name
+from lorasp_jax.data import inspection, rlds_export
 from lorasp_jax.data.__main__ import main
 from lorasp_jax.data.cache import Cache
 from lorasp_jax.data.lerobot import LeRobot
@@ -161,4 +162,27 @@ def test_an_interrupt_leaves_nothing(capsys, tmp_path, monkeypatch):
     assert run(capsys, "convert", golden("v3"), "--out", tmp_path / "cache")[0] == 130
     assert not list(tmp_path.iterdir())
     with pytest.raises(SystemExit):
-        main(["convert", "x", "--out", "y", "--cameras", "side"])
+        main(["convert", "x", "--out", "y", "--cameras", "side="])
+
+
+def test_cameras_go_by_the_last_part_of_their_names(capsys, tmp_path):
+    """Or by their full names, where they are known by the last part."""
+    for text in ("wrist", "images.wrist", "main=wrist"):
+        out = tmp_path / text
+        options = ["--cameras", text, "--image-size", "64"]
+        assert run(capsys, "convert", golden("v3"), "--out", out, *options)[0] == 0
+        assert [*Cache(out).cameras] == ["main" if "=" in text else "wrist"]
+    assert [*open_source(golden("v3"), cameras=["observation.images.side"]).cameras] == ["side"]
+    assert full_name("eye", ["left.eye", "right.eye"]) == "eye"  # not one of them
+    assert full_name("eye", ["left.eye", "eye"]) == "eye"
+    assert full_name("ye", ["left.eye"]) == "ye"
+    code, _, err = run(capsys, "inspect", golden("v3"), "--cameras", "eye")
+    assert code == 2
+    assert "observation.images.side, observation.images.wrist" in err
+
+
+def test_long_instructions_give_a_hint(capsys):
+    _, out, _ = run(capsys, "inspect", golden("v3"))
+    assert "'pick up the red cube and place it in the basket' has 11 tokens" in out
+    assert "--model.max-tokens 11" in out
+    assert not inspection.prompt_hints(["press the green button"])

@@ -9,6 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
+from lorasp_jax.data import lerobot_features
 from lorasp_jax.data.__main__ import main
 from lorasp_jax.data.keys import Keys
 from lorasp_jax.data.lerobot import LeRobot
@@ -256,3 +257,10 @@ def test_repeated_columns(folder):
     edit_rows(folder, lambda table: table.append_column("action", table["action"]))
     with pytest.raises(ValueError, match="several columns action"):
         LeRobot(folder).episode(0)
+
+
+def test_grippers_are_found_by_name():
+    """Or else the last dimension is one."""
+    find = lerobot_features.grippers
+    assert find(["left_joint", "left_Gripper.pos", "right_joint", "right_gripper"]) == [1, 3]
+    assert find(["0", "1", "2"]) == [2]

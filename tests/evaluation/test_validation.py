@@ -136,13 +136,56 @@ def test_displacements_hold_still_at_zero(recorded):
 def test_units(recorded):
     """Joint targets are shown in degrees and mm; displacements and other units as recorded."""
     found = windows(LeRobot(golden("v3")), OUT, recorded.policy, every=10)
-    assert found.units[0] == ("joint 1 [°]", pytest.approx(180 / np.pi))
+    assert found.units[0] == ("joint_1 [°]", pytest.approx(180 / np.pi))
     assert found.units[-1] == ("gripper [mm]", 1000)
     for scale in (np.array([60.0] * 6 + [1]), np.array([1.0] * 6 + [500])):
         raw = dataclasses.replace(found.raw, actions=found.raw.actions * scale)
-        assert dataclasses.replace(found, raw=raw).units[0] == ("action 1", 1)
+        assert dataclasses.replace(found, raw=raw).units[0] == ("joint_1", 1)
+    unnamed = dataclasses.replace(found, names=())
     raw = dataclasses.replace(found.raw, actions=found.raw.actions[..., 1:])
-    assert len(dataclasses.replace(found, raw=raw).units) == 6
+    shorter = dataclasses.replace(unnamed, raw=raw, grippers=(5,))
+    assert [name for name, _ in shorter.units] == [f"action {i}" for i in range(1, 7)]
+    small = dataclasses.replace(found.raw, actions=0.1 * found.raw.actions)
+    two = dataclasses.replace(unnamed, raw=small, grippers=(2, 6))
+    assert [*dict(two.units)][1:4] == ["joint 2 [°]", "gripper (3) [mm]", "joint 3 [°]"]
+    odd = ("a [x]", "a [x]", "$b$", "c\n", *"efg")
+    assert [*dict(dataclasses.replace(found, names=odd).units)][:4] == [
+        "a [x] (1) [°]",
+        "a [x] (2) [°]",
+        "$b$ [°]",
+        "c [°]",
+    ]
+
+
+def test_errors_by_instruction(recorded):
+    """The worst first; together they are the error of all windows."""
+    found = windows(LeRobot(golden("v3")), range(4), recorded.policy, every=10)
+    result = measure(recorded.policy, found, num_steps=1)
+    assert {*result.instructions} == {*found.phrase}
+    (worst, *_), (best, *_) = result.instructions.values()
+    assert best <= result.policy.mean <= worst
+    phrase = next(iter(result.instructions))
+    rows = np.array([other == phrase for other in found.phrase])
+    inside = np.asarray(found.raw.inside)[rows]
+    spread = held_out._spread(found.raw)
+    off = np.abs(result.actions - found.raw.actions)[rows] / spread
+    assert worst == pytest.approx(off[inside].mean(), rel=1e-5)
+    still = np.abs(found.still[:, None] - found.raw.actions)[rows] / spread
+    assert result.instructions[phrase][1] == pytest.approx(still[inside].mean(), rel=1e-5)
+
+
+def test_fewer_windows_on_a_cpu(recorded, monkeypatch):
+    """They take most of the time of a small run."""
+    limits = []
+    monkeypatch.setattr(validation, "windows", lambda *_, limit: limits.append(limit) or 1 / 0)
+    for scale in ("cpu", "accelerator"):
+        run = dataclasses.replace(recorded, config=dataclasses.replace(CONFIG, scale=scale))
+        run.policy = recorded.policy
+        with pytest.raises(ZeroDivisionError):
+            Validation().on_log(run, 2, {})
+    assert limits == [64, 256]
+    few = windows(LeRobot(golden("v3")), OUT, recorded.policy, limit=10)
+    assert np.bincount(few.episode).tolist() == [0, 5, 5]
 
 
 def test_a_run_measures_keeps_the_best_and_resumes(recorded, tmp_path, monkeypatch):
@@ -179,6 +222,7 @@ def test_a_run_measures_keeps_the_best_and_resumes(recorded, tmp_path, monkeypat
         assert row["validation/action_error"] == 0.9
         assert {"validation/loss", "validation/joint_6", "validation/gripper"} <= row.keys()
         page = write_report(folder).read_text()
+        assert all(f"<td>{text}</td>" in page for text in recorded.recordings.instructions)
         assert "Held-out episodes" in page
         assert page.count('alt="recorded and predicted joints"') == 1
     for name, value in first.items():

@@ -7,7 +7,6 @@ import time
 
 import jax
 import numpy as np
-import pytest
 from rich.console import Console
 
 from envs.datasets import rlds
@@ -21,7 +20,6 @@ from lorasp_jax.report.html import write_report
 from lorasp_jax.training import export, setup
 from lorasp_jax.training.base import base_model
 from lorasp_jax.training.cost import preflight
-from lorasp_jax.training.dataset import open_dataset
 from lorasp_jax.training.run_folder import to_json, write_json
 from tests.models.random_models import random_backbone
 from tests.runs import CONFIG, Miniature, make_run, random_episodes
@@ -72,11 +70,6 @@ def test_actions_of_a_recording_may_be_shorter_than_its_states(tmp_path, monkeyp
     longer = np.concatenate([group.state, group.state[..., :1]], axis=-1)
     recorded = dataclasses.replace(group, state=longer, physics_dt=0.0)
     rlds.write(recorded, tmp_path / "rlds")
-    relative = dataclasses.replace(CONFIG.model, relative_actions=True)
-    data = DataConfig(source=str(tmp_path / "rlds"))
-    config = dataclasses.replace(CONFIG, model=relative, data=data)
-    with pytest.raises(ValueError, match=r"relative-actions .* 8 and 7"):
-        open_dataset(config, Pi0Config.dummy(), tmp_path / "refused")
     run = prepare(tmp_path / "run", monkeypatch, tmp_path / "rlds")
     processor = run.policy.processor
     assert (processor.state_slots, processor.action_slots) == (

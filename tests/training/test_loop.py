@@ -7,11 +7,13 @@ import signal
 import jax
 import numpy as np
 import pytest
+from rich.progress import Progress
 
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import AugmentConfig, DataConfig
 from lorasp_jax.data.batches import flatten
 from lorasp_jax.peft import LoRA
+from lorasp_jax.training import loop
 from lorasp_jax.training.loop import RunError, train
 from lorasp_jax.training.run import Callback
 from lorasp_jax.training.run_folder import read_metrics
@@ -30,6 +32,32 @@ def quick_run(folder, *, ema=0.5, streams=False):
     if streams:
         run.dataset, run.streams = flatten(list(run.episodes.values())), True
     return run
+
+
+def test_the_bar_has_the_rate_of_training_alone(tmp_path, monkeypatch):
+    """That of the report, without what callbacks take; it says where a resumed run starts."""
+    shown = []
+
+    class Recorder(Progress):
+        def add_task(self, description, **fields):
+            shown.append((description, None))
+            return super().add_task(description, **fields)
+
+        def update(self, task_id, **fields):
+            shown.append((fields["description"], fields["rate"]))
+
+    monkeypatch.setattr(loop, "bars", lambda *_, **__: Recorder(disable=True))
+    run = quick_run(tmp_path / "run")
+    with pytest.raises(KeyboardInterrupt):
+        train(run, [Terminate()])
+    train(quick_run(tmp_path / "run"), resume=True)
+    train(quick_run(tmp_path / "run"), resume=True)
+    texts = [text for text, rate in shown if rate is None]
+    assert texts[0].startswith("compiling")
+    assert texts[1].startswith("resumed at step 2, compiling")
+    assert texts[2] == "trained"
+    logged = [row["speed/samples_per_second"] for row in read_metrics(run.folder)]
+    assert [rate for _, rate in shown if rate] == logged
 
 
 class LogSize(Callback):

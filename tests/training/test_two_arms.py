@@ -13,6 +13,8 @@ from rich.console import Console
 
 from envs.datasets import rlds
 from lorasp_jax.config import DataConfig
+from lorasp_jax.data import cache
+from lorasp_jax.data.keys import Keys
 from lorasp_jax.data.lerobot_export import to_lerobot
 from lorasp_jax.data.opening import open_source
 from lorasp_jax.extras.serving.policies import describe
@@ -24,7 +26,7 @@ from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training import setup
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.loop import train
-from lorasp_jax.training.run_folder import read_metrics
+from lorasp_jax.training.run_folder import read_json, read_metrics, write_json
 from tests.data.lerobots import edit_info
 from tests.models.random_models import random_backbone
 from tests.runs import CONFIG, leaves, random_episodes
@@ -62,12 +64,14 @@ def recordings(tmp_path_factory):
     return folder / "lerobot", group
 
 
-def prepare(folder, monkeypatch, source, cameras):
+def prepare(folder, monkeypatch, source, cameras, *, relative=None):
     monkeypatch.setattr(preflight, "choose_remat", lambda *_: ("none", NO_MEMORY))
     monkeypatch.setattr(setup, "base_model", lambda *_, **__: (random_backbone(MODEL), ""))
+    folder.mkdir(exist_ok=True)
     config = dataclasses.replace(
         CONFIG,
         data=DataConfig(source=str(source), cameras=cameras),
+        model=dataclasses.replace(CONFIG.model, relative_actions=relative),
         evaluation=dataclasses.replace(CONFIG.evaluation, execute_steps=1),
         optim=dataclasses.replace(CONFIG.optim, steps=2),
         peft=LoRA(rank=4),
@@ -121,3 +125,33 @@ def test_fewer_cameras_are_masked(recordings, tmp_path, monkeypatch):
     run.devices = jax.devices()[:1]
     train(run)
     assert read_metrics(run.folder)[-1]["step"] == 2
+
+
+def test_relative_actions_spare_both_grippers(recordings, tmp_path, monkeypatch):
+    """Through the cache of a run, one that was converted, and one of an older version."""
+    source, group = recordings
+    mask = (*[True] * 6, False) * 2
+    run = prepare(tmp_path / "run", monkeypatch, source, ("cam_high",), relative=True)
+    assert run.policy.processor.inputs.delta == mask
+    state, chunk = jnp.asarray(group.state[:, 0]), jnp.asarray(group.action[:, : MODEL.chunk])
+    shifted = run.policy.processor.normalize_actions(chunk + 1, state + 1)
+    same = run.policy.processor.normalize_actions(chunk, state)
+    moved = np.abs(shifted - same)[:, 0, :14] > 1e-4
+    np.testing.assert_array_equal(moved, [~np.array(mask)] * 3)
+    assert run.recordings is not None
+    assert run.recordings.grippers == {"state": [6, 13], "action": [6, 13]}
+    left_first = Keys(grippers=("6", "12"), cameras={"cam_high": "observation.images.cam_high"})
+    cache.write([open_source(source, left_first)], tmp_path / "mine", lambda *_: None)
+    chosen = prepare(tmp_path / "other", monkeypatch, tmp_path / "mine", (), relative=True)
+    assert np.flatnonzero(~np.array(chosen.policy.processor.inputs.delta)).tolist() == [6, 12]
+    header = read_json(tmp_path / "mine" / cache.HEADER)
+    for name in ("names", "grippers"):
+        del header[name]
+    write_json(tmp_path / "mine" / cache.HEADER, header)
+    older = prepare(tmp_path / "older", monkeypatch, tmp_path / "mine", (), relative=True)
+    assert np.flatnonzero(~np.array(older.policy.processor.inputs.delta)).tolist() == [13]
+    write_json(
+        tmp_path / "mine" / cache.HEADER, header | {"grippers": {"state": [], "action": [14]}}
+    )
+    with pytest.raises(ValueError, match="grippers of action must be those of 14 numbers"):
+        open_source(tmp_path / "mine")

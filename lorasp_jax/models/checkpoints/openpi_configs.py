@@ -84,6 +84,12 @@ class OpenPiConfig:
     max_tokens: int | None = None
     reset_pose: tuple[float, ...] = ()
 
+    def __str__(self) -> str:
+        prompts = f", prompts {'with' if self.prompt_state else 'without'} the state" * self.pi05
+        units = ", units of ALOHA" * self.robot.aloha
+        actions = "relative" if self.relative else "absolute"
+        return f"chunks of {self.chunk} {actions} actions{prompts}{units}"
+
     @property
     def config(self) -> Pi0Config:
         """The config of the published size."""
@@ -97,7 +103,8 @@ class OpenPiConfig:
         """
         if getattr(config, "pi05", None) != self.pi05:
             raise ValueError(
-                f"this training config is of {'pi0.5' if self.pi05 else 'pi0'}: choose such a size"
+                f"this training config is of {'pi0.5' if self.pi05 else 'pi0'}: choose such a "
+                f"size, as {'base_pi05' if self.pi05 else 'base'}"
             )
         inputs = dataclasses.replace(
             OPENPI_PI05 if self.pi05 else OPENPI,
@@ -160,7 +167,8 @@ def guess(where: str | os.PathLike[str]) -> OpenPiConfig | None:
     if name is None:
         return None
     print(
-        f"taking {where} for a checkpoint of openpi's training config {name}, after its name",
+        f"taking {where} for a checkpoint of openpi's training config {name}, after its name: "
+        f"{CONFIGS[name]}",
         file=sys.stderr,
     )
     return CONFIGS[name]

@@ -80,7 +80,7 @@ def test_the_printed_memory_is_that_of_the_compiled_program(config, tmp_path, mo
     assert "TFLOP" in printed
 
 
-@pytest.mark.parametrize("file", ["multitask_pi0", "multitask_smolvla"])
+@pytest.mark.parametrize("file", ["multitask_pi0", "multitask_pi05", "multitask_smolvla"])
 def test_published_models_need_no_download(file, monkeypatch):
     for download in ("_from_hub", "_from_bucket"):
         monkeypatch.setattr(hub, download, lambda *_: pytest.fail("it downloads"))
@@ -88,7 +88,7 @@ def test_published_models_need_no_download(file, monkeypatch):
     monkeypatch.setattr(preflight, "choose_remat", lambda *_: remat)
     config = load(ROOT / "configs" / f"{file}.py", "smoke")
     assert all(hub.is_remote(x) for x in (config.model.source, config.model.tokenizer))
-    model = dataclasses.replace(config.model, size="nano")
+    model = dataclasses.replace(config.model, size=config.model.size.replace("base", "nano"))
     optim = dataclasses.replace(config.optim, batch_size=jax.device_count())
     config = dataclasses.replace(config, model=model, optim=optim, tasks=("press",))
     config = dataclasses.replace(
@@ -98,6 +98,7 @@ def test_published_models_need_no_download(file, monkeypatch):
     leaves = jax.tree.leaves(nnx.state(built.model, nnx.Param))
     assert {type(leaf) for leaf in leaves} == {jax.ShapeDtypeStruct}
     assert adaptation.count(built.model).trainable > 0
+    assert getattr(built.model.config, "pi05", False) == (file == "multitask_pi05")
 
 
 def test_recordings_change_their_images_as_in_the_run(config, tmp_path, monkeypatch):
