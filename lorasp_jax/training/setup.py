@@ -153,7 +153,8 @@ def prepare(
     options = {"relative": config.model.relative_actions, "cameras": config.data.cameras}
     inputs = processor([*run.episodes.values()], model.config, built.prompts, **options)
     if any(method.needs_statistics for method in rules.methods(config)):
-        model = _adapt(config, base, rules.rules(config), input_moments(run, base, inputs))
+        moments = input_moments(run, quantized(base, config.model.base_dtype), inputs)
+        model = _adapt(config, base, rules.rules(config), moments)
     if built.source:
         _print_cameras(built.source, inputs, console)
     run.policy = Policy(model, inputs)
