@@ -169,7 +169,7 @@ def measure(policy: Policy, found: Windows, *, num_steps: int = 10) -> HeldOut:
 def sample(policy: Policy, found: Windows, *, num_steps: int = 10) -> np.ndarray:
     """Return the chunks `[N, C, J+1]` that `measure` compares; same arguments.
 
-    A policy that is quantized to save memory is not copied into a sampler, which is a little faster.
+    A policy that is quantized to save memory is not copied into a sampler, which would be faster.
     """
     sampling = policy if is_quantized(policy.model) else policy.with_sampler()
     chunks = [

@@ -9,7 +9,7 @@ more memory than there is, the next candidate is tried.
 import dataclasses
 import itertools
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -73,9 +73,7 @@ def fitted(
         ValueError: nothing fits, or see `setup.build`.
     """
     budget, least = read_size(size) - CONTEXT, float("inf")
-    base, _ = base_model(_without_weights(config), abstract=True)
-    for candidate in _candidates(config, given):
-        peak = expected_peak(candidate, base.config)
+    for candidate, peak in ranked(config, given):
         if peak <= budget and jax.default_backend() != "cpu":
             planned = planned_bytes(compile_step(_without_weights(candidate), folder, console)[-1])
             peak = max(peak, sum(planned.values()))
@@ -88,6 +86,13 @@ def fitted(
         f"--fit {(least + CONTEXT) / UNITS['GB'] + 0.05:.1f}GB; see what else saves memory in "
         "docs/launch.md"
     )
+
+
+def ranked(config: Config, given: Collection[str] = ()) -> Iterator[tuple[Config, float]]:
+    """Yield candidates and their estimated peaks [bytes], the cheapest first; see `fitted`."""
+    base, _ = base_model(_without_weights(config), abstract=True)
+    for candidate in _candidates(config, given):
+        yield candidate, expected_peak(candidate, base.config)
 
 
 def resumed(config: Config, folder: Path) -> Config | None:
