@@ -111,6 +111,7 @@ class Step:
         mesh: device mesh; by default only the first device.
         model: the model's shapes; by default those of the run.
         options: compiler options besides those of training.
+        loop: take so many steps in a call, as training does; 0: one, without a loop.
     """
 
     def __init__(
@@ -120,6 +121,7 @@ class Step:
         mesh: Mesh | None = None,
         model: Backbone | None = None,
         options: dict[str, str | bool] | None = None,
+        loop: int = 0,
     ) -> None:
         mesh = mesh or meshes.make_mesh(devices=jax.devices()[:1])
         optimizer = make_optimizer(run.optim, {run.peft})
@@ -137,9 +139,19 @@ class Step:
             graphdef=graphdef,
             optimizer=optimizer,
             weights=auxiliary_weights(run.auxiliary, run.optim.steps),
+            parts=run.optim.accumulate,
         )
+
+        def steps(state: Any, *others: Any) -> Any:
+            return jax.lax.scan(lambda state, _: step(state, *others), state, length=loop)
+
         out = state, replicated
-        jitted = jax.jit(step, donate_argnums=0, in_shardings=self._shardings, out_shardings=out)
+        jitted = jax.jit(
+            steps if loop else step,
+            donate_argnums=0,
+            in_shardings=self._shardings,
+            out_shardings=out,
+        )
         options = (compilation.step_options(mesh.size) or {}) | (options or {})
         self.compiled = jitted.lower(*shapes).compile(options)
 

@@ -8,6 +8,8 @@ from lorasp_jax.peft import Method, fields
 from lorasp_jax.peft.auxiliary import AUXILIARY_WEIGHTS
 
 SCALES = ("smoke", "cpu", "accelerator")
+VALIDATION_WINDOWS = 16
+"""Windows of held-out episodes that are measured at once."""
 MAX_NAME_BYTES = 200
 """Maximum length of a run name [bytes]. File systems allow 255; the run's lock file adds a few."""
 

@@ -1,6 +1,8 @@
 """Adapt a policy to a robot: `lorasp-jax train`, or `python train.py` in a checkout."""
 
 import contextlib
+import dataclasses
+import os
 import shlex
 import time
 from collections.abc import Sequence
@@ -24,6 +26,9 @@ def main(arguments: Sequence[str], program: str = "python train.py") -> int:
     0: success; 2: invalid input or a run that cannot continue; 130: stopped by a signal.
     """
     started = time.perf_counter()
+    if any(text.partition("=")[0] == "--fit" for text in arguments):
+        # JAX leaves a quarter of the GPU to others unless told otherwise before it starts.
+        os.environ.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", "0.95")
     cache.enable()
     import flax
     import jax
@@ -60,6 +65,12 @@ def _execute(command: "Command", console: Console, started: float) -> None:
     from lorasp_jax.training.run_folder import open_run
 
     folder = RUNS / command.config.name
+    if command.fit:
+        from lorasp_jax.training.cost import fit
+
+        config = fit.resumed(command.config, folder) if command.resume else None
+        chosen = config or fit.fitted(command.config, command.fit, command.given, folder, console)
+        command = dataclasses.replace(command, config=chosen)
     if command.dry_run:
         from lorasp_jax.training.cost.dry_run import dry_run
 

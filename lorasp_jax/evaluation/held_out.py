@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lorasp_jax.adapters.compress.quantization import is_quantized
+from lorasp_jax.config import VALIDATION_WINDOWS
 from lorasp_jax.data.batches import Batch, RawBatch, encode, flatten, gather
 from lorasp_jax.data.source import Source, dimension_names, grippers
 from lorasp_jax.models.observation import Observation
@@ -22,7 +24,6 @@ MAX_INSTRUCTIONS = 8
 """Largest number of instructions whose errors are shown."""
 Units = list[tuple[str, float]]
 """Name of each dimension of an action with its unit, and the factor to that unit."""
-_BATCH = 16  # windows per call
 _DEGREES, _MILLIMETRES = " [°]", " [mm]"
 _MAX_NAME = 40  # characters of a dimension's name
 _NOISES = 4  # draws of noise and flow time per window, for the loss
@@ -221,8 +222,11 @@ def measure(policy: Policy, found: Windows, *, num_steps: int = 10) -> HeldOut:
 
 
 def sample(policy: Policy, found: Windows, *, num_steps: int = 10) -> np.ndarray:
-    """Return the chunks `[N, C, J+1]` that `measure` compares; same arguments."""
-    sampling = policy.with_sampler()
+    """Return the chunks `[N, C, J+1]` that `measure` compares; same arguments.
+
+    A policy that is quantized to save memory is not copied into a sampler, which would be faster.
+    """
+    sampling = policy if is_quantized(policy.model) else policy.with_sampler()
     chunks = [
         np.asarray(_actions(sampling, b.observation, state, keys[1], num_steps=num_steps))[fresh]
         for b, state, fresh, keys in _batches(policy, found)
@@ -235,8 +239,8 @@ def _batches(
 ) -> Iterator[tuple[Batch, jax.Array, np.ndarray, jax.Array]]:
     """Yield batches of windows, their raw states, which of their rows are new, and two keys."""
     count, key = len(found.task), jax.random.key(0)
-    for first in range(0, count, _BATCH):
-        rows = np.arange(first, first + _BATCH)
+    for first in range(0, count, VALIDATION_WINDOWS):
+        rows = np.arange(first, first + VALIDATION_WINDOWS)
         raw = jax.tree.map(lambda x, rows=rows: x[rows % count], found.raw)  # the last wraps around
         keys = jax.random.split(jax.random.fold_in(key, first), 2)
         yield _encode(policy.processor, raw), raw.state, rows < count, keys

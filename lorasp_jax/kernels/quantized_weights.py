@@ -116,15 +116,20 @@ def quantize_kernel(kernel: jax.Array, kind: Kind) -> QuantizedKernel:
 
 @functools.partial(jax.jit, static_argnames="kind")
 def _codes(kernel: jax.Array, kind: Kind) -> tuple[jax.Array, jax.Array]:
-    """Compute the codes and scales of a `QuantizedKernel`."""
-    *leading, d_in, d_out = kernel.shape
+    """Compute the codes and scales of a `QuantizedKernel`.
+
+    One layer of a stack after another: fp32 copies of all of them would not fit in small GPUs.
+    """
+    if kernel.ndim > 2:
+        return jax.lax.map(functools.partial(_codes, kind=kind), kernel)
+    d_in, d_out = kernel.shape
     values = (kernel.mT if kind == "float8" else kernel).astype(jnp.float32)
     if kind == "nf4":
         blocks = math.ceil(d_in / NF4_BLOCK)
-        padding = [(0, 0)] * len(leading) + [(0, blocks * NF4_BLOCK - d_in), (0, 0)]
-        values = jnp.pad(values, padding).reshape(*leading, blocks, NF4_BLOCK, d_out)
+        padded = jnp.pad(values, [(0, blocks * NF4_BLOCK - d_in), (0, 0)])
+        values = padded.reshape(blocks, NF4_BLOCK, d_out)
     else:
-        values = values[..., None, :, :]
+        values = values[None]
     largest = jnp.abs(values).max((-2, -1) if kind == "float8" else -2, keepdims=True)
     scale = largest / {"float8": FLOAT8_BOUND, "int8": INT8_BOUND, "nf4": 1}[kind]
     encode = {"float8": _float8, "int8": _int8, "nf4": _nf4}[kind]

@@ -52,7 +52,7 @@ class Sampler:
             once: the sampler is used only once. The prefix then uses the kernels as they are:
                 copying them would take longer than it saves.
         """
-        models = (_prefix_model(model, once), _suffix_model(model))
+        models = (_prefix_model(model, once), suffix_model(model))
         graphdefs, states = zip(*map(nnx.split, models), strict=True)
         weights, tree = jax.tree.flatten(states)
         methods = dict.fromkeys(adaptation.methods(model).values())
@@ -139,7 +139,7 @@ def _prefix_model(model: "Backbone", once: bool) -> "Backbone":
     return model
 
 
-def _suffix_model(model: "Backbone") -> "Backbone":
+def suffix_model(model: "Backbone") -> "Backbone":
     """Copy a model for the flow steps, with input-independent results precomputed."""
     model = nnx.merge(*nnx.split(model))
     del model.vision, model.language

@@ -1,5 +1,6 @@
 """The frozen base of a run: loaded from a checkpoint or randomly initialized."""
 
+import contextlib
 import dataclasses
 import re
 import sys
@@ -8,6 +9,7 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 
 import envs
@@ -34,7 +36,8 @@ def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str
     """Return the frozen base, loaded or randomly initialized, and its hash.
 
     With `abstract`, a base that is remote or randomly initialized has only shapes and an empty
-    hash.
+    hash. A base that is to be quantized stays in host memory, as NumPy arrays: the device may not
+    hold it unquantized.
 
     Raises:
         ValueError: the backbone or size is unknown, or the checkpoint does not match the config.
@@ -65,12 +68,16 @@ def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str
                 f"--model.openpi-config is for checkpoints of openpi, and {options.source} is none"
             )
         inputs = checkpoint.inputs or model_config.inputs
-        model = checkpoint.load(dataclasses.replace(model_config, inputs=inputs))
+        with jax.default_device(_host()) if options.base_dtype else contextlib.nullcontext():
+            model = checkpoint.load(dataclasses.replace(model_config, inputs=inputs))
         # Actions of recordings may mean anything, and a base can learn another period from them.
         if checkpoint.layout == "ours" and not config.data.source:
             _check_control_dt(checkpoint.folder, config.control_dt)
-        return model, models.weights_hash(model)
-    model = model_config.create(nnx.Rngs(RandomStream.BASE.key(config.seed)))
+    else:
+        model = model_config.create(nnx.Rngs(RandomStream.BASE.key(config.seed)))
+    if options.base_dtype:
+        graphdef, state = nnx.split(model)
+        model = nnx.merge(graphdef, jax.tree.map(np.asarray, state))
     return model, models.weights_hash(model)
 
 
@@ -101,6 +108,18 @@ def _as_trained(
     return config
 
 
+def _host() -> jax.Device:
+    """Return the CPU as a JAX device; raise ValueError if JAX_PLATFORMS leaves it out."""
+    try:
+        return jax.local_devices(backend="cpu")[0]
+    except RuntimeError as error:
+        platforms = jax.config.jax_platforms  # type: ignore[attr-defined]
+        raise ValueError(
+            f"model.base_dtype quantizes the base from host memory, which JAX_PLATFORMS={platforms}"
+            f" leaves out: set JAX_PLATFORMS={platforms},cpu"
+        ) from error
+
+
 def sized(name: str, size: str) -> BackboneConfig:
     """Return the config of a size of a backbone; raise ValueError if there is none."""
     found = backbone.find(name)
@@ -122,14 +141,18 @@ def with_config(model: Backbone, **changes: Any) -> Backbone:
 def quantized(model: Any, kind: quantization.Kind | Literal[""] | None) -> Any:
     """Return the model with the layers of its three towers quantized, or unchanged if no `kind`.
 
-    Layers that are trained in full stay as they are.
+    Layers that are trained in full stay as they are. Kernels in host memory go to the device one at
+    a time, and then everything else does.
     """
     if not kind:
         return model
     trained = paths.locate(nnx.List([model]), AdapterParam)
     kept = [location.path.rpartition("/")[0] for location in trained if location.name == "kernel"]
     rules = [(f"^{re.escape(path)}$", None) for path in kept]
-    return quantization.quantize(model, [*rules, (_TOWERS, kind)]).model
+    model = quantization.quantize(model, [*rules, (_TOWERS, kind)]).model
+    graphdef, state = nnx.split(model)
+    to_device = lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x  # noqa: E731
+    return nnx.merge(graphdef, jax.tree.map(to_device, state))
 
 
 def in_bf16(model: Any) -> Any:

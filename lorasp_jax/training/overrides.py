@@ -26,12 +26,16 @@ class Command:
         resume: resume the run of this name; "auto": only if it exists.
         dry_run: stop before anything is collected, trained or written.
         wandb: Weights & Biases project.
+        fit: memory of the GPU that the run is to fit into, such as 16GB.
+        given: names of the fields that the command line sets, such as "optim.accumulate".
     """
 
     config: Config
     resume: bool | Literal["auto"] = False
     dry_run: bool = False
     wandb: str | None = None
+    fit: str | None = None
+    given: frozenset[str] = frozenset()
 
 
 def parse(arguments: Sequence[str], program: str = "python train.py") -> Command:
@@ -71,7 +75,9 @@ def parse(arguments: Sequence[str], program: str = "python train.py") -> Command
     config = override(config, rest, program)
     _check_simulated(config)
     _check_rules(config, ["--method"] * bool(known.method) + rest)
-    return Command(config, known.resume, known.dry_run, known.wandb)
+    options = (text.partition("=")[0] for text in rest if text.startswith("--"))
+    given = frozenset(option.lstrip("-").replace("-", "_") for option in options)
+    return Command(config, known.resume, known.dry_run, known.wandb, known.fit, given)
 
 
 def _option_parser(program: str = "", method: str = "") -> argparse.ArgumentParser:
@@ -102,6 +108,8 @@ def _option_parser(program: str = "", method: str = "") -> argparse.ArgumentPars
         action="store_true",
         help="compile (minutes on a CPU), print sizes and memory, then exit",
     )
+    text = "choose remat, accumulate and dtypes so that the run fits into a GPU of this memory"
+    parser.add_argument("--fit", metavar="SIZE", help=f"{text}, such as 16GB or 14.5GiB")
     parser.add_argument(
         "--wandb", metavar="PROJECT", help="also log to Weights & Biases; needs pip install wandb"
     )

@@ -161,7 +161,8 @@ def prepare(
     groups, cameras = [*run.episodes.values()], config.data.cameras
     inputs = processor(groups, model.config, built.prompts, cameras=cameras)
     if any(method.needs_statistics for method in rules.methods(config)):
-        model = _adapt(config, base, rules.rules(config), input_moments(run, base, inputs))
+        moments = input_moments(run, quantized(base, config.model.base_dtype), inputs)
+        model = _adapt(config, base, rules.rules(config), moments)
     if built.source:
         _print_cameras(built.source, inputs, console)
     run.policy = Policy(model, inputs)

@@ -124,6 +124,7 @@ def _quantize_layer(layer: nnx.Module, kind: Kind, shared: Shared) -> tuple[Adap
         raise ValueError("its kernel is already quantized")
     key = id(variable), getattr(layer, "kernel_equation", ""), kind
     if key not in shared:
+        kernel = jnp.asarray(kernel)  # a kernel on the host is copied to the device only once
         quantized_kernel = quantize_kernel(kernel, kind)
         layer.set_kernel_matrices(quantized_kernel)
         error = _error(kernel, quantized_kernel)
@@ -137,7 +138,13 @@ def _quantize_layer(layer: nnx.Module, kind: Kind, shared: Shared) -> tuple[Adap
 @jax.jit
 def _error(kernel: jax.Array, quantized_kernel: QuantizedKernel) -> jax.Array:
     """Relative error ‖W − Ŵ‖ / ‖W‖, 0 for a kernel of zeros."""
-    original = kernel.astype(jnp.float32)
-    norm = jnp.linalg.norm(original)
-    difference = jnp.linalg.norm(original - quantized_kernel.astype(jnp.float32))
+
+    def squares(kernels: tuple[jax.Array, QuantizedKernel]) -> jax.Array:
+        original, rounded = (each.astype(jnp.float32) for each in kernels)
+        return jnp.stack([jnp.sum(jnp.square(x)) for x in (original, original - rounded)])
+
+    pair = kernel, quantized_kernel
+    # One layer after another, as when quantizing.
+    total = squares(pair) if kernel.ndim == 2 else jax.lax.map(squares, pair).sum(0)
+    norm, difference = jnp.sqrt(total)
     return jnp.where(norm > 0, difference / norm, 0.0)

@@ -12,6 +12,7 @@ from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.cost.preflight import byte_unit
 from lorasp_jax.training.dataset import is_simulated
 from lorasp_jax.training.run import Run
+from lorasp_jax.training.setup import RunSetup
 
 
 def dry_run(config: Config, folder: Path, console: Console) -> None:
@@ -22,20 +23,18 @@ def dry_run(config: Config, folder: Path, console: Console) -> None:
     Raises:
         ValueError: see `setup.build`.
     """
-    built = setup.build(config, folder, abstract=True)
+    built, held, compiled = compile_step(config, folder, console)
     remote = (config.model.source, config.model.tokenizer)
     if names := [name for name in remote if hub.is_remote(name)]:
         console.print(f"not downloaded for a dry run: {', '.join(names)}", soft_wrap=True)
     console.print(setup.headline(config, built.model))
-    run = Run(config, folder, console, built.base_hash)
-    if built.source:
-        first = built.source.episode(0, ())
-        run.simulated = is_simulated([first.task], first.robot, first.physics_dt)
-    held, batches = early.data_shapes(run, built)
-    compiled = early.compile_steps(run, built, batches)
     console.print(f"memory per device, estimated: {built.memory}", soft_wrap=True)
-    if (analysis := compiled.memory_analysis()) is not None:
-        console.print(f"memory per device, compiled: {_planned(held, analysis)}", soft_wrap=True)
+    if planned := planned_bytes(compiled):
+        parts = {"dataset": held, **planned}
+        unit, name = byte_unit(peak := sum(parts.values()))
+        listed = ", ".join(f"{part} {value / unit:.2f}" for part, value in parts.items())
+        text = f"memory per device, compiled: {listed}, peak {peak / unit:.2f} {name}"
+        console.print(text, soft_wrap=True)
     unit, name = byte_unit(built.available)
     console.print(f"memory per device, available: {built.available / unit:,.0f} {name}")
     step_flops = preflight.step_flops(config, built.base.config)
@@ -46,14 +45,29 @@ def dry_run(config: Config, folder: Path, console: Console) -> None:
     console.print("dry run: nothing was collected, trained or written")
 
 
-def _planned(held: int, analysis: Any) -> str:
-    """Describe the memory that XLA plans for a step on each device, `analysis`.
+def compile_step(config: Config, folder: Path, console: Console) -> tuple[RunSetup, int, Any]:
+    """Compile the training step of a run from shapes alone, without writing to `folder`.
 
-    `held` is the size of the dataset on every device [bytes], which is no argument of the program.
+    Returns:
+        The run's setup, the bytes of the dataset on every device, which is no argument of the
+        program, and the program.
+
+    Raises:
+        ValueError: see `setup.build`.
     """
+    built = setup.build(config, folder, abstract=True)
+    run = Run(config, folder, console, built.base_hash)
+    if built.source:
+        first = built.source.episode(0, ())
+        run.simulated = is_simulated([first.task], first.robot, first.physics_dt)
+    held, batches = early.data_shapes(run, built)
+    return built, held, early.compile_steps(run, built, batches)
+
+
+def planned_bytes(compiled: Any) -> dict[str, int]:
+    """Return the memory that XLA plans for a program on each device; empty if it does not tell."""
+    if (analysis := compiled.memory_analysis()) is None:
+        return {}
     temporary = analysis.temp_size_in_bytes
     temporary += analysis.output_size_in_bytes - analysis.alias_size_in_bytes
-    parts = {"dataset": held, "arguments": analysis.argument_size_in_bytes, "temporary": temporary}
-    unit, name = byte_unit(peak := sum(parts.values()))
-    listed = ", ".join(f"{part} {value / unit:.2f}" for part, value in parts.items())
-    return f"{listed}, peak {peak / unit:.2f} {name}"
+    return {"arguments": analysis.argument_size_in_bytes, "temporary": temporary}

@@ -16,11 +16,12 @@ import jax
 from flax import nnx
 
 from lorasp_jax.adapters import adaptation
-from lorasp_jax.config import Config
+from lorasp_jax.config import VALIDATION_WINDOWS, Config
 from lorasp_jax.data.batches import Batch, nbytes
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.observation import abstract_observation
+from lorasp_jax.models.sampling import Sampler, suffix_model
 from lorasp_jax.training import rules
 from lorasp_jax.training.base import quantized
 from lorasp_jax.training.cost import flops
@@ -87,23 +88,64 @@ def estimate_memory(config: Config, backbone: BackboneConfig) -> Memory:
     """Estimate the memory of one training step, sharded over `config.fsdp` devices."""
     local_batch = max(1, config.optim.batch_size // jax.device_count())
     micro_batch = max(1, local_batch // config.optim.accumulate)
-    _, (shapes, frozen, _) = abstract_step(config, backbone, micro_batch)
-    optimizer = make_optimizer(config.optim, rules.methods(config))
-    init = functools.partial(init_state, optimizer=optimizer, ema=config.optim.ema > 0)
-    local_bytes = functools.partial(meshes.bytes_on_device, fsdp=config.fsdp)
-    adapters = local_bytes(shapes)
+    base, adapters, optimizer = _held_bytes(
+        _of_one_window(config), dataclasses.replace(backbone, remat="none")
+    )
     saved = functools.partial(_saved_bytes, config, size=micro_batch)
     return Memory(
-        base=local_bytes(frozen),
+        base=base,
         adapters=adapters,
         gradients=adapters * (1 if config.optim.accumulate == 1 else 2),
-        optimizer=local_bytes(jax.eval_shape(init, shapes)) - adapters,
+        optimizer=optimizer,
         activations=saved(backbone) + nbytes(abstract_batch(backbone, local_batch)),
         recomputation=0 if backbone.remat == "none" else _recomputed_bytes(saved, backbone),
     )
 
 
-def _recomputed_bytes(saved: Callable[[BackboneConfig], int], backbone: BackboneConfig) -> float:
+def sampling_peak(config: Config, backbone: BackboneConfig) -> float:
+    """Estimate the peak memory of evaluating the policy during training.
+
+    In simulation, a `Sampler` has weights of its own. On recordings, a quantized policy copies only
+    those of the flow steps, see `held_out.sample`.
+    """
+    return _sampling_peak(_of_one_window(config), dataclasses.replace(backbone, remat="none"))
+
+
+@functools.cache
+def _sampling_peak(config: Config, backbone: BackboneConfig) -> float:
+    graphdef, state = nnx.split(abstract_model(config, backbone))
+
+    def copies(state: Any) -> Any:
+        model = nnx.merge(graphdef, state)
+        if config.model.base_dtype and config.data.source:
+            return nnx.state(suffix_model(model))
+        return Sampler.from_model(model).weights
+
+    copied = _output_bytes(jax.make_jaxpr(copies)(state).jaxpr)
+    windows = VALIDATION_WINDOWS if config.data.source else config.evaluation.worlds
+    layer = _recomputed_bytes(functools.partial(_saved_bytes, config, size=windows), backbone) / 2
+    return HEADROOM * (sum(_held_bytes(config, backbone)) + copied + layer)
+
+
+def _of_one_window(config: Config) -> Config:
+    """Return the config of a step of one window, so that results are cached for all batches."""
+    optim = dataclasses.replace(config.optim, batch_size=1, accumulate=1)
+    model = dataclasses.replace(config.model, remat="auto")  # that of the backbone counts
+    return dataclasses.replace(config, optim=optim, model=model)
+
+
+@functools.cache
+def _held_bytes(config: Config, backbone: BackboneConfig) -> tuple[float, float, float]:
+    """Return the bytes of base, adapters and optimizer state."""
+    _, shapes, frozen = adaptation.split(abstract_model(config, backbone))
+    optimizer = make_optimizer(config.optim, rules.methods(config))
+    init = functools.partial(init_state, optimizer=optimizer, ema=config.optim.ema > 0)
+    local_bytes = functools.partial(meshes.bytes_on_device, fsdp=config.fsdp)
+    adapters = local_bytes(shapes)
+    return local_bytes(frozen), adapters, local_bytes(jax.eval_shape(init, shapes)) - adapters
+
+
+def _recomputed_bytes(saved: Callable[[BackboneConfig], float], backbone: BackboneConfig) -> float:
     """Return the bytes of the matrix products of one layer and of their gradients."""
     products, full = (
         saved(dataclasses.replace(backbone, remat=remat)) for remat in ("products", "full")
@@ -111,21 +153,35 @@ def _recomputed_bytes(saved: Callable[[BackboneConfig], int], backbone: Backbone
     return 2 * (products - full) / min(backbone.vision.depth, backbone.language.depth)
 
 
-@functools.cache
-def _saved_bytes(config: Config, backbone: BackboneConfig, *, size: int) -> int:
+def _saved_bytes(config: Config, backbone: BackboneConfig, *, size: int) -> float:
     """Return the bytes of the residuals that a forward pass of `size` windows saves.
 
-    Its inputs, such as the parameters, are not counted.
+    It is traced for one window, and for two if it also saves slices of stacked weights, as it does
+    without rematerialization. Residuals do not depend on how the base is stored.
     """
+    model = dataclasses.replace(config.model, base_dtype="", param_dtype="float32")
+    stored = dataclasses.replace(_of_one_window(config), model=model)
+    backbone = dataclasses.replace(backbone, param_dtype="bfloat16")
+    traced = functools.partial(_traced_bytes, stored, backbone)
+    each = traced(2) - traced(1) if backbone.remat == "none" else traced(1)
+    return traced(1) + (size - 1) * each
+
+
+@functools.cache
+def _traced_bytes(config: Config, backbone: BackboneConfig, size: int) -> int:
+    """Return the bytes of what a forward pass keeps, except its inputs, such as parameters."""
     loss, shapes = abstract_step(config, backbone, size)
 
     def forward(adapters: Any, frozen: Any, batch: Batch) -> Any:
         return jax.vjp(lambda a: loss(a, frozen, batch), adapters, has_aux=True)[1]
 
-    jaxpr = jax.make_jaxpr(forward)(*shapes).jaxpr
+    return _output_bytes(jax.make_jaxpr(forward)(*shapes).jaxpr)
+
+
+def _output_bytes(jaxpr: Any) -> int:
+    """Return the bytes of a function's results, except inputs that it returns as they are."""
     inputs = {id(variable) for variable in (*jaxpr.invars, *jaxpr.constvars)}
-    saved = {id(v): v.aval for v in jaxpr.outvars if id(v) not in inputs}
-    return nbytes([*saved.values()])
+    return nbytes([*{id(v): v.aval for v in jaxpr.outvars if id(v) not in inputs}.values()])
 
 
 def adapted_model(config: Config, backbone: BackboneConfig, key: jax.Array) -> Backbone:
