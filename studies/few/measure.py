@@ -19,7 +19,7 @@ class _Source:
     def __len__(self) -> int:
         return sum(group.num_episodes for group in self._groups)
 
-    def episode(self, number: int) -> Episodes:
+    def episode(self, number: int, cameras: object = None) -> Episodes:  # noqa: ARG002
         for group in self._groups:
             if number < group.num_episodes:
                 return group.select([number])
