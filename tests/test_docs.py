@@ -13,9 +13,9 @@ from tests import ROOT, test_imports
 PAGES = sorted([*ROOT.glob("docs/*.md"), *ROOT.glob("docs/methods/*.md")])
 OTHERS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("studies/*/README.md"))]
 """Pages whose links and files are checked, but not their examples."""
-WITHOUT_EXAMPLES = {"runs", "launch", "benchmarks", "architecture", "libero"}
-"""Reference pages, and one about another package."""
-SLOW = {"serving", "latency", "deployment", "reinforcement_learning", "simulation"}
+WITHOUT_EXAMPLES = {"runs", "launch", "benchmarks", "architecture", "libero", "deployment"}
+"""Reference pages, and some of commands alone."""
+SLOW = {"serving", "latency", "reinforcement_learning", "simulation"}
 SLOW |= {"adapt_your_model", "language_models", "published_checkpoints"}
 """Pages that take long and whose subjects have tests of their own."""
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
