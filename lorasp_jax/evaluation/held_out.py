@@ -303,6 +303,8 @@ def _by_instruction(compared: Sequence[np.ndarray], found: Windows) -> dict[str,
 
 COLUMNS = ("first action", "chunk", "hold still", "repeat previous")
 """Columns of `table`: errors of the policy's first action and chunk, and of two that do nothing."""
+DONE = ("policy", "hold still", "repeat previous")
+"""Columns of `HeldOut.instructions`."""
 
 
 def table(found: HeldOut) -> dict[str, list[float]]:

@@ -34,8 +34,7 @@ def test_episodes_are_equal(exported):
     assert reports == [(25, 126), (58, 126), (98, 126), (126, 126)]
     found = LeRobot(folder)
     assert (found.kind, len(found)) == ("LeRobot v3.0", 4)
-    joints = [*(f"joint_{i + 1}.pos" for i in range(6)), "gripper.pos"]
-    assert found.names == {"state": joints, "action": joints}
+    assert found.names == LeRobot(golden("v3")).names
     for number, episode in enumerate(episodes):
         assert_equal(found.episode(number), episode)
 

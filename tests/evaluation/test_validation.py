@@ -270,9 +270,13 @@ def test_evaluate_on_another_dataset(recorded, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(export, "load_policy", lambda _: recorded.policy)
     monkeypatch.setattr(export, "describe", lambda _: {"control_dt": 0.1})
     run = str(recorded.folder)
+    monkeypatch.setenv("COLUMNS", "200")
     arguments = [run, "--data", str(golden("v21")), "--out", str(tmp_path / "out")]
     assert main([*arguments, "--episodes", "0", "3", "--denoise-steps", "2"]) == 0
-    assert "hold still" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert all(
+        text in printed for text in ("hold still", "joint_1", *recorded.recordings.instructions)
+    )
     assert len(list((tmp_path / "out").glob("*.png"))) == 1
     assert main([*arguments, "--episodes", "4"]) == 2
     assert "0 to 3" in capsys.readouterr().err
