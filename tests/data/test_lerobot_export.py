@@ -61,6 +61,7 @@ def test_actions_other_than_joint_targets(tmp_path):
     info = json.loads((tmp_path / "dataset" / "meta" / "info.json").read_text())
     assert (info["fps"], info["robot_type"]) == (20, "panda")
     assert info["features"]["action"]["names"] is None
+    assert info["features"]["observation.state"]["names"][-2:] == ["joint_6.pos", "gripper.pos"]
     rows = pq.read_table(tmp_path / "dataset" / "data" / "chunk-000" / "file-001.parquet")
     length = int(episodes.length[1])
     np.testing.assert_array_equal(rows["action"].to_pylist(), episodes.action[1, :length])

@@ -119,7 +119,16 @@ def test_poses_are_no_joint_targets(recorded):
 
 
 def test_displacements_hold_still_at_zero(recorded):
-    """Actions of another length than states are no joint targets."""
+    """Actions of another length than states are no joint targets, nor those near zero."""
+
+    class Moves(LeRobot):
+        def episode(self, number, cameras=None):
+            episode = super().episode(number, cameras)
+            return dataclasses.replace(episode, action=episode.action - episode.state)
+
+    moves = windows(Moves(golden("v3")), OUT, recorded.policy, every=10)
+    assert not moves.still.any()
+    assert dict(moves.units)["joint_1"] == 1
 
     class Shorter(LeRobot):
         def episode(self, number, cameras=None):
@@ -143,7 +152,7 @@ def test_units(recorded):
         assert dataclasses.replace(found, raw=raw).units[0] == ("joint_1", 1)
     unnamed = dataclasses.replace(found, names=())
     raw = dataclasses.replace(found.raw, actions=found.raw.actions[..., 1:])
-    shorter = dataclasses.replace(unnamed, raw=raw, grippers=(5,))
+    shorter = dataclasses.replace(unnamed, raw=raw, targets=False, grippers=(5,))
     assert [name for name, _ in shorter.units] == [f"action {i}" for i in range(1, 7)]
     small = dataclasses.replace(found.raw, actions=0.1 * found.raw.actions)
     two = dataclasses.replace(unnamed, raw=small, grippers=(2, 6))
