@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lorasp_jax.data.batches import Batch, RawBatch, encode, flatten, gather
+from envs.datasets.episodes import Episodes
+from lorasp_jax.data.batches import Batch, RawBatch, Steps, encode, flatten, gather
 from lorasp_jax.data.source import Source, dimension_names, grippers
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.policies.policy import Policy
@@ -160,11 +161,7 @@ def windows(
     parts, previous, where = [], [], []
     for number in chosen:
         episode = source.episode(number)
-        if episode.actions != "joint":
-            raise ValueError(f"policies give joint targets, but {episode.actions} was recorded")
-        steps = flatten([episode])
-        rows = policy.processor.prompts.rows(episode.instructions)
-        steps = dataclasses.replace(steps, instruction=rows[steps.instruction])
+        steps = _steps(episode, policy)
         all_starts = [*range(0, len(steps.end), every or 1)]
         starts = np.array(_evenly(all_starts, limit if every else share), np.int32)
         parts.append(gather(steps, starts, chunk))
@@ -189,6 +186,15 @@ def windows(
         tuple(dimension_names(source).get("action", ())),
         tuple(grippers(source)),
     )
+
+
+def _steps(episode: Episodes, policy: Policy) -> Steps:
+    """Return the steps of an episode, with instructions as rows of the policy's prompts."""
+    if episode.actions != "joint":
+        raise ValueError(f"policies give joint targets, but {episode.actions} was recorded")
+    steps = flatten([episode])
+    rows = policy.processor.prompts.rows(episode.instructions)
+    return dataclasses.replace(steps, instruction=rows[steps.instruction])
 
 
 def _are_targets(state: np.ndarray, action: np.ndarray) -> bool:
