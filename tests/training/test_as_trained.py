@@ -110,6 +110,9 @@ def test_a_dry_run_without_the_files_follows_the_name(capsys):
     model, _ = base.base_model(config, abstract=True)
     assert (model.config.chunk, model.config.inputs.prompt_state) == (10, False)
     assert "pi05_libero" in capsys.readouterr().err
+    random = ModelConfig(size="nano_pi05", checkpoint="", openpi_config="pi05_droid")
+    model, _ = base.base_model(dataclasses.replace(CONFIG, model=random), abstract=True)
+    assert model.config.chunk == 15
 
 
 def recordings(state, action, grippers):
