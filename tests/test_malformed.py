@@ -135,6 +135,8 @@ HEADER = {
     "crc32": [{}],
     "crc32/state": [1],
     "tasks": [[], "x"],
+    "grippers": [[6], {"state": [7], "action": [6]}, {"state": [6], "action": ["gripper"]}],
+    "names": [{"state": ["x"]}, {"state": ["x"], "action": ["x"]}],
 }
 METHODS = {"": [[], {}, {"nowhere": {}}], "/lin~0/method": ["lorra", None], "/lin~0/unknown": [1]}
 METHODS |= {"/lin~0/rank": ["8", 0, NAN, 4, 10**9], "/lin~0/router": ["x"]}

@@ -22,7 +22,7 @@ from envs.rendering.video import side_by_side
 from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.config import AugmentConfig
 from lorasp_jax.data.augmentation import Augment, on_wrist, recipe
-from lorasp_jax.data.source import Source, describe_left_out
+from lorasp_jax.data.source import Source, describe_left_out, grippers
 from lorasp_jax.data.video import downscale
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.policies.offline_tokenizer import num_tokens
@@ -42,6 +42,7 @@ class Summary:
         action: f32 `[N, A]`.
         length: int `[E]`, steps of each episode.
         names: "state" and "action" -> names of the dimensions.
+        grippers: which of the state's dimensions are grippers.
         phrases: instruction -> number of episodes.
         robot: name of the robot.
         tasks: names of the tasks.
@@ -51,6 +52,7 @@ class Summary:
     action: np.ndarray
     length: np.ndarray
     names: dict[str, list[str]]
+    grippers: list[int]
     phrases: dict[str, int]
     robot: str
     tasks: tuple[str, ...]
@@ -69,6 +71,7 @@ def summarize(source: Source) -> Summary:
         action=np.concatenate([np.asarray(e.action[0]) for e in episodes]),
         length=np.array([e.num_steps for e in episodes]),
         names=getattr(source, "names", {}) or _names(episodes[0]),
+        grippers=grippers(source, "state"),
         phrases=dict(phrases.most_common()),
         robot=episodes[0].robot,
         tasks=tuple(dict.fromkeys(e.task for e in episodes)),
@@ -116,10 +119,9 @@ def report(source: Source, console: Console) -> None:
 
 def hints(summary: Summary) -> list[str]:
     """Return hints about probable unit errors in a recording."""
-    joints, gripper = (
-        np.abs(summary.state[:, :-1]).max(initial=0),
-        np.abs(summary.state[:, -1]).max(),
-    )
+    is_gripper = np.isin(np.arange(summary.state.shape[1]), summary.grippers)
+    joints = np.abs(summary.state[:, ~is_gripper]).max(initial=0)
+    gripper = np.abs(summary.state[:, is_gripper]).max()
     texts = []
     if joints > 2 * math.pi:
         texts.append(

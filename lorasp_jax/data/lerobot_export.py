@@ -18,7 +18,7 @@ from PIL import Image
 from envs.datasets.episodes import Episodes
 from lorasp_jax.base.locks import locked
 from lorasp_jax.base.writing import atomic_folder, write_text
-from lorasp_jax.data.source import Progress, Source
+from lorasp_jax.data.source import Progress, Source, dimension_names
 from lorasp_jax.policies import statistics_files
 
 _FILES_PER_CHUNK = 1000
@@ -53,7 +53,7 @@ def to_lerobot(source: Source, path: str | os.PathLike[str], progress: Progress)
         OSError: the disk is full.
     """
     with locked(Path(path)), atomic_folder(path) as folder:
-        writer = _Writer(folder, source.control_dt)
+        writer = _Writer(folder, source.control_dt, dimension_names(source))
         for number in range(len(source)):
             writer.append(source.episode(number))
             progress(writer.steps, source.num_steps)
@@ -63,8 +63,9 @@ def to_lerobot(source: Source, path: str | os.PathLike[str], progress: Progress)
 class _Writer:
     """Writes one episode at a time and keeps the metadata of all."""
 
-    def __init__(self, folder: Path, control_dt: float) -> None:
+    def __init__(self, folder: Path, control_dt: float, names: dict[str, list[str]]) -> None:
         self.folder, self.fps, self.steps = folder, round(1 / control_dt), 0
+        self._names = names
         if abs(self.fps * control_dt - 1) > 1e-3:
             raise ValueError(f"LeRobot needs whole frames per second, got {1 / control_dt:g}")
         self._tasks: dict[str, int] = {}
@@ -75,7 +76,7 @@ class _Writer:
 
     def append(self, episode: Episodes) -> None:
         number, length = len(self._episodes), int(episode.length[0])
-        features = _features(episode)
+        features = _features(episode, self._names)
         if number and (features, episode.robot) != (self._features, self._robot):
             raise ValueError(f"episode {number} has another robot or other shapes than the first")
         self._features, self._robot = features, episode.robot
@@ -146,17 +147,20 @@ def _statistics(array: np.ndarray) -> dict[str, Any]:
     return moments | {"count": [len(array)]}
 
 
-def _features(episode: Episodes) -> dict[str, Any]:
-    joints = [*(f"joint_{i + 1}.pos" for i in range(episode.state.shape[2] - 1)), "gripper.pos"]
+def _features(episode: Episodes, names: dict[str, list[str]]) -> dict[str, Any]:
+    joints = names.get("state") or [
+        *(f"joint_{i + 1}.pos" for i in range(episode.state.shape[2] - 1)),
+        "gripper.pos",
+    ]
     same = episode.actions == "joint" and episode.action.shape[2] == len(joints)
-    actions = joints if same else None
+    actions = names.get("action") or (joints if same else None)
     features: dict[str, Any] = {
         "observation.state": {"dtype": "float32", "shape": [len(joints)], "names": joints},
         "action": {"dtype": "float32", "shape": [episode.action.shape[2]], "names": actions},
     }
-    names = ["height", "width", "channels"]
+    axes = ["height", "width", "channels"]
     for camera, images in episode.image.items():
-        features[_key(camera)] = {"dtype": "image", "shape": [*images.shape[2:]], "names": names}
+        features[_key(camera)] = {"dtype": "image", "shape": [*images.shape[2:]], "names": axes}
     features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
     return features | {name: {"dtype": "int64", "shape": [1], "names": None} for name in _INDICES}
 

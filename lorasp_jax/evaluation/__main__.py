@@ -2,9 +2,8 @@
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.markup import escape
@@ -12,9 +11,6 @@ from rich.table import Table
 
 from lorasp_jax.base.errors import run_command
 from lorasp_jax.data.__main__ import add_keys, keys_of
-
-if TYPE_CHECKING:
-    from lorasp_jax.evaluation.held_out import HeldOut
 
 
 def main(arguments: Sequence[str], program: str = "lorasp-jax evaluate") -> int:
@@ -73,7 +69,10 @@ def evaluate(options: argparse.Namespace, console: Console) -> None:
     found = held_out.measure(
         policy, held_out.windows(source, numbers, policy), num_steps=options.denoise_steps
     )
-    console.print(_table(found))
+    console.print(_table("mean error", held_out.COLUMNS, held_out.table(found), 2))
+    if len(found.instructions) > 1:
+        title = "mean error by instruction [standard deviations]"
+        console.print(_table(title, held_out.DONE, found.instructions, 3))
     errors = (found.policy.mean, found.hold.mean, found.repeat.mean)
     console.print(
         "action error {:.3f}, holding still {:.3f}, repeating the previous action {:.3f} (standard "
@@ -88,15 +87,15 @@ def evaluate(options: argparse.Namespace, console: Console) -> None:
         console.print(f"picture: {path}", soft_wrap=True, highlight=False, markup=False)
 
 
-def _table(found: "HeldOut") -> Table:
-    from lorasp_jax.evaluation import held_out
-
+def _table(
+    title: str, columns: Sequence[str], rows: Mapping[str, Sequence[float]], digits: int
+) -> Table:
     table = Table(box=None, padding=(0, 2, 0, 0))
-    table.add_column("mean error")
-    for title in held_out.COLUMNS:
-        table.add_column(title, justify="right")
-    for name, values in held_out.table(found).items():
-        table.add_row(escape(name), *(f"{value:.2f}" for value in values))
+    table.add_column(title)
+    for column in columns:
+        table.add_column(column, justify="right")
+    for name, values in rows.items():
+        table.add_row(escape(name), *(f"{value:.{digits}f}" for value in values))
     return table
 
 

@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.datasets.episodes import Episodes
 from lorasp_jax.adapters.compress.quantization import is_quantized
 from lorasp_jax.config import VALIDATION_WINDOWS
-from lorasp_jax.data.batches import Batch, RawBatch, encode, flatten, gather
+from lorasp_jax.data.batches import Batch, RawBatch, Steps, encode, flatten, gather
 from lorasp_jax.data.source import Source, dimension_names, grippers
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.policies.policy import Policy
@@ -35,8 +36,8 @@ class Windows:
 
     Attributes:
         raw: the windows, in host memory.
-        still: f32 `[N, J+1]`, the action that holds still: the state, or zeros where actions are
-            displacements, which have another length than states.
+        targets: whether actions are joint targets, not displacements.
+        still: f32 `[N, J+1]`, the action that holds still: the state, or zeros for displacements.
         previous: f32 `[N, J+1]`, the action before each window; first in an episode: `still`.
         task, phrase: the task of each window, and its instruction.
         episode, step: int `[N]`, where each window starts.
@@ -46,6 +47,7 @@ class Windows:
     """
 
     raw: RawBatch
+    targets: bool
     still: np.ndarray
     previous: np.ndarray
     task: tuple[str, ...]
@@ -62,7 +64,7 @@ class Windows:
         actions = np.abs(np.asarray(self.raw.actions)).max((0, 1))
         is_gripper = np.isin(np.arange(len(actions)), self.grippers)
         limits = np.where(is_gripper, 1.0, 2 * np.pi)
-        if self.raw.state.shape[-1] != len(actions) or (actions > limits).any():
+        if not self.targets or (actions > limits).any():
             titles = self._titles([f"action {i}" for i in range(1, len(actions) + 1)])
             return [(title, 1.0) for title in titles]
         joints = iter(f"joint {i}" for i in range(1, len(actions) + 1))
@@ -157,36 +159,49 @@ def windows(
     """
     chunk, chosen = policy.model.config.chunk, _evenly([*episodes], limit)
     share = limit // len(chosen)
-    parts, still, previous, where = [], [], [], []
+    parts, previous, where = [], [], []
     for number in chosen:
         episode = source.episode(number)
-        if episode.actions != "joint":
-            raise ValueError(f"policies give joint targets, but {episode.actions} was recorded")
-        steps = flatten([episode])
-        rows = policy.processor.prompts.rows(episode.instructions)
-        steps = dataclasses.replace(steps, instruction=rows[steps.instruction])
+        steps = _steps(episode, policy)
         all_starts = [*range(0, len(steps.end), every or 1)]
         starts = np.array(_evenly(all_starts, limit if every else share), np.int32)
         parts.append(gather(steps, starts, chunk))
-        is_target = steps.state.shape[-1] == steps.action.shape[-1]
-        still.append(steps.state[starts] if is_target else 0 * steps.action[starts])
-        previous.append(np.where(starts[:, None] > 0, steps.action[starts - 1], still[-1]))
+        previous.append(steps.action[starts - 1])
         phrase = episode.instructions[int(episode.instruction[0])]
         where += [(episode.task, phrase, number, int(start)) for start in starts]
     raw = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     task, phrases, number, start = zip(*where, strict=True)
+    targets = _are_targets(raw.state, raw.actions[:, 0])
+    still = raw.state if targets else 0 * raw.actions[:, 0]
+    starts = np.array(start)
     return Windows(
         raw,
-        np.concatenate(still),
-        np.concatenate(previous),
+        targets,
+        still,
+        np.where(starts[:, None] > 0, np.concatenate(previous), still),
         task,
         phrases,
         np.array(number),
-        np.array(start),
+        starts,
         source.control_dt,
         tuple(dimension_names(source).get("action", ())),
         tuple(grippers(source)),
     )
+
+
+def _steps(episode: Episodes, policy: Policy) -> Steps:
+    """Return the steps of an episode, with instructions as rows of the policy's prompts."""
+    if episode.actions != "joint":
+        raise ValueError(f"policies give joint targets, but {episode.actions} was recorded")
+    steps = flatten([episode])
+    rows = policy.processor.prompts.rows(episode.instructions)
+    return dataclasses.replace(steps, instruction=rows[steps.instruction])
+
+
+def _are_targets(state: np.ndarray, action: np.ndarray) -> bool:
+    """Whether actions `[N, n]` are closer to the states than to zero, where displacements are."""
+    same = state.shape[-1] == action.shape[-1]
+    return same and bool(np.abs(action - state).mean() <= np.abs(action).mean())
 
 
 def _evenly(values: Sequence[int], count: int) -> list[int]:
@@ -307,6 +322,8 @@ def _by_instruction(compared: Sequence[np.ndarray], found: Windows) -> dict[str,
 
 COLUMNS = ("first action", "chunk", "hold still", "repeat previous")
 """Columns of `table`: errors of the policy's first action and chunk, and of two that do nothing."""
+DONE = ("policy", "hold still", "repeat previous")
+"""Columns of `HeldOut.instructions`."""
 
 
 def table(found: HeldOut) -> dict[str, list[float]]:

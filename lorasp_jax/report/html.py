@@ -152,7 +152,8 @@ def _held_out(folder: Path, rows: figures.Rows) -> Iterable[str]:
         errors = found["errors"].items()
         yield _table(header, ((k, *(f"{x:.2f}" for x in v)) for k, v in errors))
         if len(phrases := found.get("instructions", {})) > 1:  # the worst ones, see `held_out`
-            header = ("instruction, mean error [std]", "policy", "hold still", "repeat previous")
+            title = "mean error by instruction [standard deviations]"
+            header = (title, "policy", "hold still", "repeat previous")
             yield _table(header, ((k, *(f"{x:.3f}" for x in v)) for k, v in phrases.items()))
     for picture in sorted(folder.glob("held_out_*.png")):
         data = base64.b64encode(read_bytes(picture, folder)).decode()

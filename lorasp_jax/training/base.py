@@ -53,9 +53,10 @@ def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str
     if not (model_config.inputs.masks_missing or config.data.source):  # see `setup.build`
         cameras = model_config.cameras[: len(envs.Env.cameras)]
         model_config = dataclasses.replace(model_config, cameras=cameras)
-    if abstract and (not options.source or hub.is_remote(options.source)):
-        if options.openpi_config or hub.BUCKET.fullmatch(options.source):  # openpi's are there
-            model_config = _as_trained(options, model_config)
+    unseen = not options.source or (abstract and hub.is_remote(options.source))
+    if unseen and (options.openpi_config or hub.BUCKET.fullmatch(options.source)):
+        model_config = _as_trained(options, model_config)  # openpi's are in buckets
+    if unseen and abstract:
         return nnx.eval_shape(lambda: model_config.create(nnx.Rngs(0))), ""
     if options.source:
         checkpoint = loading.find(options.source)

@@ -153,9 +153,7 @@ def _loop(
         deferred() as stop,
         bars(run.console, "samples", per_step=config.optim.batch_size) as progress,
     ):
-        text = f"resumed at step {saved}, " * bool(saved) + "compiling train step ..."
-        text = text if saved < total else "trained"
-        bar = progress.add_task(text, total=total, completed=saved)
+        bar = progress.add_task(_first_text(saved, total), total=total, completed=saved)
         while (done := int(state.step)) < total and not stopped:
             count = _log_interval(config, done)
             state, metrics = program(state, key, done, count)
@@ -180,6 +178,13 @@ def _loop(
     if stopped:
         raise KeyboardInterrupt
     return state
+
+
+def _first_text(saved: int, total: int) -> str:
+    """Return the text of the bar before the first step."""
+    if saved >= total:
+        return "trained"
+    return f"resumed at step {saved}, " * bool(saved) + "compiling train step ..."
 
 
 def _failure(

@@ -31,7 +31,7 @@ def test_summary(source):
 
 def test_a_gripper_alone_has_no_joints(source):
     found = inspection.summarize(source)
-    alone = dataclasses.replace(found, state=2 + found.state[:, 6:])
+    alone = dataclasses.replace(found, state=2 + found.state[:, 6:], grippers=[0])
     (hint,) = inspection.hints(alone)
     assert "--gripper millimetres" in hint
 
@@ -57,6 +57,10 @@ def test_wrong_units_give_hints(source):
     degrees, millimetres = inspection.hints(dataclasses.replace(found, state=found.state * scale))
     assert "--angles degrees" in degrees
     assert "--gripper millimetres" in millimetres
+    two_arms = dataclasses.replace(found, state=np.tile(found.state * [*[1] * 6, 100], 2))
+    two_arms = dataclasses.replace(two_arms, grippers=[6, 13])
+    (hint,) = inspection.hints(two_arms)
+    assert "--gripper millimetres" in hint
 
 
 def test_contact_sheet(source, tmp_path):

@@ -34,8 +34,7 @@ def test_episodes_are_equal(exported):
     assert reports == [(25, 126), (58, 126), (98, 126), (126, 126)]
     found = LeRobot(folder)
     assert (found.kind, len(found)) == ("LeRobot v3.0", 4)
-    joints = [*(f"joint_{i + 1}.pos" for i in range(6)), "gripper.pos"]
-    assert found.names == {"state": joints, "action": joints}
+    assert found.names == LeRobot(golden("v3")).names
     for number, episode in enumerate(episodes):
         assert_equal(found.episode(number), episode)
 
@@ -62,6 +61,7 @@ def test_actions_other_than_joint_targets(tmp_path):
     info = json.loads((tmp_path / "dataset" / "meta" / "info.json").read_text())
     assert (info["fps"], info["robot_type"]) == (20, "panda")
     assert info["features"]["action"]["names"] is None
+    assert info["features"]["observation.state"]["names"][-2:] == ["joint_6.pos", "gripper.pos"]
     rows = pq.read_table(tmp_path / "dataset" / "data" / "chunk-000" / "file-001.parquet")
     length = int(episodes.length[1])
     np.testing.assert_array_equal(rows["action"].to_pylist(), episodes.action[1, :length])

@@ -119,7 +119,16 @@ def test_poses_are_no_joint_targets(recorded):
 
 
 def test_displacements_hold_still_at_zero(recorded):
-    """Actions of another length than states are no joint targets."""
+    """Actions of another length than states are no joint targets, nor those near zero."""
+
+    class Moves(LeRobot):
+        def episode(self, number, cameras=None):
+            episode = super().episode(number, cameras)
+            return dataclasses.replace(episode, action=episode.action - episode.state)
+
+    moves = windows(Moves(golden("v3")), OUT, recorded.policy, every=10)
+    assert not moves.still.any()
+    assert dict(moves.units)["joint_1"] == 1
 
     class Shorter(LeRobot):
         def episode(self, number, cameras=None):
@@ -143,7 +152,7 @@ def test_units(recorded):
         assert dataclasses.replace(found, raw=raw).units[0] == ("joint_1", 1)
     unnamed = dataclasses.replace(found, names=())
     raw = dataclasses.replace(found.raw, actions=found.raw.actions[..., 1:])
-    shorter = dataclasses.replace(unnamed, raw=raw, grippers=(5,))
+    shorter = dataclasses.replace(unnamed, raw=raw, targets=False, grippers=(5,))
     assert [name for name, _ in shorter.units] == [f"action {i}" for i in range(1, 7)]
     small = dataclasses.replace(found.raw, actions=0.1 * found.raw.actions)
     two = dataclasses.replace(unnamed, raw=small, grippers=(2, 6))
@@ -270,9 +279,13 @@ def test_evaluate_on_another_dataset(recorded, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(export, "load_policy", lambda _: recorded.policy)
     monkeypatch.setattr(export, "describe", lambda _: {"control_dt": 0.1})
     run = str(recorded.folder)
+    monkeypatch.setenv("COLUMNS", "200")
     arguments = [run, "--data", str(golden("v21")), "--out", str(tmp_path / "out")]
     assert main([*arguments, "--episodes", "0", "3", "--denoise-steps", "2"]) == 0
-    assert "hold still" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert all(
+        text in printed for text in ("hold still", "joint_1", *recorded.recordings.instructions)
+    )
     assert len(list((tmp_path / "out").glob("*.png"))) == 1
     assert main([*arguments, "--episodes", "4"]) == 2
     assert "0 to 3" in capsys.readouterr().err

@@ -1,25 +1,34 @@
 """A base is adapted with the chunk, prompts, relative actions and units of its training."""
 
 import dataclasses
+import io
 import json
+import time
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
 
+from envs.datasets import rlds
 from lorasp_jax import models
-from lorasp_jax.config import Config, DataConfig, ModelConfig
+from lorasp_jax.config import DataConfig, ModelConfig
 from lorasp_jax.models import inputs
-from lorasp_jax.models.checkpoints import loading
+from lorasp_jax.models.checkpoints import loading, published
 from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.peft import LoRA
 from lorasp_jax.policies import aloha
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Offline
-from lorasp_jax.training import base, setup
+from lorasp_jax.training import base, export, setup
+from lorasp_jax.training.cost import preflight
+from lorasp_jax.training.loop import train
 from lorasp_jax.training.overrides import override
 from lorasp_jax.training.relative import for_robot
 from lorasp_jax.training.run_folder import to_json
+from tests.models.random_models import random_backbone
 from tests.runs import CONFIG, random_episodes
 
 ARM = (*[True] * 6, False)
@@ -46,7 +55,7 @@ def folder_of_openpi(folder, chunk=None):
     return folder
 
 
-def found(where, *options, size="base_pi05") -> Config:
+def found(where, *options, size="base_pi05"):
     """Return the config of the base that a run with these options has."""
     config = dataclasses.replace(CONFIG, model=ModelConfig(size=size, checkpoint=str(where)))
     return base.base_model(override(config, options))[0].config
@@ -101,6 +110,9 @@ def test_a_dry_run_without_the_files_follows_the_name(capsys):
     model, _ = base.base_model(config, abstract=True)
     assert (model.config.chunk, model.config.inputs.prompt_state) == (10, False)
     assert "pi05_libero" in capsys.readouterr().err
+    random = ModelConfig(size="nano_pi05", checkpoint="", openpi_config="pi05_droid")
+    model, _ = base.base_model(dataclasses.replace(CONFIG, model=random), abstract=True)
+    assert model.config.chunk == 15
 
 
 def recordings(state, action, grippers):
@@ -159,3 +171,37 @@ def test_older_runs_resume():
     assert "openpi_config" not in model
     named = dataclasses.replace(CONFIG, model=ModelConfig(openpi_config="none"), data=DataConfig())
     assert to_json(named)["model"]["openpi_config"] == "none"
+
+
+def test_a_checkpoint_of_openpi_trains_and_is_exported(tmp_path, monkeypatch):
+    """From a folder named after its training config, on recordings; the given chunk wins."""
+    cameras = Pi0Config.base().cameras
+    tiny = dataclasses.replace(
+        Pi0Config.dummy(), pi05=True, cameras=cameras, action_dim=32, inputs=inputs.OPENPI_PI05
+    )
+    published.save(tmp_path / "pi05_libero", random_backbone(tiny), "openpi")
+    monkeypatch.setattr(Pi0Config, "base_pi05", lambda: dataclasses.replace(tiny))
+    remat = "none", preflight.Memory(*6 * [0.0])
+    monkeypatch.setattr(preflight, "choose_remat", lambda *_: remat)
+    rlds.write(random_episodes("press", 0), tmp_path / "rlds")
+    config = dataclasses.replace(
+        CONFIG,
+        model=ModelConfig(size="base_pi05", checkpoint=str(tmp_path / "pi05_libero")),
+        data=DataConfig(source=str(tmp_path / "rlds")),
+        evaluation=dataclasses.replace(CONFIG.evaluation, execute_steps=1),
+        peft=LoRA(rank=4),
+        targets=("action_out",),
+    )
+    console = Console(file=io.StringIO())
+    (tmp_path / "run").mkdir()
+    run = setup.prepare(config, tmp_path / "run", console, time.time())
+    assert run.policy.model.config.chunk == 10
+    assert run.policy.processor.prompts.numbers is None  # no state in prompts
+    run.devices = jax.devices()[:1]
+    train(run)
+    export.write(run)
+    policy = export.load_policy(tmp_path / "run")
+    expected = dataclasses.replace(inputs.OPENPI_PI05, prompt_state=False)
+    assert (policy.model.config.chunk, policy.processor.inputs) == (10, expected)
+    shorter = override(config, ["--model.chunk", "6"])
+    assert setup.build(shorter, tmp_path / "other").base.config.chunk == 6
