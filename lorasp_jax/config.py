@@ -165,10 +165,18 @@ class AugmentConfig:
 class DataConfig:
     """Training data: demonstrations of the scripted expert, or a dataset."""
 
-    source: str = ""
-    """Dataset to train on, which then also sets robot and tasks: LeRobot (folder or
-    hf://owner/name), RLDS, or a cache (python -m lorasp_jax.data convert). Empty: collect
-    demonstrations with the scripted expert."""
+    source: tuple[str, ...] = ()
+    """Datasets to train on, which then also set robot and tasks: LeRobot (folder or
+    hf://owner/name), RLDS, a cache, or a TOML file with a dataset's options (python -m
+    lorasp_jax.data inspect --save). Empty: collect demonstrations with the scripted expert."""
+    weights: tuple[float, ...] = ()
+    """Relative share of the windows drawn from each dataset; empty: its number of windows."""
+    replay: float = 0.0
+    """Share of the windows drawn from the last dataset: what the base was taught, not to validate
+    on; weights are those of the others."""
+    statistics: Literal["shared", "each"] = "shared"
+    """Normalize by statistics over all datasets, or each by its own; the policy then acts with those
+    of the first, or of one named when it is loaded."""
     cameras: tuple[str, ...] = ()
     """Cameras of the dataset to use, in the order of the backbone's; empty: all, by name."""
     episodes: int = 512
@@ -188,9 +196,14 @@ class DataConfig:
     trains; a multiple of log_every. 0: never."""
 
     def __post_init__(self) -> None:
+        given = (self.source,) if isinstance(self.source, str) else self.source  # one, in Python
+        object.__setattr__(self, "source", tuple(filter(None, given)))
         fields.check_fields(self)
         _at_least(1, self, "episodes", "num_envs")
         _at_least(0, self, "action_noise", "fresh_every")
+        _require(0 <= self.replay < 1, "data.replay must lie in [0, 1)", self.replay)
+        positive = all(weight > 0 for weight in self.weights)
+        _require(positive, "data.weights must be above 0", self.weights)
         if not self.source and self.validation not in (("auto",), ("0",)):
             raise ValueError("data.validation holds episodes of a dataset out: add data.source")
         if self.fresh_every and self.source:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lorasp_jax.data.batches import RawBatch, encode, flatten, gather
+from lorasp_jax.data.cache import Cache
 from lorasp_jax.data.source import Source
 from lorasp_jax.policies.policy import Policy
 
@@ -62,7 +63,8 @@ class Errors:
     Attributes:
         action: over the chunk, by dimension, `[J+1]` [rad, m].
         first: of the first action, by dimension, `[J+1]` [rad, m].
-        horizon: by step of the chunk, `[C]`, in standard deviations of the recorded actions.
+        horizon: by step of the chunk, `[C]`, in standard deviations of the recorded actions, of
+            each dataset by its own.
         mean: over the chunk and all dimensions, in standard deviations of the recorded actions, at
             least a tenth of their median.
     """
@@ -130,6 +132,10 @@ def windows(
         steps = flatten([episode])
         rows = policy.processor.prompts.rows(episode.instructions)
         steps = dataclasses.replace(steps, instruction=rows[steps.instruction])
+        if isinstance(source, Cache) and source.parts[1:]:
+            steps = dataclasses.replace(
+                steps, dataset=np.full_like(steps.end, source.dataset[number])
+            )
         all_starts = [*range(0, len(steps.end), every or 1)]
         starts = np.array(_evenly(all_starts, MAX_WINDOWS if every else share), np.int32)
         parts.append(gather(steps, starts, chunk))
@@ -204,6 +210,7 @@ def _loss(
 def _actions(policy: Policy, raw: RawBatch, key: jax.Array, *, num_steps: int) -> jax.Array:
     observed: Any = {"image": raw.image, "state": raw.state}
     observed = jax.tree.map(jnp.asarray, observed)
+    policy = dataclasses.replace(policy, processor=policy.processor.of_rows(raw.dataset))
     return policy.sample(key, observed, jnp.asarray(raw.instruction), num_steps=num_steps)
 
 
@@ -212,14 +219,21 @@ def _errors(actions: np.ndarray, raw: RawBatch) -> Errors:
     inside = np.asarray(raw.inside)[..., None]
     recorded = np.asarray(raw.actions, np.float64)
     distance = np.abs(actions - recorded) * inside
-    rows = recorded[np.asarray(raw.inside)]
-    spread = rows.std(0)
-    # What hardly moves must not decide: its standard deviation is the noise of its sensor.
-    spread = np.maximum(spread, max(0.1 * float(np.median(spread)), 1e-6))
-    by_step = distance.sum(0) / np.maximum(inside.sum(0), 1)
-    action = distance.sum((0, 1)) / inside.sum()
-    horizon, mean = (by_step / spread).mean(-1), float((action / spread).mean())
+    dataset = np.zeros(len(recorded), np.int32) if raw.dataset is None else np.asarray(raw.dataset)
+    spread = np.ones_like(recorded[:, :1])
+    for index in np.unique(dataset):
+        spread[dataset == index] = _spread(recorded[dataset == index], inside[dataset == index])
+    relative = (distance / spread).mean(-1)
+    horizon = relative.sum(0) / np.maximum(inside.sum((0, 2)), 1)
+    action, mean = distance.sum((0, 1)) / inside.sum(), float(relative.sum() / inside.sum())
     return Errors(action, distance[:, 0].mean(0), horizon, mean)
+
+
+def _spread(recorded: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """Return the standard deviations of actions `[N, C, J+1]` inside their episodes."""
+    spread = recorded[inside[..., 0]].std(0)
+    # What hardly moves must not decide: its standard deviation is the noise of its sensor.
+    return np.maximum(spread, max(0.1 * float(np.median(spread)), 1e-6))
 
 
 COLUMNS = ("first action", "chunk", "hold still", "repeat previous")

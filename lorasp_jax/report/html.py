@@ -189,7 +189,8 @@ def _subtitle(config: dict[str, Any], results: dict[str, Any]) -> str:
 def _learned_from(config: dict[str, Any]) -> str:
     """Name the recordings; a dataset also sets the robot, which the config then does not know."""
     source = config.get("data", {}).get("source")
-    return f"recordings {source}" if source else f"robot {config['robot']}"
+    names = source if isinstance(source, str) else ", ".join(source or ())
+    return f"recordings {names}" if names else f"robot {config['robot']}"
 
 
 def _success(results: dict[str, Any]) -> Iterable[str]:

@@ -88,6 +88,8 @@ def _metadata(run: Run) -> dict[str, Any]:
     """Describe the training data and everything that the policy needs besides weights."""
     config, first = run.config, next(iter(run.episodes.values()))
     processor = run.policy.processor
+    known = processor.datasets if config.data.statistics == "each" else None
+    each = {n: _json(processor.of_dataset(n).statistics) for n in known.names} if known else {}
     return {
         "robot": config.robot,
         "tasks": list(config.tasks),
@@ -103,13 +105,23 @@ def _metadata(run: Run) -> dict[str, Any]:
             "action_length": len(processor.action_slots),
             "cameras": {slot: name for slot, name in processor.cameras if name},
             "relative": list(processor.inputs.delta),
-            "statistics": json.loads(processor.statistics.to_json()),
+            "statistics": _json(processor.statistics),
+            **({"datasets": each} if each else {}),
         },
     }
 
 
+def _json(statistics: Statistics) -> dict[str, Any]:
+    return json.loads(statistics.to_json())
+
+
 def load_policy(
-    folder: str | os.PathLike[str], *, base: str = "", words: str = "", any_base: bool = False
+    folder: str | os.PathLike[str],
+    *,
+    base: str = "",
+    words: str = "",
+    any_base: bool = False,
+    dataset: str = "",
 ) -> Policy:
     """Load the policy of a finished run.
 
@@ -118,16 +130,22 @@ def load_policy(
         base: location of the frozen base (see `models.load`); default: the recorded one.
         words: location of the tokenizer; default: the recorded one.
         any_base: accept a base whose weights differ from the original's (see `load_adapters`).
+        dataset: whose statistics the policy acts with, where each dataset has its own; default: the
+            first one's.
 
     Returns:
         The policy; `Policy.sample` takes indices into `processor.prompts.instructions`.
 
     Raises:
-        ValueError: there is no such folder, the run is not finished, its files are corrupt, or the
-            base is missing or differs from the one used in training.
+        ValueError: there is no such folder, the run is not finished, its files are corrupt, there
+            are no statistics of the dataset, or the base is missing or differs from the one used in
+            training.
     """
     folder = Path(folder)
     metadata, path, is_full = _read_metadata(folder)
+    if dataset and dataset not in (known := datasets(metadata)):
+        names = ", ".join(known) or "all its datasets together"
+        raise ValueError(f"{folder} has statistics of {names}, not of {dataset!r} alone")
     try:
         policy = metadata["policy"]
         config = backbone.find(policy["backbone"]).from_dict(policy["config"])
@@ -145,6 +163,8 @@ def load_policy(
         model = native.load_adapters(folder, model, any_base=any_base)
     model = quantized(model, metadata.get(QUANTIZED))
     try:
+        if dataset:
+            policy = policy | {"statistics": policy["datasets"][dataset]}
         return Policy(model, _processor(policy, config, words))
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path} does not describe a policy") from error
@@ -157,6 +177,11 @@ def describe(folder: str | os.PathLike[str]) -> dict[str, Any]:
         ValueError: there is no such folder, the run is not finished, or its files are corrupt.
     """
     return _read_metadata(Path(folder))[0]
+
+
+def datasets(metadata: Mapping[str, Any]) -> list[str]:
+    """Return the names of the datasets with statistics of their own, from `describe`'s result."""
+    return [*metadata["policy"].get("datasets", {})]
 
 
 def is_run(folder: str | os.PathLike[str]) -> bool:

@@ -24,25 +24,30 @@ from lorasp_jax.base import hub
 from lorasp_jax.base.bars import bars
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Batch, encode, flatten, sample_batch, windows
+from lorasp_jax.data.joined import Part
 from lorasp_jax.data.source import Source, describe_left_out
-from lorasp_jax.data.split import held_out
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.policies.policy import Policy
-from lorasp_jax.policies.processor import Processor, Statistics, check_delta, robot_slots, to_delta
+from lorasp_jax.policies.processor import (
+    Datasets,
+    Processor,
+    Statistics,
+    check_delta,
+    robot_slots,
+    to_delta,
+)
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Tokenizer, load_tokenizer
-from lorasp_jax.training import rules
+from lorasp_jax.training import dataset, rules
 from lorasp_jax.training.base import base_model, quantized, with_config
 from lorasp_jax.training.cost import preflight
-from lorasp_jax.training.dataset import as_cache, is_simulated, open_dataset, outline, without
 from lorasp_jax.training.demonstrations import Demonstrations, Progress, demonstrations, in_thread
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Run
-from lorasp_jax.training.run_folder import record_dataset
 
 STATISTICS_BATCHES = 8
 """Number of batches used for data-driven initialization."""
@@ -103,7 +108,7 @@ def build(config: Config, folder: Path, *, abstract: bool = False) -> RunSetup:
     base, base_hash = base_model(config, abstract=abstract)
     chosen = {name: getattr(config.model, name) for name in ("max_tokens", "chunk")}
     base = with_config(base, **{name: value for name, value in chosen.items() if value})
-    source = open_dataset(config, base.config, folder) if config.data.source else None
+    source = dataset.open_dataset(config, base.config, folder) if config.data.source else None
     if source and not base.config.inputs.masks_missing:
         base = with_config(base, cameras=base.config.cameras[: len(source.cameras)])
     prompts, joints = _prompts_and_joints(source, environments, tokenizer, base.config)
@@ -152,6 +157,10 @@ def prepare(
     _load_or_collect(run, built, collect, meanwhile)
     options = {"relative": config.model.relative_actions, "cameras": config.data.cameras}
     inputs = processor([*run.episodes.values()], model.config, built.prompts, **options)
+    if run.recordings and (parts := run.recordings.parts)[1:]:
+        each = config.data.statistics == "each"
+        groups = dataset.by_dataset(run.recordings, run.held_out).values() if each else ()
+        inputs = of_datasets(inputs, model.config, parts, [*groups])
     if any(method.needs_statistics for method in rules.methods(config)):
         model = _adapt(config, base, rules.rules(config), input_moments(run, base, inputs))
     if built.source:
@@ -176,7 +185,7 @@ def _load_or_collect(
     with run.timed("collect"), processes.first_process_first("collected"):
         futures = [in_thread(function, run, built) for function in meanwhile]
         if built.source:
-            _load_dataset(run, built.source, built.free_bytes)
+            dataset.load(run, built.source, built.free_bytes)
         else:
             run.episodes = _collect(run, built.prompts.instructions, collect)
         for future in futures:
@@ -310,17 +319,8 @@ def processor(
     slots, dim = robot_slots(joints, model_config.inputs), model_config.action_dim
     action_slots = robot_slots(length - 1, model_config.inputs)
     delta = (*[True] * (length - 1), False) if relative else model_config.inputs.delta
-    steps = flatten([dataclasses.replace(group, image={}) for group in episodes])
-    chunk = model_config.chunk if delta else 1
-    window, _ = windows(steps, jnp.arange(len(steps.end)), chunk)
-    action = np.asarray(
-        to_delta(jnp.asarray(steps.action[window]), jnp.asarray(steps.state), delta)
-    ).reshape(-1, length)
-    state = np.repeat(np.asarray(steps.state), chunk, axis=0)
-    valid = np.ones(len(state), bool)
-    statistics = Statistics.measure(
-        state, action, valid, slots=slots, dim=dim, action_slots=action_slots
-    )
+    slots = {"slots": slots, "dim": dim, "action_slots": action_slots}
+    statistics = _measure(episodes, delta, model_config.chunk, **slots)
     ordered = cameras or sorted(episodes[0].image)
     return Processor.of(
         model_config,
@@ -333,36 +333,46 @@ def processor(
     )
 
 
-def _load_dataset(run: Run, source: Source, free_bytes: float) -> None:
-    """Load the dataset; stream it if it is larger than `free_bytes`."""
-    with bars(run.console, "steps") as progress:
-        bar = progress.add_task(f"reading {run.config.data.source}", total=None)
-        report = lambda done, total: progress.update(bar, completed=done, total=total)  # noqa: E731
-        cache = as_cache(source, run.folder, report)
-        if processes.is_first():  # the others read the same files
-            cache.verify_images()
-        progress.update(bar, completed=cache.num_steps, total=cache.num_steps)
-    metadata = cache.metadata
-    facts = (metadata[name] for name in ("tasks", "robot", "physics_dt"))
-    run.recordings, run.simulated = cache, is_simulated(*facts)
-    tasks = [cache.episode(number, ()).task for number in range(len(cache))]
-    run.held_out = held_out(run.config.data.validation, tasks, recorded=not run.simulated)
-    run.dataset, run.episodes = without(cache.steps, run.held_out), outline(cache, run.held_out)
-    identity = {name: metadata[name] for name in ("crc32", "instructions")}
-    if run.held_out:
-        identity["held_out"] = run.held_out
-    streams = sum(x.nbytes for x in jax.tree.leaves(run.dataset)) > free_bytes
-    run.streams = record_dataset(run.folder, identity, streams=streams)
-    run.config = dataclasses.replace(
-        run.config, robot=metadata["robot"], tasks=tuple(metadata["tasks"])
-    )
-    location = "streamed from disk" if run.streams else "held on the device"
-    run.console.print(f"{cache.num_steps} steps in {len(cache)} episodes, {location}")
-    if run.held_out:
-        names = ", ".join(map(str, run.held_out))
-        run.console.print(f"held out of training: {len(run.held_out)} episodes ({names})")
-    if recipe := run.augmentation:
-        run.console.print(f"images change while training, by the recipe of {recipe.preset}")
+def _measure(
+    episodes: Sequence[Episodes], delta: Sequence[bool], chunk: int, **slots: Any
+) -> Statistics:
+    """Return the statistics of all steps, of actions relative to the state where `delta` is."""
+    steps = flatten([dataclasses.replace(group, image={}) for group in episodes])
+    chunk = chunk if delta else 1
+    window, _ = windows(steps, jnp.arange(len(steps.end)), chunk)
+    action = to_delta(jnp.asarray(steps.action[window]), jnp.asarray(steps.state), delta)
+    action = np.asarray(action).reshape(-1, action.shape[-1])
+    state = np.repeat(np.asarray(steps.state), chunk, axis=0)
+    return Statistics.measure(state, action, np.ones(len(state), bool), **slots)
+
+
+def of_datasets(
+    inputs: Processor,
+    model_config: BackboneConfig,
+    parts: Sequence[Part],
+    groups: Sequence[Sequence[Episodes]] = (),
+) -> Processor:
+    """Return a processor that knows the cameras of each dataset, and its own statistics.
+
+    Args:
+        inputs: the processor of all datasets.
+        model_config: config of the backbone.
+        parts: the datasets.
+        groups: the episodes of each, for its own statistics; the robot then has those of the first.
+            Empty: the statistics are shared.
+    """
+    slots = {"slots": inputs.state_slots, "action_slots": inputs.action_slots}
+    slots["dim"] = model_config.action_dim
+    delta, chunk = inputs.inputs.delta, model_config.chunk
+    each = [_measure(group, delta, chunk, **slots) for group in groups]
+    each = each or [inputs.statistics] * len(parts)
+    present = {
+        name: jnp.array([name in part.cameras for part in parts]) for _, name in inputs.cameras
+    }
+    names = tuple(part.name for part in parts)
+    stacked = jax.tree.map(lambda *arrays: jnp.stack(arrays), *each)
+    datasets = Datasets(stacked, {name: x for name, x in present.items() if not x.all()}, names)
+    return dataclasses.replace(inputs, statistics=each[0], datasets=datasets)
 
 
 def _collect(run: Run, instructions: Sequence[str], collect: Collect) -> Demonstrations:

@@ -40,10 +40,10 @@ class Loaded:
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
 
-def load_run(folder: str, *, base: str = "", words: str = "") -> Loaded:
+def load_run(folder: str, *, base: str = "", words: str = "", dataset: str = "") -> Loaded:
     """Load a finished run; arguments and errors are those of `load_policy`."""
     described = export.describe(folder)
-    policy = export.load_policy(folder, base=base, words=words)
+    policy = export.load_policy(folder, base=base, words=words, dataset=dataset)
     recorded = hub.resolve_portable(described["policy"]["tokenizer"])
     config = read_json(Path(folder) / CONFIG_FILE, {"optim": {}})
     return Loaded(
