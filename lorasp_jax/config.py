@@ -172,11 +172,11 @@ class DataConfig:
     weights: tuple[float, ...] = ()
     """Relative share of the windows drawn from each dataset; empty: its number of windows."""
     replay: float = 0.0
-    """Share of the windows drawn from the last dataset: what the base was taught, not to validate
-    on; weights are those of the others."""
+    """Share of the windows drawn from what the base was taught: the last dataset, which is not
+    validated on and has no weight, or, without datasets, the other tasks of a base made here."""
     statistics: Literal["shared", "each"] = "shared"
-    """Normalize by statistics over all datasets, or each by its own; the policy then acts with those
-    of the first, or of one named when it is loaded."""
+    """Normalize by statistics over all datasets, or each by its own; the policy then acts with the
+    first one's, or those of one named when it is loaded."""
     cameras: tuple[str, ...] = ()
     """Cameras of the dataset to use, in the order of the backbone's; empty: all, by name."""
     episodes: int = 512
@@ -206,8 +206,8 @@ class DataConfig:
         _require(positive, "data.weights must be above 0", self.weights)
         if not self.source and self.validation not in (("auto",), ("0",)):
             raise ValueError("data.validation holds episodes of a dataset out: add data.source")
-        if self.fresh_every and self.source:
-            raise ValueError("data.fresh_every cannot be combined with data.source: drop one")
+        if self.fresh_every and (name := "source" if self.source else "replay" * bool(self.replay)):
+            raise ValueError(f"data.fresh_every cannot be combined with data.{name}: drop one")
         if self.cameras and not self.source:
             raise ValueError("data.cameras are those of a dataset: name it with data.source")
 

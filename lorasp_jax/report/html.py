@@ -18,6 +18,7 @@ from lorasp_jax.training import records
 from lorasp_jax.training.finished_run import recorded_method
 from lorasp_jax.training.run_folder import (
     CONFIG_FILE,
+    DATASET_FILE,
     STOPPED,
     TIMES_FILE,
     VALIDATION,
@@ -71,6 +72,7 @@ def write_report(folder: Path) -> Path:
         *(() if finished else _progress(folder, config, rows)),
         *_success(results),
         "<h2>Training</h2>",
+        *_datasets(folder),
         *_training(rows),
         *_held_out(folder, rows),
         *_rules(results),
@@ -120,6 +122,16 @@ def _progress(folder: Path, config: dict[str, Any], rows: figures.Rows) -> Itera
     step, steps = rows[-1]["step"] if rows else 0, config["optim"]["steps"]
     yield f"<p>Running: step {step:.0f} of {steps}.</p>"
     yield _REFRESH
+
+
+def _datasets(folder: Path) -> Iterable[str]:
+    """Show what is drawn from each of several datasets."""
+    found = read_json(folder / DATASET_FILE, records.DATASET)
+    if each := found.get("facts", {}).get("datasets"):
+        header = ("dataset", "episodes", "windows", "share of what is drawn")
+        values = ((x["episodes"], x["windows"], f"{100 * x['share']:.1f} %") for x in each)
+        rows = ((x["name"], *map(str, row)) for x, row in zip(each, values, strict=True))
+        yield _table(header, rows)
 
 
 def _training(rows: figures.Rows) -> Iterable[str]:

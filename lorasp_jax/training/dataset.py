@@ -45,7 +45,7 @@ def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
     paths = [folder / CACHE] if cached else config.data.source
     keys, cameras = Keys(image_size=model.image_size), config.data.cameras
     source = open_sources(paths, keys, cameras, functools.partial(_square, model))
-    _check_weights(config.data, [part.name for part in parts_of(source)])
+    _check_parts(config.data, model, parts_of(source))
     path = " + ".join(map(str, paths))
     if not same_period(source.control_dt, config.control_dt):
         raise ValueError(
@@ -83,20 +83,26 @@ def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
     return source
 
 
-def _check_weights(data: DataConfig, names: Sequence[str]) -> None:
-    """Raise ValueError unless weights, replay and statistics fit the number of datasets."""
-    known = ", ".join(names) or "one"
-    if data.replay and len(names) < 2:
+def _check_parts(data: DataConfig, model: BackboneConfig, parts: Sequence[Part]) -> None:
+    """Raise ValueError unless the settings and the backbone fit the datasets."""
+    known = f"the datasets are {', '.join(part.name for part in parts) or 'one'}"
+    if data.replay and len(parts) < 2:
         raise ValueError(
             "data.replay needs demonstrations of what the base was taught: name their dataset last "
-            f"in data.source, after the others; the datasets are {known}"
+            f"in data.source, after the others; {known}"
         )
-    learned = names[: len(names) - bool(data.replay)]
-    if data.weights and len(data.weights) != len(learned):
+    if data.weights and len(data.weights) != len(parts) - bool(data.replay):
         raise ValueError(
-            f"data.weights needs a number for each dataset{', but the last' * bool(data.replay)}, "
-            f"got {len(data.weights)}; the datasets are {known}"
+            f"data.weights needs a number for each dataset{' but the last' * bool(data.replay)}, "
+            f"got {len(data.weights)}; {known}"
         )
+    every = {camera for part in parts for camera in part.cameras}
+    for part in parts if not model.inputs.masks_missing else ():
+        if missing := sorted(every - {*part.cameras}):
+            raise ValueError(
+                f"{part.name} has no camera {missing[0]}, and this backbone cannot mask a missing "
+                f"one: choose those that all have with --data.cameras {' '.join(part.cameras)}"
+            )
 
 
 def _square(model: BackboneConfig, images: np.ndarray) -> np.ndarray:

@@ -92,7 +92,7 @@ def _metadata(run: Run) -> dict[str, Any]:
     each = {n: _json(processor.of_dataset(n).statistics) for n in known.names} if known else {}
     return {
         "robot": config.robot,
-        "tasks": list(config.tasks),
+        "tasks": list(run.episodes),
         "control_dt": first.control_dt,
         "physics_dt": first.physics_dt,
         "policy": {

@@ -8,14 +8,11 @@ from types import MappingProxyType
 from typing import Any
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 from flax import nnx
 from rich.console import Console
 from rich.progress import TaskID
 
 import envs
-from envs.datasets.episodes import Episodes
 from envs.env import Env
 from lorasp_jax import peft
 from lorasp_jax.adapters import adaptation, paths, summary
@@ -23,30 +20,33 @@ from lorasp_jax.adapters.compress import calibration
 from lorasp_jax.base import hub
 from lorasp_jax.base.bars import bars
 from lorasp_jax.config import Config
-from lorasp_jax.data.batches import Batch, encode, flatten, sample_batch, windows
-from lorasp_jax.data.joined import Part
+from lorasp_jax.data.batches import Batch, encode, sample_batch
 from lorasp_jax.data.source import Source, describe_left_out
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import (
-    Datasets,
     Processor,
-    Statistics,
     check_delta,
     robot_slots,
-    to_delta,
 )
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Tokenizer, load_tokenizer
 from lorasp_jax.training import dataset, rules
 from lorasp_jax.training.base import base_model, quantized, with_config
 from lorasp_jax.training.cost import preflight
-from lorasp_jax.training.demonstrations import Demonstrations, Progress, demonstrations, in_thread
+from lorasp_jax.training.demonstrations import (
+    Demonstrations,
+    Progress,
+    demonstrations,
+    in_thread,
+)
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.distributed import processes
+from lorasp_jax.training.processors import of_datasets, processor
 from lorasp_jax.training.random_streams import RandomStream
+from lorasp_jax.training.replay import replayed_tasks
 from lorasp_jax.training.run import Run
 
 STATISTICS_BATCHES = 8
@@ -101,7 +101,7 @@ def build(config: Config, folder: Path, *, abstract: bool = False) -> RunSetup:
             target that matches no layer, or an invalid batch size or number of steps to execute.
     """
     sizes = {"image_size": config.image_size, "control_dt": config.control_dt}
-    tasks = () if config.data.source else config.tasks
+    tasks = () if config.data.source else (*config.tasks, *replayed_tasks(config))
     environments = [envs.make(task, robot=config.robot, **sizes) for task in tasks]
     use_bundled = abstract and hub.is_remote(config.model.tokenizer)
     tokenizer = load_tokenizer("" if use_bundled else config.model.tokenizer)
@@ -301,80 +301,6 @@ def _batch_sampler(run: Run, processor: Processor, chunk: int) -> Callable[[jax.
     )
 
 
-def processor(
-    episodes: Sequence[Episodes],
-    model_config: BackboneConfig,
-    prompts: PromptTable,
-    *,
-    relative: bool = False,
-    cameras: Sequence[str] = (),
-) -> Processor:
-    """Build the processor from the prompts and the statistics of the demonstrations.
-
-    `cameras`, by default all sorted by name, fill the backbone's camera slots in order. With
-    `relative`, joint targets are relative to the state at the start of the chunk; otherwise the
-    model's config decides.
-    """
-    joints, length = episodes[0].state.shape[-1] - 1, episodes[0].action.shape[-1]
-    slots, dim = robot_slots(joints, model_config.inputs), model_config.action_dim
-    action_slots = robot_slots(length - 1, model_config.inputs)
-    delta = (*[True] * (length - 1), False) if relative else model_config.inputs.delta
-    slots = {"slots": slots, "dim": dim, "action_slots": action_slots}
-    statistics = _measure(episodes, delta, model_config.chunk, **slots)
-    ordered = cameras or sorted(episodes[0].image)
-    return Processor.of(
-        model_config,
-        statistics,
-        prompts,
-        num_joints=joints,
-        action_length=length,
-        cameras=dict(zip(model_config.cameras, ordered, strict=False)),
-        delta=delta,
-    )
-
-
-def _measure(
-    episodes: Sequence[Episodes], delta: Sequence[bool], chunk: int, **slots: Any
-) -> Statistics:
-    """Return the statistics of all steps, of actions relative to the state where `delta` is."""
-    steps = flatten([dataclasses.replace(group, image={}) for group in episodes])
-    chunk = chunk if delta else 1
-    window, _ = windows(steps, jnp.arange(len(steps.end)), chunk)
-    action = to_delta(jnp.asarray(steps.action[window]), jnp.asarray(steps.state), delta)
-    action = np.asarray(action).reshape(-1, action.shape[-1])
-    state = np.repeat(np.asarray(steps.state), chunk, axis=0)
-    return Statistics.measure(state, action, np.ones(len(state), bool), **slots)
-
-
-def of_datasets(
-    inputs: Processor,
-    model_config: BackboneConfig,
-    parts: Sequence[Part],
-    groups: Sequence[Sequence[Episodes]] = (),
-) -> Processor:
-    """Return a processor that knows the cameras of each dataset, and its own statistics.
-
-    Args:
-        inputs: the processor of all datasets.
-        model_config: config of the backbone.
-        parts: the datasets.
-        groups: the episodes of each, for its own statistics; the robot then has those of the first.
-            Empty: the statistics are shared.
-    """
-    slots = {"slots": inputs.state_slots, "action_slots": inputs.action_slots}
-    slots["dim"] = model_config.action_dim
-    delta, chunk = inputs.inputs.delta, model_config.chunk
-    each = [_measure(group, delta, chunk, **slots) for group in groups]
-    each = each or [inputs.statistics] * len(parts)
-    present = {
-        name: jnp.array([name in part.cameras for part in parts]) for _, name in inputs.cameras
-    }
-    names = tuple(part.name for part in parts)
-    stacked = jax.tree.map(lambda *arrays: jnp.stack(arrays), *each)
-    datasets = Datasets(stacked, {name: x for name, x in present.items() if not x.all()}, names)
-    return dataclasses.replace(inputs, statistics=each[0], datasets=datasets)
-
-
 def _collect(run: Run, instructions: Sequence[str], collect: Collect) -> Demonstrations:
     """Collect demonstrations, with a progress bar per task."""
     with bars(run.console, "episodes") as progress:
@@ -386,7 +312,12 @@ def _collect(run: Run, instructions: Sequence[str], collect: Collect) -> Demonst
                 bar_ids[task] = progress.add_task(text, total=total)
             progress.update(bar_ids[task], completed=done, description=text)
 
-        episodes = collect(run.config, run.folder, report)
+        replayed, config = replayed_tasks(run.config), run.config
+        if replayed:
+            share = f"{100 * config.data.replay:g} % of the windows"
+            run.console.print(f"{share} are of what the base was taught: {', '.join(replayed)}")
+            config = dataclasses.replace(config, tasks=(*config.tasks, *replayed))
+        episodes = collect(config, run.folder, report)
     # Steps refer to instructions by index.
     if [phrase for group in episodes.values() for phrase in group.instructions] != [*instructions]:
         raise ValueError(

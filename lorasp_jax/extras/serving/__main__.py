@@ -149,7 +149,7 @@ def _compiled(options: argparse.Namespace, named: dict[str, str]) -> dict[str, A
     """Load runs or a checkpoint."""
     from lorasp_jax.extras.serving import loading
     from lorasp_jax.extras.serving.policies import CompiledPolicy, batch_sizes
-    from lorasp_jax.training.export import datasets, describe, is_run
+    from lorasp_jax.training.export import is_run
 
     if options.max_batch is not None:
         batch_sizes(options.max_batch)  # an invalid one is refused before what takes long
@@ -162,10 +162,6 @@ def _compiled(options: argparse.Namespace, named: dict[str, str]) -> dict[str, A
         others = [name for name in CHECKPOINT_OPTIONS if name != "dataset"]
         _refuse(options, others, "is for published checkpoints: runs record theirs")
         where = {"base": options.base, "words": options.tokenizer, "dataset": options.dataset}
-        for run in named.values():
-            if (known := datasets(describe(run))) and not options.dataset:
-                text = f"{run} acts with the statistics of {known[0]}; --dataset chooses among "
-                _say(Console(stderr=True), text + ", ".join(known))
         # One at a time, as the prepared weights are copies.
         return {name: compiled(loading.load_run(run, **where)) for name, run in named.items()}
     if len(named) > 1:
