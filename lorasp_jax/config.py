@@ -175,8 +175,8 @@ class DataConfig:
     """Share of the windows drawn from what the base was taught: the last dataset, which is not
     validated on and has no weight, or, without datasets, the other tasks of a base made here."""
     statistics: Literal["shared", "each"] = "shared"
-    """Normalize by statistics over all datasets, or each by its own; the policy then acts with the
-    first one's, or those of one named when it is loaded."""
+    """Normalize by statistics over all datasets, or each by its own; the policy then acts for the
+    first, or for one that is named when it is loaded."""
     cameras: tuple[str, ...] = ()
     """Cameras of the dataset to use, in the order of the backbone's; empty: all, by name."""
     episodes: int = 512

@@ -46,7 +46,9 @@ def read(where: str | os.PathLike[str], image_size: int) -> tuple[str, Keys]:
     path = content.pop("path", None)
     if not isinstance(path, str) or not path:
         raise ValueError(f'{file} must say where the dataset is: path = "...", got {path!r}')
-    options = {key: _tuple(x) if isinstance(x, list) else x for key, x in content.items()}
+    options: dict[str, Any] = {
+        key: _tuple(x) if isinstance(x, list) else x for key, x in content.items()
+    }
     try:
         keys = Keys(**options, image_size=image_size)
     except ValueError as error:

@@ -59,7 +59,7 @@ class Renamed:
 
 
 class Joined:
-    """Several datasets as one, in order; each has an episode and some of the cameras.
+    """Several datasets as one, in order.
 
     Robots of different names become one robot "a + b". Recordings joined with simulated episodes
     count as recordings.
@@ -94,8 +94,8 @@ class Joined:
         self.left_out: dict[str, str] = {
             f"{camera} of {name}": reason
             for name, each in sources.items()
-            for camera, reason in {**each.left_out, **not_chosen}.items()
-            if camera in each.left_out or camera in each.cameras
+            for camera, reason in {**not_chosen, **each.left_out}.items()
+            if camera in {*each.cameras, *each.left_out}
         }
         self.parts: tuple[Part, ...] = tuple(
             Part(name, len(each), tuple(camera for camera in chosen if camera in each.cameras))
@@ -105,13 +105,12 @@ class Joined:
         self._check_cameras()
         first = {part.name: sources[part.name].episode(0, part.cameras) for part in self.parts}
         _check(first)
-        self._fit = fit
-        self.cameras: dict[str, tuple[int, int]] = {
-            camera: self._size(camera, {n: e for n, e in first.items() if camera in e.image})
-            for camera in chosen
-        }
-        self._same = _common([*first.values()])
+        self._fit, self._same = fit, _common([*first.values()])
         self.control_dt: float = self._same["control_dt"]
+        self.cameras: dict[str, tuple[int, int]] = {}
+        for camera in chosen:
+            having = {name: e for name, e in first.items() if camera in e.image}
+            self.cameras[camera] = self._size(camera, having)
 
     def __len__(self) -> int:
         """Number of episodes."""
@@ -155,8 +154,8 @@ class Joined:
                     f"camera {camera} has {size[0]} x {size[1]} pixels in {name} and {found[0]} x "
                     f"{found[1]} in {other}: name both in --data.source of a run, which pads them"
                 )
-            return self._fit(np.asarray(first[name].image[camera])[0, :1]).shape[1:3]
-        return size
+            size = self._fit(np.asarray(first[name].image[camera])[0, :1]).shape[1:3]
+        return size[0], size[1]
 
     def _check_cameras(self) -> None:
         """Raise ValueError if a dataset has no camera of the first one's."""

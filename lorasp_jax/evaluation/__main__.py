@@ -32,9 +32,9 @@ def parser(program: str) -> argparse.ArgumentParser:
         "task. Nothing is simulated.",
     )
     parser.add_argument("run", type=Path, help="folder of the run, such as runs/multitask")
-    text = "LeRobot dataset (folder or hf://owner/name), RLDS dataset or cache"
+    text = "LeRobot dataset (folder or hf://owner/name), RLDS dataset, cache, or its TOML file"
     parser.add_argument("--data", required=True, metavar="DATASET", help=text)
-    text = "dataset of the run whose statistics the policy acts with (default: its first)"
+    text = "for which of the run's datasets the policy acts, if they differ (default: the first)"
     parser.add_argument("--dataset", default="", metavar="NAME", help=text)
     text = "numbers of the episodes (default: all)"
     parser.add_argument("--episodes", nargs="+", type=int, metavar="N", help=text)

@@ -210,7 +210,8 @@ def _loss(
 def _actions(policy: Policy, raw: RawBatch, key: jax.Array, *, num_steps: int) -> jax.Array:
     observed: Any = {"image": raw.image, "state": raw.state}
     observed = jax.tree.map(jnp.asarray, observed)
-    policy = dataclasses.replace(policy, processor=policy.processor.of_rows(raw.dataset))
+    dataset = None if raw.dataset is None else jnp.asarray(raw.dataset)
+    policy = dataclasses.replace(policy, processor=policy.processor.of_rows(dataset))
     return policy.sample(key, observed, jnp.asarray(raw.instruction), num_steps=num_steps)
 
 

@@ -197,11 +197,14 @@ class Processor:
         return dataclasses.replace(self, **changed)
 
     def of_dataset(self, name: str) -> "Processor":
-        """Return a processor for a robot, with the statistics of one of the datasets."""
+        """Return a processor for the robot of one of the datasets: its statistics and cameras."""
         assert self.datasets is not None
         row = self.datasets.names.index(name)
-        statistics = jax.tree.map(lambda array: array[row], self.datasets.statistics)
-        return dataclasses.replace(self, statistics=statistics, datasets=None)
+        own = jax.tree.map(lambda array: array[row], self.datasets)
+        missing = {camera for camera, present in own.present.items() if not present}
+        cameras = tuple((slot, None if x in missing else x) for slot, x in self.cameras)
+        changed = {"statistics": own.statistics, "cameras": cameras, "datasets": None}
+        return dataclasses.replace(self, **changed)
 
     @property
     def flow_slots(self) -> np.ndarray:

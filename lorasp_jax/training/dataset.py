@@ -169,7 +169,7 @@ def _describe(run: Run, cache: Cache, datasets: Sequence[Mapping[str, Any]]) -> 
         console.print(text, markup=False, soft_wrap=True)
     if datasets and run.config.data.statistics == "each":
         console.print(
-            "each dataset is normalized by its own statistics; the policy acts with those of "
+            "each dataset is normalized by its own statistics; the policy acts for "
             f"{cache.parts[0].name} unless another is named with --dataset",
             markup=False,
             soft_wrap=True,
@@ -210,12 +210,11 @@ def outline(dataset: Cache, left_out: Collection[int] = ()) -> dict[str, Episode
     return groups
 
 
-def by_dataset(dataset: Cache, held_out: Collection[int]) -> dict[str, list[Episodes]]:
-    """Return the episodes to train on by dataset, as `outline` does."""
-    return {
-        part.name: [*outline(dataset, {*held_out, *np.flatnonzero(dataset.dataset != i)}).values()]
-        for i, part in enumerate(dataset.parts)
-    }
+def by_dataset(dataset: Cache, held_out: Collection[int]) -> list[list[Episodes]]:
+    """Return the episodes to train on of each dataset, as `outline` does."""
+    index = dataset.dataset.tolist()
+    others = ({n for n, i in enumerate(index) if i != part} for part in range(len(dataset.parts)))
+    return [[*outline(dataset, {*held_out, *left_out}).values()] for left_out in others]
 
 
 def without(steps: Steps, held_out: Collection[int]) -> Steps:
@@ -231,8 +230,7 @@ def mixed(steps: Steps, data: DataConfig) -> Steps:
     """Return steps whose windows are drawn by `data.weights` and `data.replay`, if given."""
     if steps.dataset is None or not (data.weights or data.replay):
         return steps
-    windows = steps.dataset if steps.starts is None else steps.dataset[steps.starts]
-    counts = np.bincount(windows)
+    counts = _windows(steps)
     shares = np.array(data.weights or counts[: len(counts) - bool(data.replay)], float)
     shares *= (1 - data.replay) / shares.sum()
     shares = np.append(shares, [data.replay] * bool(data.replay)).astype(np.float32)
@@ -242,14 +240,18 @@ def mixed(steps: Steps, data: DataConfig) -> Steps:
 
 def shares(steps: Steps, parts: Sequence[Part]) -> list[dict[str, Any]]:
     """Describe datasets: name, episodes, windows to train on, and share of what is drawn."""
-    assert steps.dataset is not None
-    windows = steps.dataset if steps.starts is None else steps.dataset[steps.starts]
-    counts = np.bincount(windows)
+    counts = _windows(steps)
     drawn = counts / counts.sum() if steps.mixture is None else np.asarray(steps.mixture.shares)
     return [
         {"name": p.name, "episodes": p.episodes, "windows": int(n), "share": round(float(x), 6)}
         for p, n, x in zip(parts, counts, drawn, strict=True)
     ]
+
+
+def _windows(steps: Steps) -> np.ndarray:
+    """Return the number of windows of each dataset, `[D]`."""
+    assert steps.dataset is not None
+    return np.bincount(steps.dataset if steps.starts is None else steps.dataset[steps.starts])
 
 
 def is_simulated(tasks: Collection[str], robot: str, physics_dt: float) -> bool:

@@ -88,8 +88,10 @@ def _metadata(run: Run) -> dict[str, Any]:
     """Describe the training data and everything that the policy needs besides weights."""
     config, first = run.config, next(iter(run.episodes.values()))
     processor = run.policy.processor
-    known = processor.datasets if config.data.statistics == "each" else None
-    each = {n: _json(processor.of_dataset(n).statistics) for n in known.names} if known else {}
+    several, each = processor.datasets, config.data.statistics == "each"
+    names = several.names if several and (each or several.present) else ()
+    robots = {name: _robot(processor.of_dataset(name)) for name in names}
+    first = names[0] if names and each else ""
     return {
         "robot": config.robot,
         "tasks": list(run.episodes),
@@ -103,16 +105,17 @@ def _metadata(run: Run) -> dict[str, Any]:
             "instructions": list(processor.prompts.instructions),
             "num_joints": len(processor.state_slots) - 1,
             "action_length": len(processor.action_slots),
-            "cameras": {slot: name for slot, name in processor.cameras if name},
             "relative": list(processor.inputs.delta),
-            "statistics": _json(processor.statistics),
-            **({"datasets": each} if each else {}),
+            **(robots[first] if first else _robot(processor)),
+            **({"dataset": first, "datasets": robots} if robots else {}),
         },
     }
 
 
-def _json(statistics: Statistics) -> dict[str, Any]:
-    return json.loads(statistics.to_json())
+def _robot(processor: Processor) -> dict[str, Any]:
+    """Describe what differs between the datasets of a run."""
+    cameras = {slot: name for slot, name in processor.cameras if name}
+    return {"cameras": cameras, "statistics": json.loads(processor.statistics.to_json())}
 
 
 def load_policy(
@@ -130,22 +133,21 @@ def load_policy(
         base: location of the frozen base (see `models.load`); default: the recorded one.
         words: location of the tokenizer; default: the recorded one.
         any_base: accept a base whose weights differ from the original's (see `load_adapters`).
-        dataset: whose statistics the policy acts with, where each dataset has its own; default: the
-            first one's.
+        dataset: for whose robot the policy acts, where datasets differ in statistics or cameras;
+            default: the first with its own statistics, or all.
 
     Returns:
         The policy; `Policy.sample` takes indices into `processor.prompts.instructions`.
 
     Raises:
         ValueError: there is no such folder, the run is not finished, its files are corrupt, there
-            are no statistics of the dataset, or the base is missing or differs from the one used in
-            training.
+            is no such dataset, or the base is missing or differs from the one used in training.
     """
     folder = Path(folder)
     metadata, path, is_full = _read_metadata(folder)
     if dataset and dataset not in (known := datasets(metadata)):
-        names = ", ".join(known) or "all its datasets together"
-        raise ValueError(f"{folder} has statistics of {names}, not of {dataset!r} alone")
+        names = ", ".join(known) or "all its datasets alike"
+        raise ValueError(f"the policy of {folder} acts for {names}, not for {dataset!r}")
     try:
         policy = metadata["policy"]
         config = backbone.find(policy["backbone"]).from_dict(policy["config"])
@@ -164,7 +166,7 @@ def load_policy(
     model = quantized(model, metadata.get(QUANTIZED))
     try:
         if dataset:
-            policy = policy | {"statistics": policy["datasets"][dataset]}
+            policy = policy | policy["datasets"][dataset]
         return Policy(model, _processor(policy, config, words))
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path} does not describe a policy") from error
@@ -180,7 +182,7 @@ def describe(folder: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def datasets(metadata: Mapping[str, Any]) -> list[str]:
-    """Return the names of the datasets with statistics of their own, from `describe`'s result."""
+    """Return the names of datasets with own statistics or cameras, from `describe`'s result."""
     return [*metadata["policy"].get("datasets", {})]
 
 

@@ -64,13 +64,15 @@ def of_datasets(
         groups: the episodes of each, for its own statistics; the robot then has those of the first.
             Empty: the statistics are shared.
     """
-    slots = {"slots": inputs.state_slots, "action_slots": inputs.action_slots}
+    slots: dict[str, Any] = {"slots": inputs.state_slots, "action_slots": inputs.action_slots}
     slots["dim"] = model_config.action_dim
     delta, chunk = inputs.inputs.delta, model_config.chunk
     each = [_measure(group, delta, chunk, **slots) for group in groups]
     each = each or [inputs.statistics] * len(parts)
     present = {
-        name: jnp.array([name in part.cameras for part in parts]) for _, name in inputs.cameras
+        name: jnp.array([name in part.cameras for part in parts])
+        for _, name in inputs.cameras
+        if name
     }
     names = tuple(part.name for part in parts)
     stacked = jax.tree.map(lambda *arrays: jnp.stack(arrays), *each)

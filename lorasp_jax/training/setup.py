@@ -159,8 +159,8 @@ def prepare(
     inputs = processor([*run.episodes.values()], model.config, built.prompts, **options)
     if run.recordings and (parts := run.recordings.parts)[1:]:
         each = config.data.statistics == "each"
-        groups = dataset.by_dataset(run.recordings, run.held_out).values() if each else ()
-        inputs = of_datasets(inputs, model.config, parts, [*groups])
+        groups = dataset.by_dataset(run.recordings, run.held_out) if each else ()
+        inputs = of_datasets(inputs, model.config, parts, groups)
     if any(method.needs_statistics for method in rules.methods(config)):
         model = _adapt(config, base, rules.rules(config), input_moments(run, base, inputs))
     if built.source:

@@ -34,6 +34,7 @@ from tests.training.test_dataset import prepare
 
 EVALUATION = dataclasses.replace(CONFIG.evaluation, execute_steps=1, validate_every=2)
 NAMES = ("near", "far")
+CAMERAS = {"near": ["side", "wrist"], "far": ["side"]}
 
 
 def recorded(seed, scale):
@@ -126,10 +127,8 @@ def test_held_out_windows_act_by_their_dataset(run):
         own = dataclasses.replace(run.policy, processor=run.policy.processor.of_dataset(name))
         expected = sample(own, dataclasses.replace(found, raw=raw), num_steps=2)
         rows = which == index
-        if name == "near":  # the other lacks a camera, which the robot has
-            np.testing.assert_allclose(chunks[rows], expected[rows], rtol=1e-4, atol=1e-5)
-        else:
-            assert np.abs(chunks[rows]).max() < 0.2 < np.abs(chunks[~rows]).max()
+        np.testing.assert_allclose(chunks[rows], expected[rows], rtol=1e-4, atol=1e-5)
+        assert np.abs(expected[~rows] - chunks[~rows]).max() > 0.1
     assert 0.1 < measure(run.policy, found, num_steps=2).hold.mean < 10  # by each one's spread
 
 
@@ -139,7 +138,7 @@ def test_the_run_says_what_it_learns_from(run, tmp_path):
     far = int((run.steps.dataset[run.steps.starts] == 1).sum())
     assert f"75.0 % of the windows from near: 3 episodes, {count - far} windows" in printed
     assert "cameras side\n" in printed
-    assert re.search(r"acts with those of near .*--dataset", printed)
+    assert re.search(r"acts for near .*--dataset", printed)
     facts = read_json(run.folder / "dataset.json")["facts"]["datasets"]
     assert facts[1] == {"name": "far", "episodes": 3, "windows": far, "share": 0.25}
     write_json(run.folder / "config.json", to_json(run.config))
@@ -213,7 +212,8 @@ def test_an_exported_policy_acts_for_the_dataset_that_is_named(run, tmp_path):
         expected = run.policy.processor.of_dataset(wanted).statistics
         jax.tree.map(np.testing.assert_array_equal, found.statistics, expected)
         assert found.datasets is None
-    with pytest.raises(ValueError, match="statistics of near, far, not of 'other'"):
+        assert [camera for _, camera in found.cameras if camera] == CAMERAS[wanted]
+    with pytest.raises(ValueError, match="acts for near, far, not for 'other'"):
         export.load_policy(tmp_path, dataset="other")
 
 

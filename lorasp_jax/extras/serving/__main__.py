@@ -74,7 +74,7 @@ def _add_checkpoint_options(group: Any) -> None:
     checkpoint = group.add_argument
     checkpoint("--statistics", default="", help="normalization, if not in the checkpoint")
     checkpoint("--dataset", default="", help="which dataset's statistics, if there are several; "
-        "also of runs whose datasets have their own")  # fmt: skip
+        "or, of a run, for which of its datasets, if they differ")  # fmt: skip
     checkpoint("--openpi-config", help="openpi's training config, such as pi05_libero, "
         "which says all that follows (default: that which the folder is named after)")  # fmt: skip
     checkpoint("--size", help="size of the model: base or base_pi05")

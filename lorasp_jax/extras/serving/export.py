@@ -30,7 +30,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--out", type=Path, required=True, metavar="FOLDER", help="folder to create")
     add("--base", default="", help="the run's base, if it has moved")
     add("--tokenizer", default="", help="the policy's tokenizer, if it has moved")
-    add("--dataset", default="", help="whose statistics, if the run's datasets have their own")
+    add("--dataset", default="", help="for which of the run's datasets, if they differ")
     add("--num-steps", type=int, default=10, help="flow steps (default: %(default)s)")
     add("--max-batch", type=int, default=8, help="largest batch (default: %(default)s)")
     return parser

@@ -44,12 +44,13 @@ class Loaded:
 def load_run(folder: str, *, base: str = "", words: str = "", dataset: str = "") -> Loaded:
     """Load a finished run; arguments and errors are those of `load_policy`.
 
-    Says whose statistics the policy acts with if there is a choice.
+    Says for which dataset's robot the policy acts if there is a choice.
     """
     described = export.describe(folder)
     if (known := export.datasets(described)) and not dataset:
-        others = f"choose among {', '.join(known)} with --dataset"
-        print(f"{folder} acts with the statistics of {known[0]}: {others}", file=sys.stderr)
+        default = described["policy"]["dataset"] or "all its datasets"
+        others = f"--dataset chooses one of {', '.join(known)}"
+        print(f"{folder} acts for {default}; {others}", file=sys.stderr)
     policy = export.load_policy(folder, base=base, words=words, dataset=dataset)
     recorded = hub.resolve_portable(described["policy"]["tokenizer"])
     config = read_json(Path(folder) / CONFIG_FILE, {"optim": {}})
