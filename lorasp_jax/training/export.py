@@ -91,7 +91,7 @@ def _metadata(run: Run) -> dict[str, Any]:
     several, each = processor.datasets, config.data.statistics == "each"
     names = several.names if several and (each or several.present) else ()
     robots = {name: _robot(processor.of_dataset(name)) for name in names}
-    first = names[0] if names and each else ""
+    default = names[0] if names and each else ""
     return {
         "robot": config.robot,
         "tasks": list(run.episodes),
@@ -106,8 +106,8 @@ def _metadata(run: Run) -> dict[str, Any]:
             "num_joints": len(processor.state_slots) - 1,
             "action_length": len(processor.action_slots),
             "relative": list(processor.inputs.delta),
-            **(robots[first] if first else _robot(processor)),
-            **({"dataset": first, "datasets": robots} if robots else {}),
+            **(robots[default] if default else _robot(processor)),
+            **({"dataset": default, "datasets": robots} if robots else {}),
         },
     }
 

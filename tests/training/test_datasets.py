@@ -224,7 +224,13 @@ def test_shared_statistics_are_those_of_all(sources, tmp_path, monkeypatch):
     rows = np.concatenate([next(iter(learned(found, name))) for name in NAMES])
     np.testing.assert_allclose(processor.statistics.state["mean"][slots], rows.mean(0), atol=1e-5)
     assert found.steps.mixture is None
-    assert "datasets" not in export._metadata(found)["policy"]
+    described = export._metadata(found)["policy"]  # robots may still have other cameras
+    assert [*described["cameras"].values()] == ["side", "wrist"]
+    assert described["dataset"] == ""
+    for name in NAMES:
+        own = described["datasets"][name]
+        assert [*own["cameras"].values()] == CAMERAS[name]
+        assert own["statistics"] == described["statistics"]
     state = jnp.asarray(rows[:4])
     alike = processor.of_rows(jnp.array([0, 1, 0, 1])).normalize_state(state)
     np.testing.assert_allclose(alike, processor.normalize_state(state), atol=1e-6)
