@@ -202,14 +202,15 @@ class DataConfig:
         _at_least(1, self, "episodes", "num_envs")
         _at_least(0, self, "action_noise", "fresh_every")
         _require(0 <= self.replay < 1, "data.replay must lie in [0, 1)", self.replay)
-        positive = all(weight > 0 for weight in self.weights)
-        _require(positive, "data.weights must be above 0", self.weights)
+        _require(min(self.weights, default=1) > 0, "data.weights must be above 0", self.weights)
         if not self.source and self.validation not in (("auto",), ("0",)):
             raise ValueError("data.validation holds episodes of a dataset out: add data.source")
         if self.fresh_every and (name := "source" if self.source else "replay" * bool(self.replay)):
             raise ValueError(f"data.fresh_every cannot be combined with data.{name}: drop one")
-        if self.cameras and not self.source:
-            raise ValueError("data.cameras are those of a dataset: name it with data.source")
+        of_datasets = {"cameras": self.cameras, "weights": self.weights}
+        of_datasets["statistics"] = self.statistics == "each"
+        if not self.source and (name := next((k for k, x in of_datasets.items() if x), "")):
+            raise ValueError(f"data.{name} are those of a dataset: name it with data.source")
 
 
 @dataclass(frozen=True)

@@ -74,8 +74,8 @@ class Stream:
 def _order(steps: Steps, seed: int) -> Any:
     """Return the endless order of windows: all of them in each epoch, of each dataset if weighted.
 
-    The datasets of a mixture take turns; their shares, relative to the least, are rounded to
-    hundredths, so by at most 0.5 %.
+    The datasets of a mixture take turns. Their shares are rounded to hundredths of the least, so
+    that none changes by more than 1 % of itself.
     """
 
     def shuffled(low: int, high: int, seed: int) -> Any:

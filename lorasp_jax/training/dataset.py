@@ -85,7 +85,7 @@ def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
 
 def _check_parts(data: DataConfig, model: BackboneConfig, parts: Sequence[Part]) -> None:
     """Raise ValueError unless the settings and the backbone fit the datasets."""
-    known = f"the datasets are {', '.join(part.name for part in parts) or 'one'}"
+    known = f"the datasets are {', '.join(part.name for part in parts) or data.source[0]}"
     if data.replay and len(parts) < 2:
         raise ValueError(
             "data.replay needs demonstrations of what the base was taught: name their dataset last "
@@ -96,6 +96,8 @@ def _check_parts(data: DataConfig, model: BackboneConfig, parts: Sequence[Part])
             f"data.weights needs a number for each dataset{' but the last' * bool(data.replay)}, "
             f"got {len(data.weights)}; {known}"
         )
+    if blind := [part.name for part in parts if not part.cameras]:
+        raise ValueError(f"{blind[0]} has none of --data.cameras {' '.join(data.cameras)}")
     every = {camera for part in parts for camera in part.cameras}
     for part in parts if not model.inputs.masks_missing else ():
         if missing := sorted(every - {*part.cameras}):

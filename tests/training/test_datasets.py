@@ -253,6 +253,7 @@ def test_the_last_dataset_is_replayed(sources, tmp_path, monkeypatch):
     [
         ({"weights": (1.0,)}, {}, "weights needs a number for each dataset, got 1; .* near, far"),
         ({"weights": (1.0, 1.0), "replay": 0.1}, {}, "each dataset but the last, got 2"),
+        ({"cameras": ("wrist",)}, {}, "far .*wrist"),
         ({}, {"masks_missing": False}, "far has no camera wrist, .*--data.cameras side"),
     ],
 )
@@ -278,6 +279,9 @@ def test_on_the_command_line_and_in_the_file_of_a_run():
     for wrong in ({"weights": (0.0,)}, {"replay": 1.0}, {"statistics": "none"}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             DataConfig("a", **wrong)
+    for alone in ({"weights": (1.0,)}, {"statistics": "each"}):
+        with pytest.raises(ValueError, match=r"data\.source"):
+            DataConfig(**alone)
 
 
 BUNDLED = dataclasses.replace(CONFIG.model, checkpoint="assets/pi0_nano")
