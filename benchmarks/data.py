@@ -85,7 +85,7 @@ def read_cache(folder: Path, steps: int, size: tuple[int, int], batch: int, batc
     """Measure windows/s, and the time from opening the folder to the first batch."""
     path = folder / f"{size[0]}x{size[1]}"
     if not path.exists():
-        cache.write(Noise(steps, *size), path, lambda *_: None)
+        cache.write([Noise(steps, *size)], path, lambda *_: None)
     start = time.perf_counter()
     stream = Stream(cache.Cache(path).steps, batch_size=batch, chunk=CHUNK, seed=0)
     next(stream)
@@ -160,7 +160,7 @@ def import_dataset(folder: Path, codec: str, image_size: int) -> dict[str, Any]:
     """Measure steps/s and images/s of importing a LeRobot dataset into a cache."""
     source = LeRobot(folder / codec, Keys(image_size=image_size))
     target = folder / f"imported_{codec}_{image_size}"
-    rate = source.num_steps / seconds(lambda: cache.write(source, target, lambda *_: None))
+    rate = source.num_steps / seconds(lambda: cache.write([source], target, lambda *_: None))
     side, _ = cache.Cache(target).cameras.values()
     size, images = f"{side[1]}x{side[0]}", len(CAMERAS) * rate
     return {"codec": codec, "stored as": size, "steps/s": rate, "images/s": images}

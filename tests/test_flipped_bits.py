@@ -85,7 +85,7 @@ def read_base(folder: Path) -> Any:
 def dataset(folder: Path) -> None:
     rlds.write(random_episodes("press", 0), folder.parent / "rlds")
     folder.rmdir()
-    cache.write(open_source(folder.parent / "rlds"), folder, lambda done, total: None)
+    cache.write([open_source(folder.parent / "rlds")], folder, lambda done, total: None)
 
 
 def read_dataset(folder: Path) -> Any:

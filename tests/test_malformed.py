@@ -206,7 +206,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Write a valid folder of each kind."""
     at = tmp_path_factory.mktemp("good")
     rlds.write(make(), at / "rlds")
-    cache.write(open_source(at / "rlds"), at / "cache", lambda done, total: None)
+    cache.write([open_source(at / "rlds")], at / "cache", lambda done, total: None)
     make().save(at / "npz" / "episodes.npz")
     model = adaptation.adapt(Net(), [(".*", LoRASP(rank=8, hidden_width=4))], rngs=nnx.Rngs(0))
     save_adapters(at / "adapter", model)

@@ -74,7 +74,7 @@ def convert(options: argparse.Namespace, console: Console) -> None:
         elif options.to == "lerobot":
             lerobot_export.to_lerobot(source, options.out, progress)
         else:
-            cache.write(source, options.out, progress)
+            cache.write([source], options.out, progress)
     console.print(f"{options.out}: {len(source)} episodes", soft_wrap=True, highlight=False)
 
 

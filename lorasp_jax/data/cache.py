@@ -1,6 +1,6 @@
 """A dataset's steps as flat files on disk, written once and read by training.
 
-    cache.write(open_source("my_dataset"), "my_cache", lambda done, total: None)
+    cache.write([open_source("my_dataset")], "my_cache", lambda done, total: None)
     steps = cache.Cache("my_cache").steps
 
 A cache is a folder of memory-mapped .npy files, including raw images, and cache.json with the
@@ -55,11 +55,11 @@ _HEADER_TYPES: dict[str, Any] = {
 }
 
 
-def write(source: Source, path: str | os.PathLike[str], progress: Progress) -> None:
+def write(sources: Sequence[Source], path: str | os.PathLike[str], progress: Progress) -> None:
     """Write a cache folder, which appears only once it is complete.
 
     Args:
-        source: the dataset, whose episodes share robot and image size; not modified.
+        sources: a dataset, or several to join; not modified.
         path: folder to create.
         progress: called with the steps done and the total.
 
@@ -68,6 +68,8 @@ def write(source: Source, path: str | os.PathLike[str], progress: Progress) -> N
             or incompatible with the others.
         OSError: the disk is full.
     """
+    names = map(str, range(len(sources)))
+    source = Joined(dict(zip(names, sources, strict=True))) if sources[1:] else sources[0]
     with locked(Path(path)):
         verify_images(source)  # the copy's checksums would declare damaged images valid
         with atomic_folder(path) as folder, ThreadPoolExecutor(1) as reader:

@@ -188,7 +188,7 @@ def as_cache(source: Source, folder: Path, progress: Progress) -> Cache:
     if isinstance(source, Cache):
         return source
     if not (folder / CACHE).exists():
-        cache.write(source, folder / CACHE, progress)
+        cache.write([source], folder / CACHE, progress)
     return Cache(folder / CACHE)
 
 

@@ -28,7 +28,7 @@ def quietly(done, total):
 
 
 def written(folder, source):
-    cache.write(source, folder, quietly)
+    cache.write([source], folder, quietly)
     return cache.Cache(folder)
 
 

@@ -9,8 +9,7 @@ from envs.datasets import rlds
 from lorasp_jax.config import DataConfig
 from lorasp_jax.data import cache
 from lorasp_jax.data.cache import Cache
-from lorasp_jax.data.keys import Keys
-from lorasp_jax.data.opening import open_sources
+from lorasp_jax.data.opening import open_source
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.training import dataset
 from tests.data.lerobots import golden
@@ -33,7 +32,7 @@ def simulated(tmp_path_factory):
     folder = tmp_path_factory.mktemp("simulated")
     for number, task in enumerate(("press", "pour")):
         rlds.write(random_episodes(task, number), folder / task)
-    sources = open_sources([folder / task for task in ("press", "pour")], Keys())
+    sources = [open_source(folder / task) for task in ("press", "pour")]
     cache.write(sources, folder / "cache", quietly)
     return Cache(folder / "cache")
 

@@ -66,7 +66,7 @@ def test_episodes_follow_each_other(joined, folder):
 
 
 def test_a_cache_knows_what_it_was_joined_from(joined, tmp_path):
-    cache.write(joined, tmp_path / "cache", quietly)
+    cache.write([joined], tmp_path / "cache", quietly)
     found = Cache(tmp_path / "cache")
     assert found.parts == joined.parts
     assert found.dataset.tolist() == 4 * [0] + 3 * [1]
@@ -226,11 +226,12 @@ def test_streamed_by_weight(mixture):
 
 def test_images_of_a_damaged_cache_are_not_joined(folder, tmp_path):
     for name in ("a", "b"):
-        cache.write(open_source(folder / "rlds"), tmp_path / name, quietly)
+        cache.write([open_source(folder / "rlds")], tmp_path / name, quietly)
     file = tmp_path / "b" / "image_extra.npy"
     content = bytearray(file.read_bytes())
     content[-50] ^= 1
     file.write_bytes(content)
     sources = {name: Cache(tmp_path / name) for name in ("a", "b")}
-    with pytest.raises(ValueError, match="image_extra"):
-        cache.write(Joined(sources), tmp_path / "copy", quietly)
+    for joined in ([*sources.values()], [Joined(sources)]):
+        with pytest.raises(ValueError, match="image_extra"):
+            cache.write(joined, tmp_path / "copy", quietly)

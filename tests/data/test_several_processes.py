@@ -32,7 +32,7 @@ def files(folder):
 def whole(tmp_path_factory):
     """Files that an undisturbed conversion writes."""
     path = tmp_path_factory.mktemp("whole") / "cache"
-    cache.write(LeRobot(golden("v3"), Keys(image_size=224)), path, lambda *_: None)
+    cache.write([LeRobot(golden("v3"), Keys(image_size=224))], path, lambda *_: None)
     return files(path)
 
 
@@ -55,5 +55,5 @@ def test_killed_at_any_moment(whole, tmp_path, seed):
 def test_a_second_writer_is_refused(tmp_path):
     out = tmp_path / "cache"
     with locked(out), pytest.raises(ValueError, match="cache"):
-        cache.write(LeRobot(golden("v3")), out, lambda *_: None)
+        cache.write([LeRobot(golden("v3"))], out, lambda *_: None)
     assert not list(tmp_path.iterdir())

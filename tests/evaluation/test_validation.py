@@ -39,7 +39,7 @@ CONFIG = dataclasses.replace(
 def recorded(tmp_path_factory):
     """A run on two of the four golden episodes, in a user's cache, with the dummy backbone."""
     folder = tmp_path_factory.mktemp("recorded")
-    cache.write(LeRobot(golden("v3")), folder / "mine", lambda *_: None)
+    cache.write([LeRobot(golden("v3"))], folder / "mine", lambda *_: None)
     data = dataclasses.replace(DATA, source=str(folder / "mine"))
     with pytest.MonkeyPatch.context() as patch:
         config = dataclasses.replace(CONFIG, data=data)

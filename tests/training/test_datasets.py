@@ -52,7 +52,7 @@ def sources(tmp_path_factory):
     far = recorded(1, 0.01)
     side = {"top": far.image["side"]}
     rlds.write(dataclasses.replace(far, image=side), folder / "rlds")
-    cache.write(open_source(folder / "rlds"), folder / "cache", lambda *_: None)
+    cache.write([open_source(folder / "rlds")], folder / "cache", lambda *_: None)
     (folder / "far.toml").write_text('path = "cache"\n[cameras]\nside = "top"\n')
     return str(folder / "near"), str(folder / "far.toml")
 
@@ -253,7 +253,7 @@ def test_the_last_dataset_is_replayed(sources, tmp_path, monkeypatch):
     [
         ({"weights": (1.0,)}, {}, "weights needs a number for each dataset, got 1; .* near, far"),
         ({"weights": (1.0, 1.0), "replay": 0.1}, {}, "each dataset but the last, got 2"),
-        ({"cameras": ("wrist",)}, {}, "far .*wrist"),
+        ({"cameras": ("wrist",)}, {}, "wrist and far side: name the same"),
         ({}, {"masks_missing": False}, "far has no camera wrist, .*--data.cameras side"),
     ],
 )
@@ -262,6 +262,12 @@ def test_settings_that_do_not_fit(data, inputs, sentence, sources, tmp_path):
     model = dataclasses.replace(model, inputs=dataclasses.replace(model.inputs, **inputs))
     with pytest.raises(ValueError, match=sentence):
         dataset.open_dataset(config(sources, **data), model, tmp_path)
+
+
+def test_a_dataset_without_the_chosen_cameras_is_refused_in_a_cache_too(run, sources):
+    chosen = config(sources, cameras=("wrist",))
+    with pytest.raises(ValueError, match=r"far has none of --data\.cameras wrist"):
+        dataset.open_dataset(chosen, Pi0Config.dummy(), run.folder)
 
 
 def test_on_the_command_line_and_in_the_file_of_a_run():
