@@ -23,7 +23,7 @@ def get_config(scale: str) -> Config:
         scale=scale,
         peft=LoRASP(rank=64),
         model=ModelConfig(size="small", dtype="bfloat16", max_tokens=_MAX_TOKENS),
-        data=DataConfig(source="data/mt50"),
+        data=DataConfig(source=("data/mt50",)),
         optim=OptimConfig(steps=10_000, batch_size=128, learning_rate=1e-3, warmup_steps=100),
         log_every=125,
         checkpoint_every=2500,

@@ -92,16 +92,8 @@ class ModelConfig:
 
 _AUGMENT = {
     "openpi": {"crop": 0.95, "rotation": 5.0, "brightness": 0.3, "contrast": 0.4, "hue": 0.1},
-    "lerobot": {
-        "rotation": 5.0,
-        "translation": 0.05,
-        "brightness": 0.2,
-        "contrast": 0.2,
-        "saturation": 0.5,
-        "hue": 0.05,
-        "sharpness": 0.5,
-        "at_most": 3,
-    },
+    "lerobot": {"rotation": 5.0, "translation": 0.05, "brightness": 0.2, "contrast": 0.2}
+    | {"saturation": 0.5, "hue": 0.05, "sharpness": 0.5, "at_most": 3},
 }
 """Presets of `AugmentConfig`: openpi's models/model.py with augmax's default hue, and LeRobot's
 datasets/transforms.py."""
@@ -171,10 +163,18 @@ class AugmentConfig:
 class DataConfig:
     """Training data: demonstrations of the scripted expert, or a dataset."""
 
-    source: str = ""
-    """Dataset to train on, which then also sets robot and tasks: LeRobot (folder or
-    hf://owner/name), RLDS, or a cache (python -m lorasp_jax.data convert). Empty: collect
-    demonstrations with the scripted expert."""
+    source: tuple[str, ...] = ()
+    """Datasets to train on, which then also set robot and tasks: LeRobot (folder or
+    hf://owner/name), RLDS, a cache, or a TOML file with a dataset's options (python -m
+    lorasp_jax.data inspect --save). Empty: collect demonstrations with the scripted expert."""
+    weights: tuple[float, ...] = ()
+    """Relative share of the windows drawn from each dataset; empty: its number of windows."""
+    replay: float = 0.0
+    """Share of the windows drawn from what the base was taught: the last dataset, which is not
+    validated on and has no weight, or, without datasets, the other tasks of a base made here."""
+    statistics: Literal["shared", "each"] = "shared"
+    """Normalize by statistics over all datasets, or each by its own; the policy then acts for the
+    first, or for one that is named when it is loaded."""
     cameras: tuple[str, ...] = ()
     """Cameras of the dataset to use, in the order of the backbone's; the last part of a dotted
     name is enough. Empty: all, by name."""
@@ -195,15 +195,21 @@ class DataConfig:
     trains; a multiple of log_every. 0: never."""
 
     def __post_init__(self) -> None:
+        given = (self.source,) if isinstance(self.source, str) else self.source  # one, in Python
+        object.__setattr__(self, "source", tuple(filter(None, given)))
         fields.check_fields(self)
         _at_least(1, self, "episodes", "num_envs")
         _at_least(0, self, "action_noise", "fresh_every")
+        _require(0 <= self.replay < 1, "data.replay must lie in [0, 1)", self.replay)
+        _require(min(self.weights, default=1) > 0, "data.weights must be above 0", self.weights)
         if not self.source and self.validation not in (("auto",), ("0",)):
             raise ValueError("data.validation holds episodes of a dataset out: add data.source")
-        if self.fresh_every and self.source:
-            raise ValueError("data.fresh_every cannot be combined with data.source: drop one")
-        if self.cameras and not self.source:
-            raise ValueError("data.cameras are those of a dataset: name it with data.source")
+        if self.fresh_every and (name := "source" if self.source else "replay" * bool(self.replay)):
+            raise ValueError(f"data.fresh_every cannot be combined with data.{name}: drop one")
+        of_datasets = {"cameras": self.cameras, "weights": self.weights}
+        of_datasets["statistics"] = self.statistics == "each"
+        if not self.source and (name := next((k for k, x in of_datasets.items() if x), "")):
+            raise ValueError(f"data.{name} are those of a dataset: name it with data.source")
 
 
 @dataclass(frozen=True)

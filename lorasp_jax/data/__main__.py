@@ -32,52 +32,57 @@ def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.data") -
 
 
 def inspect(options: argparse.Namespace, console: Console) -> None:
-    """Print a summary of a dataset and write a contact sheet of its images."""
-    from lorasp_jax.data import inspection
+    """Print a summary of a dataset, write a contact sheet of its images, and save the options."""
+    from lorasp_jax.data import dataset_file, inspection
     from lorasp_jax.data.opening import open_source
 
-    source = open_source(options.path, keys_of(options))
-    if options.out:
-        check_local(options.out)
-    if options.out and options.out.exists() and not options.overwrite:
-        raise ValueError(f"{options.out} already exists: add --overwrite or choose another --out")
+    keys = keys_of(options)
+    source = open_source(options.path, keys)
+    for name, file in (("out", options.out), ("save", options.save)):
+        if file:
+            check_local(file)
+        if file and file.exists() and not options.overwrite:
+            raise ValueError(f"{file} already exists: add --overwrite or choose another --{name}")
+    if options.save and (dataset_file.is_file(options.path) or options.save.suffix != ".toml"):
+        raise ValueError(f"--save needs a dataset and a new .toml file, got {options.save}")
     path = options.out or inspection.default_path(options.path)
     inspection.report(source, console)
     inspection.write_contact_sheet(source, path, options.augment)
     console.print(f"contact sheet: {path}", soft_wrap=True, highlight=False, markup=False)
+    if options.save:
+        dataset_file.write(options.save, options.path, keys)
+        console.print(f"for --data.source: {options.save}", soft_wrap=True, highlight=False)
 
 
 def convert(options: argparse.Namespace, console: Console) -> None:
     """Convert datasets to a cache for training, or one dataset to RLDS or LeRobot v3.0."""
     from lorasp_jax.data import cache, lerobot_export, rlds_export
-    from lorasp_jax.data.opening import open_source
+    from lorasp_jax.data.opening import open_sources
     from lorasp_jax.data.source import describe_left_out
 
-    keys = keys_of(options)
-    sources = [open_source(path, keys) for path in options.paths]
-    for source in sources:
-        if unused := describe_left_out(source):
-            console.print(unused, soft_wrap=True, highlight=False, markup=False)
-    if options.to != "cache" and len(sources) > 1:
-        raise ValueError(f"--to {options.to} converts exactly one dataset, got {len(sources)}")
-    if options.to != "cache" and isinstance(sources[0], cache.Cache):
-        sources[0].verify_images()
+    count = len(options.paths)
+    if options.to != "cache" and count > 1:
+        raise ValueError(f"--to {options.to} converts exactly one dataset, got {count}")
+    source = open_sources(options.paths, keys_of(options))
+    if unused := describe_left_out(source):
+        console.print(unused, soft_wrap=True, highlight=False, markup=False)
+    if options.to != "cache":
+        cache.verify_images(source)
     with _progress_bar(f"writing {options.out.name}") as progress:
         if options.to == "rlds":
-            rlds_export.to_rlds(sources[0], options.out, progress)
+            rlds_export.to_rlds(source, options.out, progress)
         elif options.to == "lerobot":
-            lerobot_export.to_lerobot(sources[0], options.out, progress)
+            lerobot_export.to_lerobot(source, options.out, progress)
         else:
-            cache.write(sources, options.out, progress)
-    episodes = sum(len(source) for source in sources)
-    console.print(f"{options.out}: {episodes} episodes", soft_wrap=True, highlight=False)
+            cache.write([source], options.out, progress)
+    console.print(f"{options.out}: {len(source)} episodes", soft_wrap=True, highlight=False)
 
 
 def parser(program: str) -> argparse.ArgumentParser:
     """Define the commands and their options."""
     parser = argparse.ArgumentParser(prog=program, description="Inspect or convert datasets.")
     subparsers = parser.add_subparsers(required=True, metavar="command")
-    where = "LeRobot dataset (folder or hf://owner/name), RLDS dataset or cache"
+    where = "LeRobot dataset (folder or hf://owner/name), RLDS dataset, cache, or its TOML file"
 
     text = inspect.__doc__
     sub = subparsers.add_parser("inspect", help=text, description=text)
@@ -88,7 +93,9 @@ def parser(program: str) -> argparse.ArgumentParser:
         type=Path,
         help="output .png file (default: one per dataset in ~/.cache/lorasp_jax)",
     )
-    sub.add_argument("--overwrite", action="store_true", help="replace an existing .png file")
+    text = "write the dataset and these options to a .toml file, which stands for it everywhere"
+    sub.add_argument("--save", type=Path, metavar="FILE", help=text)
+    sub.add_argument("--overwrite", action="store_true", help="replace existing files")
     text = "show what training makes of a frame, by this recipe (default: %(const)s)"
     recipes = {"nargs": "?", "const": "openpi", "choices": ("openpi", "lerobot")}
     sub.add_argument("--augment", default="none", help=text, **recipes)
@@ -118,7 +125,7 @@ def add_keys(parser: argparse.ArgumentParser) -> None:
     text = "gripper openings among the dimensions in use (default: those so named, or the last)"
     add("--grippers", nargs="+", default=(), metavar="NAME", help=text)
     text = "cameras to use, also by the last part of their names, and names of your choice for "
-    text += "them (default: all)"
+    text += "them, in datasets of any format (default: all)"
     add("--cameras", nargs="+", default=(), metavar="[NAME=]FEATURE", type=_camera, help=text)
     text = f"unit of the joints {default}"
     add("--angles", choices=("radians", "degrees"), default=Keys.angles, help=text)

@@ -8,7 +8,7 @@ is needed to resume.
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +35,18 @@ class Batch:
     action_mask: jax.Array
 
 
+class Mixture(NamedTuple):
+    """Weights of datasets.
+
+    Attributes:
+        bounds: `[D+1]` int32, the number of the first window of each dataset, and of all windows.
+        shares: `[D]` f32, how many of the windows that are drawn come from each dataset; sum 1.
+    """
+
+    bounds: Array
+    shares: Array
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Steps:
@@ -47,6 +59,8 @@ class Steps:
         end: `[N]` int32, index just past the last step of the episode.
         instruction: `[N]` int32, row of the processor's token table.
         starts: `[S]` int32, the steps at which a window may start; None: all.
+        dataset: `[N]` int32, index of the dataset among several; None: there is one.
+        mixture: how often windows are drawn from each dataset; None: each window equally often.
     """
 
     image: dict[str, Array]
@@ -55,11 +69,17 @@ class Steps:
     end: Array
     instruction: Array
     starts: Array | None = None
+    dataset: Array | None = None
+    mixture: Mixture | None = None
 
     @property
     def num_starts(self) -> int:
         """Number of windows."""
         return len(self.end if self.starts is None else self.starts)
+
+    def start(self, window: Array) -> Array:
+        """Return the steps at which windows start, given their numbers."""
+        return window if self.starts is None else self.starts[window]
 
 
 @jax.tree_util.register_dataclass
@@ -74,6 +94,7 @@ class RawBatch:
             episode, the last action is repeated.
         inside: `[B, C]` bool, False past the end of the episode.
         instruction: `[B]` int32, row of the processor's token table.
+        dataset: `[B]` int32, index of the dataset among several; None: there is one.
     """
 
     image: dict[str, Array]
@@ -81,6 +102,7 @@ class RawBatch:
     actions: Array
     inside: Array
     instruction: Array
+    dataset: Array | None = None
 
 
 def flatten(episodes: Sequence[Episodes]) -> Steps:
@@ -148,18 +170,26 @@ def gather(steps: Steps, start: Array, chunk: int) -> RawBatch:
         actions=steps.action[window],
         inside=inside,
         instruction=steps.instruction[start],
+        dataset=None if steps.dataset is None else steps.dataset[start],
     )
 
 
 def draw(key: jax.Array, steps: Steps, *, batch_size: int, chunk: int) -> RawBatch:
-    """Gather `batch_size` windows that start at uniformly random steps."""
-    start = jax.random.randint(key, (batch_size,), 0, steps.num_starts)
-    return gather(steps, start if steps.starts is None else steps.starts[start], chunk)
+    """Gather `batch_size` random windows, by `Steps.mixture` if there is one."""
+    low, high = 0, steps.num_starts
+    if steps.mixture is not None:
+        bounds, shares = steps.mixture
+        which, key = jax.random.split(key)
+        dataset = jax.random.choice(which, len(shares), (batch_size,), p=shares)
+        low, high = bounds[dataset], bounds[dataset + 1]
+    window = jax.random.randint(key, (batch_size,), low, high)
+    return gather(steps, steps.start(window), chunk)
 
 
 def encode(key: jax.Array, raw: RawBatch, processor: Processor, *, state_noise: float) -> Batch:
     """Normalize a batch for the model; `key` seeds the noise added to the normalized state."""
     batch: Any = jax.tree.map(jnp.asarray, raw)
+    processor = processor.of_rows(batch.dataset)
     observed: RawObservation = {"image": batch.image, "state": batch.state}
     noise = state_noise * jax.random.normal(key, (len(batch.state), processor.statistics.dim))
     observation = processor.encode(observed, batch.instruction, state_noise=noise)

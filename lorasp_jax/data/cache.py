@@ -12,6 +12,7 @@ shuffled windows, two cameras), this gives 37,000 windows/s at 128 x 128 pixels 
 224 x 168; array_record files give 6,500 and 3,800.
 """
 
+import dataclasses
 import json
 import math
 import os
@@ -31,6 +32,7 @@ from lorasp_jax.base.locks import locked
 from lorasp_jax.base.writing import atomic_folder
 from lorasp_jax.data.batches import Steps
 from lorasp_jax.data.cache_writer import Column, map_column
+from lorasp_jax.data.joined import Joined, Part, Renamed
 from lorasp_jax.data.source import Progress, Source, dimension_names, grippers
 
 FORMAT = "lorasp-cache-2"
@@ -51,6 +53,7 @@ _HEADER_TYPES: dict[str, Any] = {
     "crc32": {str: int},
     "names?": {"state": [str], "action": [str]},
     "grippers?": {"state": [int], "action": [int]},
+    "datasets?": [{"name": str, "episodes": int, "cameras": [str]}],
 }
 
 
@@ -58,7 +61,7 @@ def write(sources: Sequence[Source], path: str | os.PathLike[str], progress: Pro
     """Write a cache folder, which appears only once it is complete.
 
     Args:
-        sources: datasets with the same robot and image size; not modified.
+        sources: a dataset, or several to join; not modified.
         path: folder to create.
         progress: called with the steps done and the total.
 
@@ -67,32 +70,35 @@ def write(sources: Sequence[Source], path: str | os.PathLike[str], progress: Pro
             or incompatible with the others.
         OSError: the disk is full.
     """
-    total = sum(source.num_steps for source in sources)
+    names = map(str, range(len(sources)))
+    source = Joined(dict(zip(names, sources, strict=True))) if sources[1:] else sources[0]
     with locked(Path(path)):
-        shared = _metadata(sources[0].episode(0)) if sources[1:] else {}
-        dimensions = _dimensions(sources)
-        for source in sources[1:]:  # fail now, not after hours of reading images
-            _check_compatible(shared, source.episode(0))
-        for source in sources:  # the copy's checksums would declare damaged images valid
-            if isinstance(source, Cache):
-                source.verify_images()
+        verify_images(source)  # the copy's checksums would declare damaged images valid
         with atomic_folder(path) as folder, ThreadPoolExecutor(1) as reader:
-            writer = _Writer(folder, dimensions)
-            for episode in _prefetch(sources, reader):
+            writer = _Writer(folder, source)
+            for episode in _prefetch(source, reader):
                 writer.append(episode)
-                progress(writer.num_steps, total)
+                progress(writer.num_steps, source.num_steps)
             writer.complete()
 
 
-def _prefetch(sources: Sequence[Source], reader: ThreadPoolExecutor) -> Iterator[Episodes]:
+def verify_images(source: Source) -> None:
+    """Raise ValueError if images of a cache are damaged, also of one among several."""
+    if isinstance(source, Cache):
+        source.verify_images()
+    elif isinstance(source, Joined | Renamed):
+        for each in source.sources.values():
+            verify_images(each)
+
+
+def _prefetch(source: Source, reader: ThreadPoolExecutor) -> Iterator[Episodes]:
     """Yield all episodes while loading the next one; two are in memory at a time."""
     pending = None
-    for source in sources:
-        for number in range(len(source)):
-            ready = pending and pending.result()
-            pending = reader.submit(source.episode, number)
-            if ready:
-                yield ready
+    for number in range(len(source)):
+        ready = pending and pending.result()
+        pending = reader.submit(source.episode, number)
+        if ready:
+            yield ready
     if pending:
         yield pending.result()
 
@@ -100,8 +106,10 @@ def _prefetch(sources: Sequence[Source], reader: ThreadPoolExecutor) -> Iterator
 class _Writer:
     """Writes a cache episode by episode into an existing folder."""
 
-    def __init__(self, folder: Path, dimensions: dict[str, Any]) -> None:
-        self.num_steps, self._dimensions = 0, dimensions
+    def __init__(self, folder: Path, source: Source) -> None:
+        self.num_steps = 0
+        self._parts = source.parts if isinstance(source, Cache | Joined) else ()
+        self._dimensions = _dimensions(source)
         self._folder, self._metadata = folder, {}
         self._tasks: list[str] = []
         self._instructions: list[str] = []
@@ -115,6 +123,8 @@ class _Writer:
             column.complete()
         header = {"format": FORMAT, **self._metadata, **self._dimensions, "steps": self.num_steps}
         header |= {"tasks": self._tasks, "instructions": self._instructions}
+        if self._parts[1:]:
+            header["datasets"] = [dataclasses.asdict(part) for part in self._parts]
         header["crc32"] = {name: column.crc32 for name, column in self._columns.items()}
         (self._folder / HEADER).write_text(json.dumps(with_digest(header), indent=1))
 
@@ -159,21 +169,11 @@ def _check_compatible(shared: dict[str, Any], episode: Episodes) -> None:
             )
 
 
-def _dimensions(sources: Sequence[Source]) -> dict[str, Any]:
-    """Return the grippers of all sources, and the names of dimensions if they are the same.
-
-    Raises:
-        ValueError: the sources have different grippers.
-    """
-    found = [{kind: grippers(s, kind) for kind in ("state", "action")} for s in sources]
-    if wrong := [other for other in found if other != found[0]]:
-        raise ValueError(
-            f"all episodes of a cache must have the same grippers, got dimensions {found[0]} in "
-            f"the first dataset and {wrong[0]} in another"
-        )
-    names = [dimension_names(source) for source in sources]
-    same = any(names) and names == names[:1] * len(names)
-    return {"grippers": found[0], **({"names": names[0]} if same else {})} if found else {}
+def _dimensions(source: Source) -> dict[str, Any]:
+    """Return which dimensions are grippers, and their names if they have any."""
+    names = dimension_names(source)
+    found = {kind: grippers(source, kind) for kind in ("state", "action")} if len(source) else {}
+    return {"grippers": found} | ({"names": names} if names else {})
 
 
 def _metadata(episode: Episodes) -> dict[str, Any]:
@@ -194,6 +194,7 @@ class Cache:
         cameras: name -> height and width.
         left_out: camera -> why it is not among the cameras.
         names, grippers: as in `LeRobot`; empty if the cache does not say.
+        parts: the datasets that were joined, or one for all.
     """
 
     kind = "cache"
@@ -217,6 +218,11 @@ class Cache:
         self.cameras: dict[str, list[int]]
         self.left_out: dict[str, str]
         self.cameras, self.left_out = choose_cameras(self.metadata["cameras"], cameras, self.path)
+        whole = {"name": self.path.name, "episodes": -1, "cameras": [*self.cameras]}
+        self.parts: tuple[Part, ...] = tuple(
+            Part(x["name"], x["episodes"], tuple(c for c in x["cameras"] if c in self.cameras))
+            for x in self.metadata.get("datasets", [whole])
+        )
         for name in self.left_out:  # the rest identifies what a run was trained on
             del self.metadata["crc32"][_IMAGE + name]
         self.control_dt: float = self.metadata["control_dt"]
@@ -247,7 +253,20 @@ class Cache:
             action=self._columns["action"],
             end=np.repeat(self._end, length).astype(np.int32),
             instruction=np.repeat(self._columns["instruction"], length),
+            dataset=np.repeat(self.dataset, length) if self.parts[1:] else None,
         )
+
+    @property
+    def dataset(self) -> np.ndarray:
+        """Index of each episode's dataset among `parts`, `[E]` int32."""
+        counts = [part.episodes for part in self.parts]
+        index = np.arange(len(counts), dtype=np.int32)
+        return np.repeat(index, counts) if counts[1:] else np.zeros(len(self), np.int32)
+
+    def part_of(self, task: str) -> Part:
+        """Return the first dataset with a task."""
+        row = self.metadata["tasks"].index(task)
+        return self.parts[self.dataset[np.argmax(self._columns["task"] == row)]]
 
     def episode(self, number: int, cameras: Sequence[str] | None = None) -> Episodes:
         """Load one episode with images from `cameras`; None means all cameras."""
@@ -282,6 +301,8 @@ class Cache:
         length = self._columns["length"]
         if not len(length) or length.min() < 1 or self._end[-1] != self.num_steps:
             raise ValueError(f"its episodes must not be empty and have {self.num_steps} steps")
+        if self.parts[1:] and len(self.dataset) != len(length):
+            raise ValueError(f"its datasets must have {len(length)} episodes in all")
         for name, texts in (("task", self.metadata["tasks"]), ("instruction", self.instructions)):
             low, high = self._columns[name].min(), self._columns[name].max()
             if len(self._columns[name]) != len(length) or low < 0 or high >= len(texts):

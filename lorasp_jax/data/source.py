@@ -8,6 +8,8 @@ from envs.datasets.episodes import Episodes
 Progress = Callable[[int, int], None]
 """Called with the steps done and the total."""
 
+_DT_TOLERANCE = 0.01  # relative; 1/30 s has no exact decimal representation
+
 
 class Source(Protocol):
     """A dataset whose episodes are loaded one at a time."""
@@ -66,3 +68,8 @@ def describe_left_out(source: Source) -> str:
     """Name the pictures that are not used, on one line; empty if all are."""
     texts = [f"{name} ({reason})" for name, reason in source.left_out.items()]
     return "left out: " * bool(texts) + ", ".join(texts)
+
+
+def same_period(a: float, b: float) -> bool:
+    """Whether two control periods [s] are the same."""
+    return abs(a / b - 1) <= _DT_TOLERANCE

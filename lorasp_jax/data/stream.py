@@ -6,6 +6,7 @@ For given data and batch size, a global batch depends only on the seed and its p
 therefore resume at any position, and with a different number of processes.
 """
 
+import itertools
 from typing import Any
 
 import grain
@@ -53,11 +54,9 @@ class Stream:
         rows = slice(index * share, (index + 1) * share)
 
         def read(window: np.ndarray) -> RawBatch:
-            start = window[rows] if steps.starts is None else steps.starts[window[rows]]
-            return gather(steps, start, chunk)
+            return gather(steps, steps.start(window[rows]), chunk)
 
-        order: Any = grain.MapDataset.range(steps.num_starts).seed(seed).shuffle().repeat()
-        batches = order.batch(batch_size).map(read)
+        batches = _order(steps, seed).batch(batch_size).map(read)
         options = grain.ReadOptions(num_threads=_THREADS, prefetch_buffer_size=_PREFETCH)
         self._iterator: Any = iter(batches.to_iter_dataset(options))
         self._iterator.set_state({"next_index": start})
@@ -70,3 +69,21 @@ class Stream:
         raw = next(self._iterator)
         self.position += 1
         return raw
+
+
+def _order(steps: Steps, seed: int) -> Any:
+    """Return the endless order of windows: all of them in each epoch, of each dataset if weighted.
+
+    The datasets of a mixture take turns. Their shares are rounded to hundredths of the least, so
+    that none changes by more than 1 % of itself.
+    """
+
+    def shuffled(low: int, high: int, seed: int) -> Any:
+        return grain.MapDataset.range(low, high).seed(seed).shuffle().repeat()
+
+    if steps.mixture is None:
+        return shuffled(0, steps.num_starts, seed)
+    bounds, shares = (np.asarray(array).tolist() for array in steps.mixture)
+    datasets = [shuffled(*pair, seed + i) for i, pair in enumerate(itertools.pairwise(bounds))]
+    weights = [round(100 * share / min(shares)) for share in shares]
+    return grain.MapDataset.mix(datasets, weights)

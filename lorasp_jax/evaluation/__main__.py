@@ -28,8 +28,10 @@ def parser(program: str) -> argparse.ArgumentParser:
         "task. Nothing is simulated.",
     )
     parser.add_argument("run", type=Path, help="folder of the run, such as runs/multitask")
-    text = "LeRobot dataset (folder or hf://owner/name), RLDS dataset or cache"
+    text = "LeRobot dataset (folder or hf://owner/name), RLDS dataset, cache, or its TOML file"
     parser.add_argument("--data", required=True, metavar="DATASET", help=text)
+    text = "for which of the run's datasets the policy acts, if they differ (default: the first)"
+    parser.add_argument("--dataset", default="", metavar="NAME", help=text)
     text = "numbers of the episodes (default: all)"
     parser.add_argument("--episodes", nargs="+", type=int, metavar="N", help=text)
     text = "flow-matching steps per chunk (default: %(default)s)"
@@ -48,14 +50,14 @@ def evaluate(options: argparse.Namespace, console: Console) -> None:
     """
     from lorasp_jax.base import compilation_cache as cache
     from lorasp_jax.data.opening import open_source
+    from lorasp_jax.data.source import same_period
     from lorasp_jax.evaluation import held_out, held_out_figure
     from lorasp_jax.training import export
-    from lorasp_jax.training.dataset import has_period
 
     cache.enable()
     source = open_source(options.data, keys_of(options))
     period = export.describe(options.run)["control_dt"]
-    if not has_period(source, period):
+    if not same_period(source.control_dt, period):
         shorter = source.control_dt < period
         remedy = "pass --every N to keep every N-th frame" if shorter else "record more often"
         raise ValueError(
@@ -65,7 +67,7 @@ def evaluate(options: argparse.Namespace, console: Console) -> None:
     numbers = options.episodes or [*range(len(source))]
     if wrong := [number for number in numbers if not 0 <= number < len(source)]:
         raise ValueError(f"--episodes must be 0 to {len(source) - 1}, got {wrong[0]}")
-    policy = export.load_policy(options.run)
+    policy = export.load_policy(options.run, dataset=options.dataset)
     found = held_out.measure(
         policy, held_out.windows(source, numbers, policy), num_steps=options.denoise_steps
     )

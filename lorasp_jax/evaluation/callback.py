@@ -1,6 +1,7 @@
 """Measure success in simulation before, during and after training; render a video per task."""
 
 import contextlib
+import dataclasses
 import functools
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -152,6 +153,9 @@ class Evaluation(Callback):
             if task not in self._rollouts:
                 self._rollouts[task] = compiled_rollout(run, task)
             env, rollout = self._rollouts[task]
+            if run.recordings and policy.processor.datasets:  # each with statistics of its own
+                processor = policy.processor.of_dataset(run.recordings.part_of(task).name)
+                policy = dataclasses.replace(policy, processor=processor)
             return evaluate(policy, env, key, episodes, rollout=rollout, progress=report)
 
 

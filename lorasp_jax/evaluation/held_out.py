@@ -14,6 +14,7 @@ from envs.datasets.episodes import Episodes
 from lorasp_jax.adapters.compress.quantization import is_quantized
 from lorasp_jax.config import VALIDATION_WINDOWS
 from lorasp_jax.data.batches import Batch, RawBatch, Steps, encode, flatten, gather
+from lorasp_jax.data.cache import Cache
 from lorasp_jax.data.source import Source, dimension_names, grippers
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.policies.policy import Policy
@@ -89,7 +90,8 @@ class Errors:
     Attributes:
         action: over the chunk, by dimension, `[J+1]` [rad, m].
         first: of the first action, by dimension, `[J+1]` [rad, m].
-        horizon: by step of the chunk, `[C]`, in standard deviations of the recorded actions.
+        horizon: by step of the chunk, `[C]`, in standard deviations of the recorded actions, of
+            each dataset by its own.
         mean: over the chunk and all dimensions, in standard deviations of the recorded actions, at
             least a tenth of their median.
     """
@@ -163,6 +165,9 @@ def windows(
     for number in chosen:
         episode = source.episode(number)
         steps = _steps(episode, policy)
+        if isinstance(source, Cache) and source.parts[1:]:
+            dataset = np.full_like(steps.end, source.dataset[number])
+            steps = dataclasses.replace(steps, dataset=dataset)
         all_starts = [*range(0, len(steps.end), every or 1)]
         starts = np.array(_evenly(all_starts, limit if every else share), np.int32)
         parts.append(gather(steps, starts, chunk))
@@ -243,22 +248,24 @@ def sample(policy: Policy, found: Windows, *, num_steps: int = 10) -> np.ndarray
     """
     sampling = policy if is_quantized(policy.model) else policy.with_sampler()
     chunks = [
-        np.asarray(_actions(sampling, b.observation, state, keys[1], num_steps=num_steps))[fresh]
-        for b, state, fresh, keys in _batches(policy, found)
+        np.asarray(
+            _actions(sampling, b.observation, raw.state, raw.dataset, keys[1], num_steps=num_steps)
+        )[fresh]
+        for b, raw, fresh, keys in _batches(policy, found)
     ]
     return np.concatenate(chunks)
 
 
 def _batches(
     policy: Policy, found: Windows
-) -> Iterator[tuple[Batch, jax.Array, np.ndarray, jax.Array]]:
-    """Yield batches of windows, their raw states, which of their rows are new, and two keys."""
+) -> Iterator[tuple[Batch, RawBatch, np.ndarray, jax.Array]]:
+    """Yield encoded batches of windows, the raw ones, which rows are new, and two keys."""
     count, key = len(found.task), jax.random.key(0)
     for first in range(0, count, VALIDATION_WINDOWS):
         rows = np.arange(first, first + VALIDATION_WINDOWS)
         raw = jax.tree.map(lambda x, rows=rows: x[rows % count], found.raw)  # the last wraps around
         keys = jax.random.split(jax.random.fold_in(key, first), 2)
-        yield _encode(policy.processor, raw), raw.state, rows < count, keys
+        yield _encode(policy.processor, raw), raw, rows < count, keys
 
 
 @jax.jit
@@ -283,26 +290,45 @@ def _loss(
 
 @functools.partial(jax.jit, static_argnames="num_steps")
 def _actions(
-    policy: Policy, observation: Observation, state: jax.Array, key: jax.Array, *, num_steps: int
+    policy: Policy,
+    observation: Observation,
+    state: jax.Array,
+    dataset: Any,
+    key: jax.Array,
+    *,
+    num_steps: int,
 ) -> jax.Array:
-    slots = policy.processor.flow_slots
+    processor = policy.processor.of_rows(dataset)
+    slots = processor.flow_slots
     chunk = policy.model.sample_actions(key, observation, num_steps=num_steps, slots=slots)
-    return policy.processor.decode(chunk, jnp.asarray(state))
+    return processor.decode(chunk, jnp.asarray(state))
 
 
 def _errors(actions: np.ndarray, raw: RawBatch) -> Errors:
     """Compare actions `[N, C, J+1]` (or broadcast to it) with the recorded ones."""
     inside = np.asarray(raw.inside)[..., None]
-    distance, spread = np.abs(actions - np.asarray(raw.actions, np.float64)) * inside, _spread(raw)
-    by_step = distance.sum(0) / np.maximum(inside.sum(0), 1)
-    action = distance.sum((0, 1)) / inside.sum()
-    horizon, mean = (by_step / spread).mean(-1), float((action / spread).mean())
+    recorded, spread = np.asarray(raw.actions, np.float64), _spread(raw)
+    distance = np.abs(actions - recorded) * inside
+    relative = (distance / spread).mean(-1)
+    horizon = relative.sum(0) / np.maximum(inside.sum((0, 2)), 1)
+    action, mean = distance.sum((0, 1)) / inside.sum(), float(relative.sum() / inside.sum())
     return Errors(action, distance[:, 0].mean(0), horizon, mean)
 
 
 def _spread(raw: RawBatch) -> np.ndarray:
-    """Return the standard deviations of the recorded actions, `[J+1]`."""
-    spread = np.asarray(raw.actions, np.float64)[np.asarray(raw.inside)].std(0)
+    """Return the standard deviations of the actions in each row's dataset, `[N, 1, J+1]`."""
+    recorded, inside = np.asarray(raw.actions, np.float64), np.asarray(raw.inside)
+    dataset = np.zeros(len(recorded), np.int32) if raw.dataset is None else np.asarray(raw.dataset)
+    spread = np.ones_like(recorded[:, :1])
+    for index in np.unique(dataset):
+        rows = dataset == index
+        spread[rows] = _deviation(recorded[rows][inside[rows]])
+    return spread
+
+
+def _deviation(recorded: np.ndarray) -> np.ndarray:
+    """Return the standard deviations of actions `[N, J+1]`."""
+    spread = recorded.std(0)
     # What hardly moves must not decide: its standard deviation is the noise of its sensor.
     return np.maximum(spread, max(0.1 * float(np.median(spread)), 1e-6))
 

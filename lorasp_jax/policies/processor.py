@@ -106,6 +106,22 @@ def _offset(actions: jax.Array, state: jax.Array, mask: Sequence[bool]) -> jax.A
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
+class Datasets:
+    """What differs between the D datasets that a policy learns from. A pytree.
+
+    Attributes:
+        statistics: those of each, by slot, arrays `[D, A]`.
+        present: robot camera -> which datasets have it, bool `[D]`.
+        names: D names.
+    """
+
+    statistics: Statistics
+    present: Mapping[str, jax.Array]
+    names: tuple[str, ...] = field(metadata={"static": True})
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
 class Processor:
     """Converts observations and actions of one robot and its tasks. A pytree.
 
@@ -118,6 +134,8 @@ class Processor:
         inputs: input conventions that the backbone was trained with.
         cameras: pairs (backbone camera, robot camera or None), see `camera_slots`; empty if robot
             and backbone use the same names.
+        datasets: what differs between the datasets of a run, see `of_rows`; None: there is one.
+        present: robot camera -> which rows of a batch have it, bool `[B]`; all without an entry.
     """
 
     state_slots: tuple[int, ...] = field(metadata={"static": True})
@@ -127,6 +145,8 @@ class Processor:
     image_size: int = field(default=64, metadata={"static": True})
     inputs: InputConfig = field(default=OURS, metadata={"static": True})
     cameras: tuple[tuple[str, str | None], ...] = field(default=(), metadata={"static": True})
+    datasets: Datasets | None = None
+    present: Mapping[str | None, jax.Array] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -178,6 +198,26 @@ class Processor:
         """Return a processor for rows of the prompt table alone; see `PromptTable.shared`."""
         return dataclasses.replace(self, prompts=self.prompts.shared())
 
+    def of_rows(self, dataset: jax.Array | None) -> "Processor":
+        """Return a processor for B rows of these datasets, `[B]` int32; None: of the robot."""
+        if dataset is None or self.datasets is None:
+            return self
+        rows = jax.tree.map(lambda array: array[dataset], self.datasets)
+        action = {name: array[:, None] for name, array in rows.statistics.action.items()}
+        statistics = Statistics(rows.statistics.state, action)
+        changed = {"statistics": statistics, "present": rows.present, "datasets": None}
+        return dataclasses.replace(self, **changed)
+
+    def of_dataset(self, name: str) -> "Processor":
+        """Return a processor for the robot of one of the datasets: its statistics and cameras."""
+        assert self.datasets is not None
+        row = self.datasets.names.index(name)
+        own = jax.tree.map(lambda array: array[row], self.datasets)
+        missing = {camera for camera, present in own.present.items() if not present}
+        cameras = tuple((slot, None if x in missing else x) for slot, x in self.cameras)
+        changed = {"statistics": own.statistics, "cameras": cameras, "datasets": None}
+        return dataclasses.replace(self, **changed)
+
     @property
     def flow_slots(self) -> np.ndarray:
         """Mask of the slots that carry flow noise and count in the loss, `[A]` bool."""
@@ -214,7 +254,8 @@ class Processor:
                 for name, source in sources.items()
             },
             image_masks={
-                name: jnp.full(len(state), source is not None) for name, source in sources.items()
+                name: jnp.broadcast_to(self.present.get(source, source is not None), len(state))
+                for name, source in sources.items()
             },
             tokens=prompt.ids,
             token_mask=prompt.mask,
@@ -246,7 +287,7 @@ class Processor:
     def decode(self, actions: jax.Array, state: jax.Array | None = None) -> jax.Array:
         """Invert `normalize_actions`: `[..., C, A]` -> `[..., C, J+1]` f32 [rad, m]."""
         slots, inputs = np.array(self.action_slots), self.inputs
-        stats = {name: array[slots] for name, array in self.statistics.action.items()}
+        stats = {name: array[..., slots] for name, array in self.statistics.action.items()}
         actions = unnormalize(actions[..., slots], stats, inputs.action, inputs.convention)
         if inputs.delta:
             actions = to_absolute(actions, known_state(self._require(state), inputs), inputs.delta)
@@ -266,7 +307,7 @@ class Processor:
         """Normalize states or actions `[..., n]` and return them in slots, `[..., A]`."""
         dim, at = self.statistics.dim, np.array(slots)
         check_slots(slots, dim, values.shape[-1])
-        stats = {name: array[at] for name, array in getattr(self.statistics, kind).items()}
+        stats = {name: array[..., at] for name, array in getattr(self.statistics, kind).items()}
         normalized = normalize(values, stats, getattr(self.inputs, kind), self.inputs.convention)
         return jnp.zeros((*values.shape[:-1], dim)).at[..., at].set(normalized)
 

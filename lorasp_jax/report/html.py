@@ -19,6 +19,7 @@ from lorasp_jax.training import records
 from lorasp_jax.training.finished_run import recorded_method
 from lorasp_jax.training.run_folder import (
     CONFIG_FILE,
+    DATASET_FILE,
     STOPPED,
     TIMES_FILE,
     VALIDATION,
@@ -72,6 +73,7 @@ def write_report(folder: Path) -> Path:
         *(() if finished else _progress(folder, config, rows)),
         *_success(results),
         "<h2>Training</h2>",
+        *_datasets(folder),
         *_training(rows),
         *_held_out(folder, rows),
         *_rules(results),
@@ -121,6 +123,16 @@ def _progress(folder: Path, config: dict[str, Any], rows: figures.Rows) -> Itera
     step, steps = rows[-1]["step"] if rows else 0, config["optim"]["steps"]
     yield f"<p>Running: step {step:.0f} of {steps}.</p>"
     yield _REFRESH
+
+
+def _datasets(folder: Path) -> Iterable[str]:
+    """Show what is drawn from each of several datasets."""
+    found = read_json(folder / DATASET_FILE, records.DATASET)
+    if each := found.get("facts", {}).get("datasets"):
+        header = ("dataset", "episodes", "windows", "share of what is drawn")
+        values = ((x["episodes"], x["windows"], f"{100 * x['share']:.1f} %") for x in each)
+        rows = ((x["name"], *map(str, row)) for x, row in zip(each, values, strict=True))
+        yield _table(header, rows)
 
 
 def _training(rows: figures.Rows) -> Iterable[str]:
@@ -194,7 +206,8 @@ def _subtitle(config: dict[str, Any], results: dict[str, Any]) -> str:
 def _learned_from(config: dict[str, Any]) -> str:
     """Name the recordings; a dataset also sets the robot, which the config then does not know."""
     source = config.get("data", {}).get("source")
-    return f"recordings {source}" if source else f"robot {config['robot']}"
+    names = source if isinstance(source, str) else ", ".join(source or ())
+    return f"recordings {names}" if names else f"robot {config['robot']}"
 
 
 def _success(results: dict[str, Any]) -> Iterable[str]:

@@ -109,7 +109,7 @@ def _as_trained(
     return config
 
 
-def _host() -> jax.Device:
+def _host() -> Any:
     """Return the CPU as a JAX device; raise ValueError if JAX_PLATFORMS leaves it out."""
     try:
         return jax.local_devices(backend="cpu")[0]

@@ -1,39 +1,53 @@
 """Open the dataset of a run, convert it to a cache once, and group its episodes by task."""
 
 import dataclasses
-from collections.abc import Collection
+import functools
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from envs.datasets.episodes import Episodes, concatenate
 from envs.names import names
-from lorasp_jax.config import Config
+from lorasp_jax.base.bars import bars
+from lorasp_jax.config import Config, DataConfig
 from lorasp_jax.data import cache
-from lorasp_jax.data.batches import Steps
+from lorasp_jax.data.batches import Mixture, Steps
 from lorasp_jax.data.cache import Cache
-from lorasp_jax.data.lerobot import Keys
-from lorasp_jax.data.opening import open_source
-from lorasp_jax.data.source import Progress, Source
+from lorasp_jax.data.joined import Part, parts_of
+from lorasp_jax.data.keys import Keys
+from lorasp_jax.data.opening import open_sources
+from lorasp_jax.data.source import Progress, Source, same_period
+from lorasp_jax.data.split import held_out
 from lorasp_jax.models.config import BackboneConfig
+from lorasp_jax.policies.images import resize_with_pad, to_unit
 from lorasp_jax.policies.processor import robot_slots
+from lorasp_jax.training.distributed import processes
+from lorasp_jax.training.run import Run
+from lorasp_jax.training.run_folder import record_dataset
 
 CACHE = Path("cache", "steps")
-_DT_TOLERANCE = 0.01  # relative; 1/30 s has no exact decimal representation
 
 
 def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
-    """Open the dataset at `config.data.source`, or its cache in `folder`.
+    """Open the datasets at `config.data.source`, or their cache in `folder`.
 
     LeRobot images are resized to the model's image size.
 
     Raises:
-        ValueError: the source is not a dataset, is corrupt, or is incompatible with the run.
+        ValueError: a source is not a dataset, is corrupt, or is incompatible with the run or with
+            the others.
     """
-    cache_folder = folder / CACHE
-    path = cache_folder if cache_folder.exists() else config.data.source
-    source = open_source(path, Keys(image_size=model.image_size), config.data.cameras)
-    if not has_period(source, config.control_dt):
+    cached = (folder / CACHE).exists()
+    paths = [folder / CACHE] if cached else config.data.source
+    keys, cameras = Keys(image_size=model.image_size), config.data.cameras
+    source = open_sources(paths, keys, cameras, functools.partial(_square, model))
+    _check_parts(config.data, model, parts_of(source))
+    path = " + ".join(map(str, paths))
+    if not same_period(source.control_dt, config.control_dt):
         raise ValueError(
             f"{path} has a control period of {source.control_dt:.4g} s, but this run has "
             f"--control-dt {config.control_dt:g}: pass --control-dt {source.control_dt:.4g}, or "
@@ -63,9 +77,104 @@ def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
     return source
 
 
-def has_period(source: Source, control_dt: float) -> bool:
-    """Whether the time between two actions is `control_dt` [s]."""
-    return abs(source.control_dt / control_dt - 1) <= _DT_TOLERANCE
+def _check_parts(data: DataConfig, model: BackboneConfig, parts: Sequence[Part]) -> None:
+    """Raise ValueError unless the settings and the backbone fit the datasets."""
+    known = f"the datasets are {', '.join(part.name for part in parts) or data.source[0]}"
+    if data.replay and len(parts) < 2:
+        raise ValueError(
+            "data.replay needs demonstrations of what the base was taught: name their dataset last "
+            f"in data.source, after the others; {known}"
+        )
+    if data.weights and len(data.weights) != len(parts) - bool(data.replay):
+        raise ValueError(
+            f"data.weights needs a number for each dataset{' but the last' * bool(data.replay)}, "
+            f"got {len(data.weights)}; {known}"
+        )
+    if blind := [part.name for part in parts if not part.cameras]:
+        raise ValueError(f"{blind[0]} has none of --data.cameras {' '.join(data.cameras)}")
+    every = {camera for part in parts for camera in part.cameras}
+    for part in parts if not model.inputs.masks_missing else ():
+        if missing := sorted(every - {*part.cameras}):
+            raise ValueError(
+                f"{part.name} has no camera {missing[0]}, and this backbone cannot mask a missing "
+                f"one: choose those that all have with --data.cameras {' '.join(part.cameras)}"
+            )
+
+
+def _square(model: BackboneConfig, images: np.ndarray) -> np.ndarray:
+    """Resize and pad images `[T, H, W, 3]` uint8 as the policy does, one by one: T varies."""
+    return np.concatenate([np.asarray(_resized(image[None], model)) for image in images])
+
+
+@functools.partial(jax.jit, static_argnames="model")
+def _resized(image: jax.Array, model: BackboneConfig) -> jax.Array:
+    options = {"centred": model.inputs.centred, "antialias": model.inputs.antialias}
+    unit = resize_with_pad(to_unit("dataset", image), model.image_size, **options)
+    return jnp.round(127.5 * (unit + 1)).astype(jnp.uint8)
+
+
+def load(run: Run, source: Source, free_bytes: float) -> None:
+    """Load the dataset of a run; stream it if it is larger than `free_bytes`."""
+    data = run.config.data
+    with bars(run.console, "steps") as progress:
+        bar = progress.add_task(f"reading {' '.join(data.source)}", total=None)
+        report = lambda done, total: progress.update(bar, completed=done, total=total)  # noqa: E731
+        cache = as_cache(source, run.folder, report)
+        if processes.is_first():  # the others read the same files
+            cache.verify_images()
+        progress.update(bar, completed=cache.num_steps, total=cache.num_steps)
+    metadata = cache.metadata
+    facts = (metadata[name] for name in ("tasks", "robot", "physics_dt"))
+    run.recordings, run.simulated = cache, is_simulated(*facts)
+    run.held_out = held_out(data.validation, _tasks(cache, data), recorded=not run.simulated)
+    run.dataset = mixed(without(cache.steps, run.held_out), data)
+    run.episodes = outline(cache, run.held_out)
+    identity = {name: metadata[name] for name in ("crc32", "instructions")}
+    if run.held_out:
+        identity["held_out"] = run.held_out
+    if cache.parts[1:]:
+        identity["datasets"] = shares(run.dataset, cache.parts)
+    streams = sum(x.nbytes for x in jax.tree.leaves(run.dataset)) > free_bytes
+    run.streams = record_dataset(run.folder, identity, streams=streams)
+    run.config = dataclasses.replace(
+        run.config, robot=metadata["robot"], tasks=tuple(metadata["tasks"])
+    )
+    _describe(run, cache, identity.get("datasets", []))
+
+
+def _tasks(cache: Cache, data: DataConfig) -> list[str]:
+    """Return the task of each episode that may be held out; equal names in datasets are two."""
+    last = len(cache) - cache.parts[-1].episodes if data.replay else len(cache)
+    found = [cache.episode(number, ()).task for number in range(last)]
+    if cache.parts[1:]:
+        pairs = zip(found, cache.dataset, strict=False)
+        found = [f"{task} of {cache.parts[index].name}" for task, index in pairs]
+    return found
+
+
+def _describe(run: Run, cache: Cache, datasets: Sequence[Mapping[str, Any]]) -> None:
+    """Print what is trained on."""
+    console = run.console
+    location = "streamed from disk" if run.streams else "held on the device"
+    console.print(f"{cache.num_steps} steps in {len(cache)} episodes, {location}")
+    for part, each in zip(cache.parts, datasets, strict=False):
+        text = (
+            f"  {100 * each['share']:.1f} % of the windows from {part.name}: {part.episodes} "
+            f"episodes, {each['windows']} windows, cameras {', '.join(part.cameras)}"
+        )
+        console.print(text, markup=False, soft_wrap=True)
+    if datasets and run.config.data.statistics == "each":
+        console.print(
+            "each dataset is normalized by its own statistics; the policy acts for "
+            f"{cache.parts[0].name} unless another is named with --dataset",
+            markup=False,
+            soft_wrap=True,
+        )
+    if run.held_out:
+        names = ", ".join(map(str, run.held_out))
+        console.print(f"held out of training: {len(run.held_out)} episodes ({names})")
+    if recipe := run.augmentation:
+        console.print(f"images change while training, by the recipe of {recipe.preset}")
 
 
 def as_cache(source: Source, folder: Path, progress: Progress) -> Cache:
@@ -77,15 +186,17 @@ def as_cache(source: Source, folder: Path, progress: Progress) -> Cache:
     return Cache(folder / CACHE)
 
 
-def outline(dataset: Cache, held_out: Collection[int] = ()) -> dict[str, Episodes]:
+def outline(dataset: Cache, left_out: Collection[int] = ()) -> dict[str, Episodes]:
     """Return the episodes of each task; one image per camera stands in for all others.
 
-    Those that are held out are left out.
+    Those that are left out, and tasks that have no others, are missing.
     """
-    episodes = {n: dataset.episode(n, ()) for n in range(len(dataset)) if n not in held_out}
+    episodes = {n: dataset.episode(n, ()) for n in range(len(dataset)) if n not in left_out}
     groups: dict[str, Episodes] = {}
     for task in dataset.metadata["tasks"]:
         indices = [index for index, episode in episodes.items() if episode.task == task]
+        if not indices:
+            continue
         group = concatenate([episodes[index] for index in indices])
         image = {
             name: np.broadcast_to(x[0, 0], (*group.state.shape[:2], *x.shape[2:]))
@@ -95,6 +206,13 @@ def outline(dataset: Cache, held_out: Collection[int] = ()) -> dict[str, Episode
     return groups
 
 
+def by_dataset(dataset: Cache, held_out: Collection[int]) -> list[list[Episodes]]:
+    """Return the episodes to train on of each dataset, as `outline` does."""
+    index = dataset.dataset.tolist()
+    others = ({n for n, i in enumerate(index) if i != part} for part in range(len(dataset.parts)))
+    return [[*outline(dataset, {*held_out, *left_out}).values()] for left_out in others]
+
+
 def without(steps: Steps, held_out: Collection[int]) -> Steps:
     """Return steps whose windows start in none of the episodes that are held out."""
     if not held_out:
@@ -102,6 +220,34 @@ def without(steps: Steps, held_out: Collection[int]) -> Steps:
     episode = np.unique(steps.end, return_inverse=True)[1]
     starts = np.flatnonzero(~np.isin(episode, [*held_out])).astype(np.int32)
     return dataclasses.replace(steps, starts=starts)
+
+
+def mixed(steps: Steps, data: DataConfig) -> Steps:
+    """Return steps whose windows are drawn by `data.weights` and `data.replay`, if given."""
+    if steps.dataset is None or not (data.weights or data.replay):
+        return steps
+    counts = _windows(steps)
+    shares = np.array(data.weights or counts[: len(counts) - bool(data.replay)], float)
+    shares *= (1 - data.replay) / shares.sum()
+    shares = np.append(shares, [data.replay] * bool(data.replay)).astype(np.float32)
+    bounds = np.append(0, np.cumsum(counts)).astype(np.int32)
+    return dataclasses.replace(steps, mixture=Mixture(bounds, shares))
+
+
+def shares(steps: Steps, parts: Sequence[Part]) -> list[dict[str, Any]]:
+    """Describe datasets: name, episodes, windows to train on, and share of what is drawn."""
+    counts = _windows(steps)
+    drawn = counts / counts.sum() if steps.mixture is None else np.asarray(steps.mixture.shares)
+    return [
+        {"name": p.name, "episodes": p.episodes, "windows": int(n), "share": round(float(x), 6)}
+        for p, n, x in zip(parts, counts, drawn, strict=True)
+    ]
+
+
+def _windows(steps: Steps) -> np.ndarray:
+    """Return the number of windows of each dataset, `[D]`."""
+    assert steps.dataset is not None
+    return np.bincount(steps.dataset if steps.starts is None else steps.dataset[steps.starts])
 
 
 def is_simulated(tasks: Collection[str], robot: str, physics_dt: float) -> bool:

@@ -1,5 +1,6 @@
 """Compile the training program before there are demonstrations, from shapes alone."""
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -12,6 +13,7 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.base import messages
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import flatten, nbytes
+from lorasp_jax.data.joined import parts_of
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor
 from lorasp_jax.training import program, setup
@@ -57,6 +59,8 @@ def data_shapes(run: Run, built: setup.RunSetup) -> tuple[int, Any]:
     count = source.num_steps if source else config.data.episodes * limits
     mesh, size = meshes.make_mesh(config.fsdp, run.devices), config.optim.batch_size
     episode = jax.eval_shape(lambda: flatten([_first_episode(config, built)]))
+    if source and parts_of(source)[1:]:
+        episode = dataclasses.replace(episode, dataset=episode.end)
     steps = jax.tree.map(lambda x: jax.ShapeDtypeStruct((count, *x.shape[1:]), x.dtype), episode)
     drawn = DrawnBatches(steps, mesh, size, built.base.config.chunk)
     if source is None or nbytes(steps) <= built.free_bytes:
@@ -69,7 +73,9 @@ def _blank_processor(config: Config, built: setup.RunSetup) -> Processor:
     """Return the run's processor with the statistics of one episode."""
     episode = _first_episode(config, built)
     cameras = config.data.cameras
-    return setup.processor([episode], built.base.config, built.prompts, cameras=cameras)
+    inputs = setup.processor([episode], built.base.config, built.prompts, cameras=cameras)
+    parts = parts_of(built.source) if built.source else ()
+    return setup.of_datasets(inputs, built.base.config, parts) if parts[1:] else inputs
 
 
 def _first_episode(config: Config, built: setup.RunSetup) -> Episodes:

@@ -88,9 +88,13 @@ def _metadata(run: Run) -> dict[str, Any]:
     """Describe the training data and everything that the policy needs besides weights."""
     config, first = run.config, next(iter(run.episodes.values()))
     processor = run.policy.processor
+    several, each = processor.datasets, config.data.statistics == "each"
+    names = several.names if several and (each or several.present) else ()
+    robots = {name: _robot(processor.of_dataset(name)) for name in names}
+    default = names[0] if names and each else ""
     return {
         "robot": config.robot,
-        "tasks": list(config.tasks),
+        "tasks": list(run.episodes),
         "control_dt": first.control_dt,
         "physics_dt": first.physics_dt,
         "policy": {
@@ -101,15 +105,26 @@ def _metadata(run: Run) -> dict[str, Any]:
             "instructions": list(processor.prompts.instructions),
             "num_joints": len(processor.state_slots) - 1,
             "action_length": len(processor.action_slots),
-            "cameras": {slot: name for slot, name in processor.cameras if name},
             "relative": list(processor.inputs.delta),
-            "statistics": json.loads(processor.statistics.to_json()),
+            **(robots[default] if default else _robot(processor)),
+            **({"dataset": default, "datasets": robots} if robots else {}),
         },
     }
 
 
+def _robot(processor: Processor) -> dict[str, Any]:
+    """Describe what differs between the datasets of a run."""
+    cameras = {slot: name for slot, name in processor.cameras if name}
+    return {"cameras": cameras, "statistics": json.loads(processor.statistics.to_json())}
+
+
 def load_policy(
-    folder: str | os.PathLike[str], *, base: str = "", words: str = "", any_base: bool = False
+    folder: str | os.PathLike[str],
+    *,
+    base: str = "",
+    words: str = "",
+    any_base: bool = False,
+    dataset: str = "",
 ) -> Policy:
     """Load the policy of a finished run.
 
@@ -118,16 +133,21 @@ def load_policy(
         base: location of the frozen base (see `models.load`); default: the recorded one.
         words: location of the tokenizer; default: the recorded one.
         any_base: accept a base whose weights differ from the original's (see `load_adapters`).
+        dataset: for whose robot the policy acts, where datasets differ in statistics or cameras;
+            default: the first with its own statistics, or all.
 
     Returns:
         The policy; `Policy.sample` takes indices into `processor.prompts.instructions`.
 
     Raises:
-        ValueError: there is no such folder, the run is not finished, its files are corrupt, or the
-            base is missing or differs from the one used in training.
+        ValueError: there is no such folder, the run is not finished, its files are corrupt, there
+            is no such dataset, or the base is missing or differs from the one used in training.
     """
     folder = Path(folder)
     metadata, path, is_full = _read_metadata(folder)
+    if dataset and dataset not in (known := datasets(metadata)):
+        names = ", ".join(known) or "all its datasets alike"
+        raise ValueError(f"the policy of {folder} acts for {names}, not for {dataset!r}")
     try:
         policy = metadata["policy"]
         config = backbone.find(policy["backbone"]).from_dict(policy["config"])
@@ -145,6 +165,8 @@ def load_policy(
         model = native.load_adapters(folder, model, any_base=any_base)
     model = quantized(model, metadata.get(QUANTIZED))
     try:
+        if dataset:
+            policy = policy | policy["datasets"][dataset]
         return Policy(model, _processor(policy, config, words))
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path} does not describe a policy") from error
@@ -157,6 +179,11 @@ def describe(folder: str | os.PathLike[str]) -> dict[str, Any]:
         ValueError: there is no such folder, the run is not finished, or its files are corrupt.
     """
     return _read_metadata(Path(folder))[0]
+
+
+def datasets(metadata: Mapping[str, Any]) -> list[str]:
+    """Return the names of datasets with own statistics or cameras, from `describe`'s result."""
+    return [*metadata["policy"].get("datasets", {})]
 
 
 def is_run(folder: str | os.PathLike[str]) -> bool:

@@ -52,7 +52,9 @@ def _from_json(recorded: Mapping[str, Any], tasks: tuple[str, ...]) -> Config:
     augment, validation = ("none", "0") if data["source"] else ("auto", "auto")
     data["augment"] = AugmentConfig(**data.get("augment", {"preset": augment}))
     data["validation"] = tuple(data.get("validation", [validation]))
-    data["cameras"] = tuple(data.get("cameras", ()))
+    data["source"] = (data["source"],) if isinstance(data["source"], str) else data["source"]
+    for name in ("source", "weights", "cameras"):
+        data[name] = tuple(data.get(name, ()))
     fields["data"] = data
     for name, group in _GROUPS.items():
         fields[name] = group(**fields[name])

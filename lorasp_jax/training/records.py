@@ -21,7 +21,9 @@ RESULTS: Schema = {
     "rules?": {str: {"layers": int, "parameters": int, "active_rank?": float}},
 }
 ROW: Schema = {"step": float, str: float}
-DATASET: Schema = {"facts": {}, "streams": bool}
+DATASETS: Schema = {"name": str, "episodes": int, "windows": int, "share": float}
+DATASET: Schema = {"facts": {"datasets?": [DATASETS]}, "streams": bool}
+TAUGHT: Schema = {"robot?": str, "tasks?": [str], "physics_dt?": float}
 BEST: Schema = {"step": int, "error": float, "weights": str}
 VALIDATION: Schema = {
     "episodes": [int],

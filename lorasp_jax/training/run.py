@@ -3,16 +3,17 @@
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from envs.datasets.episodes import Episodes
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import AugmentConfig, Config
-from lorasp_jax.data.batches import Steps, flatten
+from lorasp_jax.data.batches import Mixture, Steps, flatten
 from lorasp_jax.data.cache import Cache
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training import records
@@ -25,7 +26,8 @@ class Run:
     """A run, as passed to callbacks.
 
     Attributes:
-        episodes: demonstrations per task; those of a dataset repeat one image per camera.
+        episodes: demonstrations per task; those of a dataset repeat one image per camera. Tasks to
+            replay follow those of the config.
         dataset: all steps of a dataset, stored on disk; None: train on `episodes`.
         recordings: the dataset; None: train on `episodes`.
         held_out: numbers of its episodes that are not trained on.
@@ -63,7 +65,15 @@ class Run:
     @property
     def steps(self) -> Steps:
         """All steps to train on."""
-        return self.dataset or flatten(list(self.episodes.values()))
+        if self.dataset:
+            return self.dataset
+        groups, count = list(self.episodes.values()), len(self.config.tasks)
+        steps, share = flatten(groups), self.config.data.replay
+        if not share:
+            return steps
+        learned = sum(group.num_steps for group in groups[:count])  # the others are replayed
+        bounds = np.array([0, learned, steps.num_starts], np.int32)
+        return replace(steps, mixture=Mixture(bounds, np.array([1 - share, share], np.float32)))
 
     @property
     def augmentation(self) -> AugmentConfig | None:

@@ -41,7 +41,8 @@ STOPPED = "stopped.json"
 
 
 _OPTIONAL = (
-    *(("data", "cameras"), ("model", "base_dtype"), ("model", "chunk"), ("model", "openpi_config")),
+    *(("data", "cameras"), ("data", "weights"), ("data", "replay")),
+    *(("model", "base_dtype"), ("model", "chunk"), ("model", "openpi_config")),
     ("optim", "rtc_max_delay"),
 )
 """Settings that `to_json` omits at their defaults, which are 0 or empty, as it omits `adapt`:
@@ -59,6 +60,10 @@ def to_json(config: Config) -> dict[str, Any]:
         if not fields[group][name]:
             del fields[group][name]
     augment, data = config.data.augment, fields["data"]
+    if len(data["source"]) < 2:  # as in runs from before there could be several
+        data["source"] = "".join(data["source"])
+    if config.data.statistics == "shared":
+        del data["statistics"]
     if augment == AugmentConfig("auto" if not config.data.source else "none"):
         del data["augment"]  # as in runs from before there was augmentation
     else:

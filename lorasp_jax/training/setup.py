@@ -8,14 +8,11 @@ from types import MappingProxyType
 from typing import Any
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 from flax import nnx
 from rich.console import Console
 from rich.progress import TaskID
 
 import envs
-from envs.datasets.episodes import Episodes, full_name
 from envs.env import Env
 from lorasp_jax import peft
 from lorasp_jax.adapters import adaptation, paths, summary
@@ -23,33 +20,34 @@ from lorasp_jax.adapters.compress import calibration
 from lorasp_jax.base import hub
 from lorasp_jax.base.bars import bars
 from lorasp_jax.config import Config
-from lorasp_jax.data.batches import Batch, encode, flatten, sample_batch, windows
+from lorasp_jax.data.batches import Batch, encode, sample_batch
 from lorasp_jax.data.source import Source, describe_left_out
-from lorasp_jax.data.split import held_out
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import (
     Processor,
-    Statistics,
-    known_actions,
-    known_state,
     robot_slots,
 )
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Tokenizer, load_tokenizer
-from lorasp_jax.training import rules
+from lorasp_jax.training import dataset, rules
 from lorasp_jax.training.base import base_model, quantized, with_config
 from lorasp_jax.training.cost import preflight
-from lorasp_jax.training.dataset import as_cache, is_simulated, open_dataset, outline, without
-from lorasp_jax.training.demonstrations import Demonstrations, Progress, demonstrations, in_thread
+from lorasp_jax.training.demonstrations import (
+    Demonstrations,
+    Progress,
+    demonstrations,
+    in_thread,
+)
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.distributed import processes
+from lorasp_jax.training.processors import of_datasets, processor
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.relative import for_robot
+from lorasp_jax.training.replay import replayed_tasks
 from lorasp_jax.training.run import Run
-from lorasp_jax.training.run_folder import record_dataset
 
 STATISTICS_BATCHES = 8
 """Number of batches used for data-driven initialization."""
@@ -103,14 +101,14 @@ def build(config: Config, folder: Path, *, abstract: bool = False) -> RunSetup:
             target that matches no layer, or an invalid batch size or number of steps to execute.
     """
     sizes = {"image_size": config.image_size, "control_dt": config.control_dt}
-    tasks = () if config.data.source else config.tasks
+    tasks = () if config.data.source else (*config.tasks, *replayed_tasks(config))
     environments = [envs.make(task, robot=config.robot, **sizes) for task in tasks]
     use_bundled = abstract and hub.is_remote(config.model.tokenizer)
     tokenizer = load_tokenizer("" if use_bundled else config.model.tokenizer)
     base, base_hash = base_model(config, abstract=abstract)
     chosen = {name: getattr(config.model, name) for name in ("max_tokens", "chunk")}
     base = with_config(base, **{name: value for name, value in chosen.items() if value})
-    source = open_dataset(config, base.config, folder) if config.data.source else None
+    source = dataset.open_dataset(config, base.config, folder) if config.data.source else None
     if source and not base.config.inputs.masks_missing:
         base = with_config(base, cameras=base.config.cameras[: len(source.cameras)])
     prompts, joints = _prompts_and_joints(source, environments, tokenizer, base.config)
@@ -160,6 +158,10 @@ def prepare(
     _load_or_collect(run, built, collect, meanwhile)
     groups, cameras = [*run.episodes.values()], config.data.cameras
     inputs = processor(groups, model.config, built.prompts, cameras=cameras)
+    if run.recordings and (parts := run.recordings.parts)[1:]:
+        each = config.data.statistics == "each"
+        groups = dataset.by_dataset(run.recordings, run.held_out) if each else ()
+        inputs = of_datasets(inputs, model.config, parts, groups)
     if any(method.needs_statistics for method in rules.methods(config)):
         moments = input_moments(run, quantized(base, config.model.base_dtype), inputs)
         model = _adapt(config, base, rules.rules(config), moments)
@@ -185,7 +187,7 @@ def _load_or_collect(
     with run.timed("collect"), processes.first_process_first("collected"):
         futures = [in_thread(function, run, built) for function in meanwhile]
         if built.source:
-            _load_dataset(run, built.source, built.free_bytes)
+            dataset.load(run, built.source, built.free_bytes)
         else:
             run.episodes = _collect(run, built.prompts.instructions, collect)
         for future in futures:
@@ -301,76 +303,6 @@ def _batch_sampler(run: Run, processor: Processor, chunk: int) -> Callable[[jax.
     )
 
 
-def processor(
-    episodes: Sequence[Episodes],
-    model_config: BackboneConfig,
-    prompts: PromptTable,
-    *,
-    cameras: Sequence[str] = (),
-) -> Processor:
-    """Build the processor from the prompts and the statistics of the demonstrations.
-
-    `cameras`, by default all sorted by name, fill the backbone's camera slots in order. Statistics
-    are those of the values that the model's config has: ALOHA's converted, and relative actions.
-    """
-    joints, length = episodes[0].state.shape[-1] - 1, episodes[0].action.shape[-1]
-    inputs, dim = model_config.inputs, model_config.action_dim
-    slots, action_slots = robot_slots(joints, inputs), robot_slots(length - 1, inputs)
-    steps = flatten([dataclasses.replace(group, image={}) for group in episodes])
-    chunk = model_config.chunk if inputs.delta else 1
-    window, _ = windows(steps, jnp.arange(len(steps.end)), chunk)
-    state = jnp.asarray(steps.state)
-    action = np.asarray(known_actions(jnp.asarray(steps.action[window]), state, inputs))
-    action = action.reshape(-1, length)
-    state = np.repeat(np.asarray(known_state(state, inputs)), chunk, axis=0)
-    valid = np.ones(len(state), bool)
-    statistics = Statistics.measure(
-        state, action, valid, slots=slots, dim=dim, action_slots=action_slots
-    )
-    images = episodes[0].image
-    ordered = [full_name(name, images) for name in cameras] or sorted(images)
-    return Processor.of(
-        model_config,
-        statistics,
-        prompts,
-        num_joints=joints,
-        action_length=length,
-        cameras=dict(zip(model_config.cameras, ordered, strict=False)),
-    )
-
-
-def _load_dataset(run: Run, source: Source, free_bytes: float) -> None:
-    """Load the dataset; stream it if it is larger than `free_bytes`."""
-    with bars(run.console, "steps") as progress:
-        bar = progress.add_task(f"reading {run.config.data.source}", total=None)
-        report = lambda done, total: progress.update(bar, completed=done, total=total)  # noqa: E731
-        cache = as_cache(source, run.folder, report)
-        if processes.is_first():  # the others read the same files
-            cache.verify_images()
-        progress.update(bar, completed=cache.num_steps, total=cache.num_steps)
-    metadata = cache.metadata
-    facts = (metadata[name] for name in ("tasks", "robot", "physics_dt"))
-    run.recordings, run.simulated = cache, is_simulated(*facts)
-    tasks = [cache.episode(number, ()).task for number in range(len(cache))]
-    run.held_out = held_out(run.config.data.validation, tasks, recorded=not run.simulated)
-    run.dataset, run.episodes = without(cache.steps, run.held_out), outline(cache, run.held_out)
-    identity = {name: metadata[name] for name in ("crc32", "instructions")}
-    if run.held_out:
-        identity["held_out"] = run.held_out
-    streams = sum(x.nbytes for x in jax.tree.leaves(run.dataset)) > free_bytes
-    run.streams = record_dataset(run.folder, identity, streams=streams)
-    run.config = dataclasses.replace(
-        run.config, robot=metadata["robot"], tasks=tuple(metadata["tasks"])
-    )
-    location = "streamed from disk" if run.streams else "held on the device"
-    run.console.print(f"{cache.num_steps} steps in {len(cache)} episodes, {location}")
-    if run.held_out:
-        names = ", ".join(map(str, run.held_out))
-        run.console.print(f"held out of training: {len(run.held_out)} episodes ({names})")
-    if recipe := run.augmentation:
-        run.console.print(f"images change while training, by the recipe of {recipe.preset}")
-
-
 def _collect(run: Run, instructions: Sequence[str], collect: Collect) -> Demonstrations:
     """Collect demonstrations, with a progress bar per task."""
     with bars(run.console, "episodes") as progress:
@@ -382,7 +314,12 @@ def _collect(run: Run, instructions: Sequence[str], collect: Collect) -> Demonst
                 bar_ids[task] = progress.add_task(text, total=total)
             progress.update(bar_ids[task], completed=done, description=text)
 
-        episodes = collect(run.config, run.folder, report)
+        replayed, config = replayed_tasks(run.config), run.config
+        if replayed:
+            share = f"{100 * config.data.replay:g} % of the windows"
+            run.console.print(f"{share} are of what the base was taught: {', '.join(replayed)}")
+            config = dataclasses.replace(config, tasks=(*config.tasks, *replayed))
+        episodes = collect(config, run.folder, report)
     # Steps refer to instructions by index.
     if [phrase for group in episodes.values() for phrase in group.instructions] != [*instructions]:
         raise ValueError(

@@ -130,7 +130,7 @@ def _config(name: str, seed: int, rate: float) -> Config:
         model=model,
         data=dataclasses.replace(
             config.data,
-            source=f"data/{stage.tasks}",
+            source=(f"data/{stage.tasks}",),
             augment=AugmentConfig("none"),
             validation=("0",),
         ),

@@ -276,7 +276,7 @@ def test_runs_without_held_out_episodes_have_the_settings_of_before():
 
 
 def test_evaluate_on_another_dataset(recorded, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(export, "load_policy", lambda _: recorded.policy)
+    monkeypatch.setattr(export, "load_policy", lambda *_, **__: recorded.policy)
     monkeypatch.setattr(export, "describe", lambda _: {"control_dt": 0.1})
     run = str(recorded.folder)
     monkeypatch.setenv("COLUMNS", "200")

@@ -24,6 +24,7 @@ TASKS = {task: RESULTS["tasks"]["press"] for task in CONFIG.tasks}
         {"data": DataConfig(source="x", cameras=("a", "b"), validation=("0.1",))},
         {"data": DataConfig(source="x", augment=AugmentConfig("lerobot", hue=0.1))},
         {"data": DataConfig(source="x", augment=AugmentConfig("none"), validation=("0",))},
+        {"data": DataConfig(("a", "b"), weights=(2.0,), replay=0.1, statistics="each")},
         {"adapt": ("language=lora:4", "action=full")},
     ],
 )

@@ -73,7 +73,8 @@ def parser(program: str) -> argparse.ArgumentParser:
 def _add_checkpoint_options(group: Any) -> None:
     checkpoint = group.add_argument
     checkpoint("--statistics", default="", help="normalization, if not in the checkpoint")
-    checkpoint("--dataset", default="", help="which statistics, if there are several")
+    checkpoint("--dataset", default="", help="which dataset's statistics, if there are several; "
+        "or, of a run, for which of its datasets, if they differ")  # fmt: skip
     checkpoint("--openpi-config", help="openpi's training config, such as pi05_libero, "
         "which says all that follows (default: that which the folder is named after)")  # fmt: skip
     checkpoint("--size", help="size of the model: base or base_pi05")
@@ -158,8 +159,9 @@ def _compiled(options: argparse.Namespace, named: dict[str, str]) -> dict[str, A
         settings["guidance"] = 10.0 if options.guidance is None else options.guidance
     compiled = functools.partial(CompiledPolicy, **settings)
     if all(map(is_run, named.values())):
-        _refuse(options, CHECKPOINT_OPTIONS, "is for published checkpoints: runs record theirs")
-        where = {"base": options.base, "words": options.tokenizer}
+        others = [name for name in CHECKPOINT_OPTIONS if name != "dataset"]
+        _refuse(options, others, "is for published checkpoints: runs record theirs")
+        where = {"base": options.base, "words": options.tokenizer, "dataset": options.dataset}
         # One at a time, as the prepared weights are copies.
         return {name: compiled(loading.load_run(run, **where)) for name, run in named.items()}
     if len(named) > 1:

@@ -30,6 +30,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--out", type=Path, required=True, metavar="FOLDER", help="folder to create")
     add("--base", default="", help="the run's base, if it has moved")
     add("--tokenizer", default="", help="the policy's tokenizer, if it has moved")
+    add("--dataset", default="", help="for which of the run's datasets, if they differ")
     add("--num-steps", type=int, default=10, help="flow steps (default: %(default)s)")
     add("--max-batch", type=int, default=8, help="largest batch (default: %(default)s)")
     return parser
@@ -43,7 +44,8 @@ def _export(options: argparse.Namespace, console: Console) -> None:
     jax.config.update("jax_platforms", "cpu")
     from lorasp_jax.extras.serving import exporting, loading
 
-    loaded = loading.load_run(options.run, base=options.base, words=options.tokenizer)
+    where = {"base": options.base, "words": options.tokenizer, "dataset": options.dataset}
+    loaded = loading.load_run(options.run, **where)
     exporting.write(
         loaded.policy,
         options.out,

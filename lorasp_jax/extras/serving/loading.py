@@ -1,6 +1,7 @@
 """Load what a server serves: finished runs, or a published checkpoint with or without adapters."""
 
 import dataclasses
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,10 +41,17 @@ class Loaded:
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
 
-def load_run(folder: str, *, base: str = "", words: str = "") -> Loaded:
-    """Load a finished run; arguments and errors are those of `load_policy`."""
+def load_run(folder: str, *, base: str = "", words: str = "", dataset: str = "") -> Loaded:
+    """Load a finished run; arguments and errors are those of `load_policy`.
+
+    Says for which dataset's robot the policy acts if there is a choice.
+    """
     described = export.describe(folder)
-    policy = export.load_policy(folder, base=base, words=words)
+    if (known := export.datasets(described)) and not dataset:
+        default = described["policy"]["dataset"] or "all its datasets"
+        others = f"--dataset chooses one of {', '.join(known)}"
+        print(f"{folder} acts for {default}; {others}", file=sys.stderr)
+    policy = export.load_policy(folder, base=base, words=words, dataset=dataset)
     recorded = hub.resolve_portable(described["policy"]["tokenizer"])
     config = read_json(Path(folder) / CONFIG_FILE, {"optim": {}})
     return Loaded(

@@ -39,7 +39,7 @@ def test_runs_have_the_settings_in_the_results():
         assert changed_settings(recorded, describe_config(cell, config)) == ["name"]
         backbone, stage, method, _ = cell.name.split("/")
         assert type(config.peft) is kinds.get(method, peft.LoRA)
-        assert config.data.source == f"data/{study.STAGES[stage].tasks}"
+        assert config.data.source == (f"data/{study.STAGES[stage].tasks}",)
         base = f"runs/metaworld/{backbone}/ml45/full/s0/base"
         bundled = f"assets/{backbone}_small"
         assert config.model.source == (base if stage == "ml5" else bundled)
