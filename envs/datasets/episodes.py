@@ -136,9 +136,9 @@ class Episodes:
             check_camera(name)
         _check(self._image_rules())
 
-    def validate_numbers(self) -> None:
-        """Run the checks of `validate`, except those of images."""
-        _check(self._rules())
+    def validate_numbers(self, what: str = "") -> None:
+        """Run the checks of `validate`, except those of images; messages begin with `what`."""
+        _check(self._rules(), what)
 
     def _image_rules(self) -> Iterator[tuple[bool, str]]:
         steps = self.state.shape[:2]
@@ -176,7 +176,8 @@ class Episodes:
             values = np.asarray(getattr(self, name))
             yield values.dtype == np.float32, f"{name} must be float32, got {values.dtype}"
             wrong = np.argwhere(~np.isfinite(values))
-            at = "episode {}, step {}, dimension {}".format(*wrong[0]) if len(wrong) else ""
+            number = "episode {0}, " if episodes > 1 else ""
+            at = f"{number}step {{1}}, dimension {{2}}".format(*wrong[0]) if len(wrong) else ""
             yield not at, f"{name} is not finite at {at}"
         for name, low, high in (
             ("length", 1, steps),
@@ -188,11 +189,11 @@ class Episodes:
             yield in_range, f"{name} must be {episodes} integers from {low} to {high}, got {values}"
 
 
-def _check(rules: Iterable[tuple[bool, str]]) -> None:
-    """Raise a ValueError for the first rule that does not hold."""
+def _check(rules: Iterable[tuple[bool, str]], what: str = "") -> None:
+    """Raise a ValueError for the first rule that does not hold; it begins with `what`."""
     for holds, rule in rules:
         if not holds:
-            raise ValueError(rule)
+            raise ValueError(f"{what}{rule}")
 
 
 def check_camera(name: str) -> None:

@@ -122,12 +122,16 @@ def rows(column: pa.ChunkedArray, dim: int) -> np.ndarray:
     if not len(values):
         return np.empty((0, dim))
     found = 1
-    while pa.types.is_nested(values.type):
+    while not pa.types.is_struct(values.type) and pa.types.is_nested(values.type):
         sizes = pc.unique(pc.list_value_length(values)).to_pylist()
         if len(sizes) > 1 or sizes[0] is None:
             raise ValueError(f"its rows have {sizes} values, not {dim}")
         found *= sizes[0]
         values = values.flatten()
     if found != dim:
-        raise ValueError(f"its rows have {found} values, not {dim}")
-    return values.cast(pa.float64()).to_numpy(zero_copy_only=False).reshape(-1, dim)
+        raise ValueError(f"its rows have {found} values, not {dim}, of the type {values.type}")
+    try:
+        numbers = values.cast(pa.float64())
+    except pa.ArrowException as error:
+        raise ValueError(f"its values are {values.type}, not numbers") from error
+    return numbers.to_numpy(zero_copy_only=False).reshape(-1, dim)
