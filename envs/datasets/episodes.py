@@ -136,9 +136,9 @@ class Episodes:
             check_camera(name)
         _check(self._image_rules())
 
-    def validate_numbers(self, what: str = "") -> None:
-        """Run the checks of `validate`, except those of images; messages begin with `what`."""
-        _check(self._rules(), what)
+    def validate_numbers(self) -> None:
+        """Run the checks of `validate`, except those of images."""
+        _check(self._rules())
 
     def _image_rules(self) -> Iterator[tuple[bool, str]]:
         steps = self.state.shape[:2]
@@ -189,11 +189,11 @@ class Episodes:
             yield in_range, f"{name} must be {episodes} integers from {low} to {high}, got {values}"
 
 
-def _check(rules: Iterable[tuple[bool, str]], what: str = "") -> None:
-    """Raise a ValueError for the first rule that does not hold; it begins with `what`."""
+def _check(rules: Iterable[tuple[bool, str]]) -> None:
+    """Raise a ValueError for the first rule that does not hold."""
     for holds, rule in rules:
         if not holds:
-            raise ValueError(f"{what}{rule}")
+            raise ValueError(rule)
 
 
 def check_camera(name: str) -> None:

@@ -137,8 +137,8 @@ class LeRobot:
             physics_dt=0.0,
             attempted=1,
         )
-        with as_value_error(entry.table):
-            episode.validate_numbers(f"episode {entry.number}: ")
+        with as_value_error(Path(f"{entry.table}: episode {entry.number}")):
+            episode.validate_numbers()
         return episode
 
     def _choose_cameras(self, chosen: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:

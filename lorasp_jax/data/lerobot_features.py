@@ -59,10 +59,11 @@ def dimension_names(features: Features, key: str, path: Path) -> list[str]:
     Raises:
         KeyError, TypeError, ValueError: the feature is missing, or is no vector.
     """
-    shape = [as_int(size) for size in features[key]["shape"]]
+    shape = [as_int(size) for size in features[key].get("shape") or [0]]
     dim = math.prod(shape)
     if not 0 < dim <= _MAX_DIM or dim != max(shape, default=1):
-        raise RefusedError(f"{path}: {key} must be one vector per frame, but has shape {shape}")
+        found = features[key].get("shape")
+        raise RefusedError(f"{path}: {key} must be one vector per frame, but has shape {found}")
     names = _flat(features[key].get("names"))
     return names if len(names) == dim else [str(i) for i in range(dim)]
 

@@ -12,6 +12,9 @@ from tests.data.lerobots import golden
 
 RNG = np.random.default_rng(0)
 STATE, ACTION = RNG.uniform(size=(2, len(NAMES), 7)).astype(np.float32)
+for values in (STATE, ACTION):
+    for low in (2, 4, 6):  # min and max, q01 and q99, q10 and q90
+        values[low : low + 2].sort(axis=0)
 
 
 def by_name(values, names=NAMES):

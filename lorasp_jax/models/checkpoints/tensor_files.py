@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import safetensors
 
+from lorasp_jax.base import json_values
 from lorasp_jax.base.files import (
     as_value_error,
     check_memory,
@@ -33,7 +34,8 @@ def weight_files(folder: Path) -> list[Path]:
     if (folder / SINGLE).exists() or not index.exists():
         return [folder / SINGLE]
     with as_value_error(index):
-        names = sorted(set(read_json(index)["weight_map"].values()))
+        json_values.check(content := read_json(index), {"weight_map": {str: str}})
+    names = sorted(set(content["weight_map"].values()))
     return [join_inside(folder, name) for name in names]
 
 
