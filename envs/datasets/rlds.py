@@ -126,7 +126,10 @@ class Reader:
             self._shared: dict[str, Any] = {name: self.metadata[name] for name in SHARED}
             self._shared |= {"instructions": tuple(self.metadata["instructions"]), "attempted": 1}
             check_regular(self.path / _INFO, self.path)
-            shards = sorted(self.path.glob(f"[!.]*-{_SPLIT}.array_record-*"))
+            shards = sorted(self.path.glob(f"*-{_SPLIT}.array_record-*"))
+            # macOS writes a file ._NAME beside each file NAME on some drives.
+            copies = {file.with_name(f"._{file.name}") for file in shards}
+            shards = [file for file in shards if file not in copies]
             self._records = ArrayRecordDataSource([check_regular(f, self.path) for f in shards])
             if len(self) != (expected := sum(self.metadata["parts"])):
                 raise ValueError(f"expected {expected} episodes, found {len(self)}")

@@ -145,7 +145,10 @@ def _policy(files: list[Path]) -> dict[str, Stats]:
     for pipeline in (files[0].with_name(name) for name in PIPELINES):
         json_values.check(content := read_json(pipeline), PIPELINE, nulls=True)
         for step in content["steps"]:
-            if "normalizer" in (step.get("registry_name") or "") and step.get("state_file"):
+            if (
+                "normalizer" in (step.get("registry_name") or "")
+                and step.get("state_file") is not None
+            ):
                 tensors += _tensors(join_inside(pipeline.parent, step["state_file"]))
     return _group(tensors)
 

@@ -80,6 +80,20 @@ def test_images_without_colors(path, monkeypatch):
         rlds.read(path.parent / "depth")
 
 
+def test_lengths_of_states_and_actions(path):
+    edit(path / "metadata.json", lambda found: found.update(widths=[7, 6]))
+    with pytest.raises(ValueError, match="press: episode 0 is damaged .action has .* not 6 each"):
+        rlds.read(path)
+    edit(path / "metadata.json", lambda found: found.pop("widths"))  # older datasets
+    assert rlds.read(path).action.shape[2] == 7
+
+
+def test_hidden_copies_of_macos(path):
+    (file,) = path.glob("*array_record*")
+    file.with_name(f"._{file.name}").write_bytes(b"\0\5\26\7")
+    assert rlds.read(path).num_episodes == make().num_episodes
+
+
 @pytest.mark.parametrize("name", ["../../harm", "/tmp/harm", "é" * 300, ""])
 def test_names_of_tasks_and_robots_are_not_paths(name, path, tmp_path):
     before = sorted(tmp_path.iterdir())
@@ -112,7 +126,7 @@ def test_values_that_are_not_finite(path):
     episodes = make()
     episodes.state[1, 0, 2] = np.nan
     rewrite(path, episodes)
-    with pytest.raises(ValueError, match=r"press is damaged .*state .* dimension 2"):
+    with pytest.raises(ValueError, match=r"press: episode 1 is damaged .*state .* dimension 2"):
         rlds.read(path)
 
 
@@ -120,5 +134,5 @@ def test_an_empty_episode(path):
     one = make()
     nothing = {name: picture[:, :0] for name, picture in one.image.items()}
     rewrite(path, dataclasses.replace(one, image=nothing, length=np.array([1, 0, 1], np.int32)))
-    with pytest.raises(ValueError, match="press is damaged"):
+    with pytest.raises(ValueError, match="press: episode 0 is damaged"):
         rlds.read(path)

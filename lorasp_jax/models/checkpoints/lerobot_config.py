@@ -36,6 +36,8 @@ FIELDS: Fields = {
     "image_resolution?": (int, int),
     "resize_imgs_with_padding?": (int, int),
     "empty_cameras?": int,
+    "num_vlm_layers?": int,
+    "expert_width_multiplier?": float,
 }
 _OPTIONS: Fields = {
     "norm_map?": {str: str},
