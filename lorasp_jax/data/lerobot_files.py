@@ -193,14 +193,15 @@ def _file(folder: Path, info: Mapping[str, Any], name: str, **values: Any) -> Pa
     `str.format` is unsafe, because it evaluates attributes.
     """
     template = info.get(name)
-    rest = _FIELD.sub("", template) if isinstance(template, str) else "{}"
-    if set("{}") & set(rest) or not {x for x, _ in _FIELD.findall(template)} <= values.keys():
+    text = template if isinstance(template, str) else "{}"
+    fields = {field for field, _ in _FIELD.findall(text)}
+    if set("{}") & set(_FIELD.sub("", text)) or not fields <= values.keys():
         raise RefusedError(
             f"{folder}/meta/info.json: {name} must be a path with the fields {', '.join(values)}, "
             f"got {template!r}"
         )
-    text = _FIELD.sub(lambda field: format(values[field[1]], field[2] or ""), template)
-    return join_inside(folder, text)
+    fill = lambda field: format(values[field[1]], field[2] or "")  # noqa: E731
+    return join_inside(folder, _FIELD.sub(fill, text))
 
 
 def read_table(

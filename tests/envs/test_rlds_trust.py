@@ -82,7 +82,7 @@ def test_images_without_colors(path, monkeypatch):
 
 def test_lengths_of_states_and_actions(path):
     edit(path / "metadata.json", lambda found: found.update(widths=[7, 6]))
-    with pytest.raises(ValueError, match="press: episode 0 is damaged .action has .* not 6 each"):
+    with pytest.raises(ValueError, match=r"press: episode 0 is damaged .action has .* not 6 each"):
         rlds.read(path)
     edit(path / "metadata.json", lambda found: found.pop("widths"))  # older datasets
     assert rlds.read(path).action.shape[2] == 7

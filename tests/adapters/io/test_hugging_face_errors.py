@@ -46,14 +46,14 @@ def test_a_config_that_is_no_object(copy):
     for text in ("[]", "null"):
         (copy / hugging_face.CONFIG).write_text(text)
         with pytest.raises(
-            ValueError, match="adapter_config.json is damaged .it must be an object"
+            ValueError, match=r"adapter_config.json is damaged .it must be an object"
         ):
             hugging_face.load_peft(copy, Net())
 
 
 def test_pickles_are_never_opened(copy):
     (copy / hugging_face.TENSORS).rename(copy / "adapter_model.bin")
-    with pytest.raises(ValueError, match="adapter_model.bin, a pickle, .* save it again"):
+    with pytest.raises(ValueError, match=r"adapter_model.bin, a pickle, .* save it again"):
         hugging_face.load_peft(copy, Net())
 
 
