@@ -156,7 +156,7 @@ def episode(
         state=rows("observation/state", widths[0]),
         action=rows("action", widths[1]),
         length=np.array([steps], np.int32),
-        instruction=np.array(instruction, np.int32),
+        instruction=np.array([*instruction], np.int32),
         **metadata,
     )
 

@@ -88,6 +88,14 @@ def test_lengths_of_states_and_actions(path):
     assert rlds.read(path).action.shape[2] == 7
 
 
+@pytest.mark.parametrize("number", [-1, 5, 2**40])
+def test_instructions_that_do_not_exist(number, path):
+    episodes = make()
+    rewrite(path, dataclasses.replace(episodes, instruction=np.full(3, number)))
+    with pytest.raises(ValueError, match="press: episode 0 is damaged"):
+        rlds.read(path)
+
+
 def test_hidden_copies_of_macos(path):
     (file,) = path.glob("*array_record*")
     file.with_name(f"._{file.name}").write_bytes(b"\0\5\26\7")

@@ -28,7 +28,7 @@ _FIXED: Fields = {
 FIELDS: Fields = {
     "type": str,
     "input_features?": {str: {"type": str}},
-    "output_features?": {str: {"type": str}},
+    "output_features?": {str: {}},
     "normalization_mapping?": {str: str},
     "use_relative_actions?": bool,
     "relative_exclude_joints?": [str],
