@@ -176,7 +176,8 @@ class Episodes:
             values = np.asarray(getattr(self, name))
             yield values.dtype == np.float32, f"{name} must be float32, got {values.dtype}"
             wrong = np.argwhere(~np.isfinite(values))
-            at = "episode {}, step {}, dimension {}".format(*wrong[0]) if len(wrong) else ""
+            number = "episode {0}, " if episodes > 1 else ""
+            at = f"{number}step {{1}}, dimension {{2}}".format(*wrong[0]) if len(wrong) else ""
             yield not at, f"{name} is not finite at {at}"
         for name, low, high in (
             ("length", 1, steps),

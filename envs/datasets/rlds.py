@@ -41,6 +41,7 @@ _TYPES: dict[str, Any] = {"options": {}, "parts": [int], "steps": int, "attempte
 _SHARD_TYPES: dict[str, Any] = {
     **{"task": str, "robot": str, "actions": str, "instructions": [str]},
     **{"cameras": {str: (int, int)}, "control_dt": float, "physics_dt": float},
+    **{"widths?": (int, int)},
 }
 """Schema of the fields that appear with the first shard."""
 _FORMAT, _SPLIT, _VERSION = "envs-rlds-1", "train", "1.0.0"
@@ -79,6 +80,7 @@ def metadata(path: Path) -> dict[str, Any]:
     """
     with _reading(path):
         content = read_json(path / METADATA, path)
+        json_values.check(content, {"format": str})
         if content["format"] != _FORMAT:
             raise ValueError(f"its format is not {_FORMAT}")
         json_values.check(content, _TYPES | (_SHARD_TYPES if content["parts"] else {}))
@@ -125,6 +127,9 @@ class Reader:
             self._shared |= {"instructions": tuple(self.metadata["instructions"]), "attempted": 1}
             check_regular(self.path / _INFO, self.path)
             shards = sorted(self.path.glob(f"*-{_SPLIT}.array_record-*"))
+            # macOS writes a file ._NAME beside each file NAME on some drives.
+            copies = {file.with_name(f"._{file.name}") for file in shards}
+            shards = [file for file in shards if file not in copies]
             self._records = ArrayRecordDataSource([check_regular(f, self.path) for f in shards])
             if len(self) != (expected := sum(self.metadata["parts"])):
                 raise ValueError(f"expected {expected} episodes, found {len(self)}")
@@ -143,11 +148,12 @@ class Reader:
         Raises:
             ValueError: it is damaged or incomplete.
         """
-        with _reading(self.path):
-            names = self.cameras if cameras is None else cameras
-            selected = {name: self.cameras[name] for name in names}
-            sizes = self.metadata["cameras"]
-            episode = rlds_schema.episode(self._records[number], selected, sizes, self._shared)
+        names = self.cameras if cameras is None else cameras
+        selected = {name: self.cameras[name] for name in names}
+        sizes, widths = self.metadata["cameras"], self.metadata.get("widths", (0, 0))
+        with _reading(Path(f"{self.path}: episode {number}")):
+            record = self._records[number]
+            episode = rlds_schema.episode(record, selected, sizes, widths, self._shared)
             episode.validate_numbers()
             return episode
 

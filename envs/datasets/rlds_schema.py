@@ -6,12 +6,12 @@ Features have the names of Open X-Embodiment.
 import io
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import tensorflow_datasets as tfds
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 from tensorflow_datasets.core.example_serializer import ExampleSerializer
 from tensorflow_datasets.proto import tf_example_pb2
 
@@ -119,6 +119,7 @@ def episode(
     record: bytes,
     cameras: Mapping[str, str],
     sizes: Mapping[str, Any],
+    widths: Sequence[int],
     metadata: Mapping[str, Any],
 ) -> Episodes:
     """Parse a record to an episode in host memory.
@@ -129,14 +130,19 @@ def episode(
         record: from `record`.
         cameras: camera -> feature of its images.
         sizes: camera -> height and width of its images.
+        widths: number of values in a state and in an action; 0: any.
         metadata: the metadata fields of `Episodes`.
     """
     fields = tf_example_pb2.Example.FromString(record).features.feature
     steps = len(fields["steps/is_first"].int64_list.value)
-    (instruction,) = fields["episode_metadata/instruction"].int64_list.value
+    instruction = fields["episode_metadata/instruction"].int64_list.value
+    if not steps or len(instruction) != 1:
+        raise ValueError(f"it has {steps} steps and {len(instruction)} instructions")
 
-    def rows(name: str) -> np.ndarray:
+    def rows(name: str, width: int) -> np.ndarray:
         values = np.array(fields[f"steps/{name}"].float_list.value, np.float32)
+        if values.size % steps or width not in (0, values.size // steps):
+            raise ValueError(f"{name} has {values.size} numbers in {steps} steps, not {width} each")
         return values.reshape(1, steps, -1)
 
     def images(camera: str, feature: str) -> np.ndarray:
@@ -147,10 +153,10 @@ def episode(
 
     return Episodes(
         image={camera: images(camera, feature) for camera, feature in cameras.items()},
-        state=rows("observation/state"),
-        action=rows("action"),
+        state=rows("observation/state", widths[0]),
+        action=rows("action", widths[1]),
         length=np.array([steps], np.int32),
-        instruction=np.array([instruction], np.int32),
+        instruction=np.array([*instruction], np.int32),
         **metadata,
     )
 
@@ -186,7 +192,11 @@ def _chunk(kind: bytes, data: bytes) -> bytes:
 def _decode(file: bytes, size: Any) -> np.ndarray:
     """Decode an image to uint8 `[H, W, 3]`; raise ValueError if its size is not `size`,
     or if it has no colors."""
-    with Image.open(io.BytesIO(file), formats=("PNG",)) as image:
+    try:
+        image = Image.open(io.BytesIO(file), formats=("PNG",))
+    except UnidentifiedImageError as error:
+        raise ValueError(f"an image is no PNG file, it begins with {file[:8]}") from error
+    with image:
         if [image.height, image.width] != list(size):  # checked before decoding
             raise ValueError(f"an image has {image.height} x {image.width} pixels, not {size}")
         if image.mode != "RGB":

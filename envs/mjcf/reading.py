@@ -15,6 +15,7 @@ from lorasp_jax.base.files import as_value_error
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _KINDS = ("free", "ball", "slide", "hinge")
 _MAX_JOINTS = 16  # our choice: compile time grows with every joint
+_NUMBERS = ("body_pos", "body_quat", "geom_pos", "geom_size", "jnt_pos", "jnt_axis")
 _RADIANS_AS_DEGREES = np.deg2rad(4 * np.pi)  # width of +-2 pi, read as degrees
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
@@ -56,7 +57,10 @@ def read(
         spec.memory = -1  # automatic, whatever the file asks for
         # Merge no bodies and drop no geoms: both would change the ids in the model.
         spec.compiler.fusestatic = spec.compiler.discardvisual = False
-        return spec, spec.compile()
+        model = spec.compile()
+    if not all(np.isfinite(getattr(model, name)).all() for name in _NUMBERS):
+        raise ValueError("the numbers in the file must be finite")
+    return spec, model
 
 
 def find_arm(model: mujoco.MjModel) -> ArmIds:
@@ -140,13 +144,17 @@ def _servo(model: mujoco.MjModel, joint: int) -> tuple[int, float]:
     """Find the actuator that moves only this joint, and its rate as in `_rates`."""
     rates = _rates(model, joint)
     others = np.any([_rates(model, j) for j in range(model.njnt) if j != joint], axis=0)
-    for i in np.flatnonzero(rates * ~others).tolist():
-        gain = model.actuator_gainprm[i, 0]
-        # At control = angle, the force must be 0: gain * control and bias * rate * angle cancel.
-        if _is_servo(model, i) and np.isclose(gain, -model.actuator_biasprm[i, 1] * rates[i]):
-            return i, float(rates[i])
-    name = _names(model, [joint])
-    raise ValueError(f"joint {name} needs a position actuator of its own; {_actuators(model)}")
+    gains = model.actuator_gainprm[:, 0]
+    # At control = angle, the force must be 0: gain * control and bias * rate * angle cancel.
+    balanced = np.isclose(gains, -model.actuator_biasprm[:, 1] * rates)
+    own = np.flatnonzero(rates * ~others * balanced).tolist()
+    servos = [i for i in own if _is_servo(model, i)]
+    if len(servos) == 1:
+        return servos[0], float(rates[servos[0]])
+    name, count = _names(model, [joint]), "only one" if servos else "a"
+    raise ValueError(
+        f"joint {name} needs {count} position actuator of its own; {_actuators(model)}"
+    )
 
 
 def _rates(model: mujoco.MjModel, joint: int) -> np.ndarray:

@@ -97,29 +97,39 @@ def read_bytes(path: Path, folder: Path | None = None) -> bytes:
 
 
 def read_text(path: Path, folder: Path | None = None) -> str:
-    """Read a UTF-8 file (see `read_bytes`); raise ValueError if it has another encoding."""
-    return read_bytes(path, folder).decode()
+    """Read a UTF-8 file (see `read_bytes`); raise ValueError if it has another encoding.
+
+    A byte order mark, with which some editors begin a file, is skipped.
+    """
+    return read_bytes(path, folder).decode("utf-8-sig")
 
 
 def read_json(path: Path, folder: Path | None = None) -> Any:
-    """Read a JSON file (see `read_bytes`).
+    """Read a JSON file (see `read_bytes` and `parse_json`)."""
+    return parse_json(read_text(path, folder))
+
+
+def parse_json(text: str) -> Any:
+    """Parse JSON.
 
     Raises:
         ValueError: it is not JSON, has a string with a lone surrogate or a key twice.
         RecursionError: it is nested too deeply.
     """
-    value = json.loads(read_text(path, folder), object_pairs_hook=_unique)
+    value = json.loads(text, object_pairs_hook=_unique)
     json.dumps(value, ensure_ascii=False).encode()  # raises for lone surrogates
     return value
 
 
-def read_json_lines(path: Path, folder: Path | None = None) -> list[Any]:
-    """Read a file of one JSON value a line (see `read_bytes`).
+def read_json_lines(path: Path, folder: Path | None = None) -> list[dict[str, Any]]:
+    """Read a file of one JSON object a line (see `read_bytes` and `parse_json`).
 
     Only a line feed ends a line: JSON strings may contain the other line ends of Unicode.
     """
-    lines = read_text(path, folder).split("\n")
-    return [json.loads(line, object_pairs_hook=_unique) for line in lines if line.strip()]
+    rows = [parse_json(line) for line in read_text(path, folder).split("\n") if line.strip()]
+    if wrong := [row for row in rows if not isinstance(row, dict)]:
+        raise ValueError(f"each line must be an object, got {str(wrong[0])[:40]!r}")
+    return rows
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

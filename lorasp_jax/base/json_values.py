@@ -13,7 +13,7 @@ _NAMES: dict[Any, str] = {
 }
 
 
-def check(value: Any, kind: Any, name: str = "") -> None:
+def check(value: Any, kind: Any, name: str = "", *, nulls: bool = False) -> None:
     """Raise ValueError unless a JSON value matches a schema.
 
     Args:
@@ -23,6 +23,7 @@ def check(value: Any, kind: Any, name: str = "") -> None:
             "b". Other keys may have any value; if the schema has the type `str` as a key, they must
             match its kind.
         name: dotted path of the value, for the error message.
+        nulls: whether optional keys may be null, as in other projects' files.
     """
     if isinstance(kind, type):
         if not _is(value, kind):
@@ -34,14 +35,16 @@ def check(value: Any, kind: Any, name: str = "") -> None:
         if missing := [key for key in required if key not in value]:
             raise ValueError(f"{name or 'it'} lacks {missing[0]!r}")
         for key, item in value.items():
-            if (item_kind := kind.get(key, kind.get(f"{key}?", kind.get(str)))) is not None:
-                check(item, item_kind, f"{name}.{key}".lstrip("."))
+            item_kind = kind.get(key, kind.get(f"{key}?", kind.get(str)))
+            is_null = nulls and item is None and f"{key}?" in kind
+            if item_kind is not None and not is_null:
+                check(item, item_kind, f"{name}.{key}".lstrip("."), nulls=nulls)
     else:
         if not isinstance(value, list) or (isinstance(kind, tuple) and len(value) != len(kind)):
             count = f" of {len(kind)}" if isinstance(kind, tuple) else ""
             raise ValueError(f"{name} must be a list{count}, got {_truncated(value)}")
         for index, item in enumerate(value):
-            check(item, kind[0], f"{name}[{index}]")
+            check(item, kind[0], f"{name}[{index}]", nulls=nulls)
 
 
 def _is(value: Any, kind: type) -> bool:

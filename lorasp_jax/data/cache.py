@@ -299,12 +299,16 @@ class Cache:
     def _check_columns(self) -> None:
         """Raise ValueError unless rows, indices and values are valid, whoever wrote the cache."""
         length = self._columns["length"]
+        for name, column in self._columns.items():
+            of_steps = name in ("state", "action")
+            if column.ndim != 1 + of_steps or (of_steps and len(column) != self.num_steps):
+                raise ValueError(f"{name} has the shape {column.shape}, which does not match")
         if not len(length) or length.min() < 1 or self._end[-1] != self.num_steps:
             raise ValueError(f"its episodes must not be empty and have {self.num_steps} steps")
         if self.parts[1:] and len(self.dataset) != len(length):
             raise ValueError(f"its datasets must have {len(length)} episodes in all")
         for name, texts in (("task", self.metadata["tasks"]), ("instruction", self.instructions)):
-            low, high = self._columns[name].min(), self._columns[name].max()
+            low, high = self._columns[name].min(initial=0), self._columns[name].max(initial=0)
             if len(self._columns[name]) != len(length) or low < 0 or high >= len(texts):
                 raise ValueError(f"{name} indices must be 0 to {len(texts) - 1} in each episode")
         for name in ("state", "action"):

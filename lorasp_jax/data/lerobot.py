@@ -35,11 +35,13 @@ from lorasp_jax.data.lerobot_files import (
     read_index,
     read_table,
 )
-from lorasp_jax.data.video import VideoReader, decode_image
+from lorasp_jax.data.video import VideoReader, check_same_size, decode_image
 
 _COLUMNS = ("timestamp", "frame_index", "episode_index", "task_index")
 _TIME_TOLERANCE = 0.25
 """Tolerance of timestamps, in frame periods, as for videos."""
+_PICTURES = (pa.types.is_struct, pa.types.is_binary, pa.types.is_large_binary)
+"""Types of columns that may contain PNG or JPEG files, or name them."""
 
 
 class LeRobot:
@@ -138,7 +140,7 @@ class LeRobot:
             physics_dt=0.0,
             attempted=1,
         )
-        with as_value_error(entry.table):
+        with as_value_error(Path(f"{entry.table}: episode {entry.number}")):
             episode.validate_numbers()
         return episode
 
@@ -237,7 +239,8 @@ class LeRobot:
         # Each selected state is paired with the last action before the next selected state.
         first = 0 if kind == "state" else every - 1
         steps = np.minimum(np.arange(0, len(values), every) + first, len(values) - 1)
-        return values[steps].astype(np.float32)
+        with np.errstate(over="ignore"):  # overflows to inf, which is rejected later
+            return values[steps].astype(np.float32)
 
     def _instruction(self, table: Any, entry: EpisodeEntry) -> int:
         """Return the index of the episode's instruction in `Episodes.instructions`."""
@@ -262,14 +265,17 @@ class LeRobot:
         what = f"{entry.table}: a picture of {key}"
         with as_value_error(entry.table):
             column = table[key]
-            if not (pa.types.is_struct(column.type) or pa.types.is_binary(column.type)):
+            if not any(is_type(column.type) for is_type in _PICTURES):
                 raise RefusedError(f"{what} is {column.type}, neither a PNG nor a JPEG file")
             # Read one by one, because rows may name files in place of containing them.
             files = (self._file(row, what) for row in column.to_pylist()[::every])
             first = decode_image(next(files), what, size)
             length = -(-entry.length // every)
             check_memory(length * first.nbytes, f"an episode in {entry.table}")
-            return np.stack([first, *(decode_image(file, what, size) for file in files)])
+            images = [first, *(decode_image(file, what, size) for file in files)]
+            for image in images:
+                check_same_size(image, first, entry.table)
+            return np.stack(images)
 
     def _file(self, row: Any, what: str) -> bytes:
         """Return the content of a picture file that a row contains, or names by its path."""
@@ -278,6 +284,8 @@ class LeRobot:
         )
         if content is None and name is None:
             raise RefusedError(f"{what} is missing")
+        if content is not None and not isinstance(content, bytes):
+            raise RefusedError(f"{what} must be bytes, got {type(content).__name__}")
         return read_bytes(join_inside(self.path, name), self.path) if content is None else content
 
     def _video(self, camera: str, path: Path) -> VideoReader:

@@ -59,10 +59,11 @@ def dimension_names(features: Features, key: str, path: Path) -> list[str]:
     Raises:
         KeyError, TypeError, ValueError: the feature is missing, or is no vector.
     """
-    shape = [as_int(size) for size in features[key]["shape"]]
+    shape = [as_int(size) for size in features[key].get("shape") or [0]]
     dim = math.prod(shape)
     if not 0 < dim <= _MAX_DIM or dim != max(shape, default=1):
-        raise RefusedError(f"{path}: {key} must be one vector per frame, but has shape {shape}")
+        found = features[key].get("shape")
+        raise RefusedError(f"{path}: {key} must be one vector per frame, but has shape {found}")
     names = _flat(features[key].get("names"))
     return names if len(names) == dim else [str(i) for i in range(dim)]
 
@@ -130,12 +131,16 @@ def rows(column: pa.ChunkedArray, dim: int) -> np.ndarray:
     if not len(values):
         return np.empty((0, dim))
     found = 1
-    while pa.types.is_nested(values.type):
+    while not pa.types.is_struct(values.type) and pa.types.is_nested(values.type):
         sizes = pc.unique(pc.list_value_length(values)).to_pylist()
         if len(sizes) > 1 or sizes[0] is None:
             raise ValueError(f"its rows have {sizes} values, not {dim}")
         found *= sizes[0]
         values = values.flatten()
     if found != dim:
-        raise ValueError(f"its rows have {found} values, not {dim}")
-    return values.cast(pa.float64()).to_numpy(zero_copy_only=False).reshape(-1, dim)
+        raise ValueError(f"its rows have {found} values, not {dim}, of the type {values.type}")
+    try:
+        numbers = values.cast(pa.float64())
+    except pa.ArrowException as error:
+        raise ValueError(f"its values are {values.type}, not numbers") from error
+    return numbers.to_numpy(zero_copy_only=False).reshape(-1, dim)

@@ -7,7 +7,6 @@ Source: LeRobot, src/lerobot/datasets/utils.py, at 0.3.3 (2.1) and at 0.6.1 (3.0
 """
 
 import contextlib
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-from lorasp_jax.base import files
+from lorasp_jax.base import files, json_values
 from lorasp_jax.base.files import (
     RefusedError,
     as_int,
@@ -33,6 +32,19 @@ VERSIONS = ("v2.0", "v2.1", "v3.0")
 _FIELD = re.compile(r"\{(\w+)(?::(\d{0,2}d?))?\}")
 """A field of a path template, with an optional width: {episode_index:06d}."""
 _MAX_VALUE_BYTES = 8  # maximum size of a value in memory
+_MAX_SECONDS = 2**31  # limit for the start of an episode in a video
+_INFO: dict[str, Any] = {
+    "codebase_version": str,
+    "fps": float,
+    "features": {str: {"dtype": str, "shape?": [float], "info?": {}, "video_info?": {}}},
+    "data_path": str,
+}
+"""Schema of meta/info.json, see `json_values.check`."""
+_PATHS_3 = {
+    "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+    "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
+}
+"""Path templates that version 3.0 does not need to record."""
 
 
 @dataclass(frozen=True)
@@ -82,15 +94,25 @@ def read_index(folder: Path) -> Index:
     path = folder / "meta" / "info.json"
     with as_value_error(path):
         info = read_json(path, folder)
-        version, fps, features = info["codebase_version"], float(info["fps"]), info["features"]
+        json_values.check(info, {"codebase_version": str})
+        if (version := info["codebase_version"]) not in VERSIONS:
+            raise RefusedError(
+                f"{path} has the codebase_version {version!r}; convert it with LeRobot to one of "
+                f"{', '.join(VERSIONS)}"
+            )
+        info = {**(_PATHS_3 if version == "v3.0" else {}), **info}
+        json_values.check(info, _INFO, nulls=True)
+        fps, features = float(info["fps"]), info["features"]
         videos = [name for name, feature in features.items() if feature["dtype"] == "video"]
         robot = str(info.get("robot_type") or "unknown")
-        if version not in VERSIONS or not 0 < fps < math.inf:
-            valid = f"{', '.join(VERSIONS)} and a positive number of"
-            raise ValueError(f"it must have version {valid} fps, got {version} and {fps}")
+        if fps <= 0:
+            raise ValueError(f"fps must be positive, got {fps}")
+        if version != "v3.0" and as_int(info["chunks_size"]) < 1:
+            raise ValueError(f"chunks_size must be at least 1, got {info['chunks_size']}")
     read = _read_3 if version == "v3.0" else _read_2
     tasks, episodes = read(folder, info, videos)
     _check(folder, info, episodes)
+    episodes.sort(key=lambda entry: entry.number)  # as LeRobot does
     return Index(version, fps, robot, features, tasks, episodes)
 
 
@@ -109,13 +131,10 @@ def _read_2(
             chunk = number // as_int(info["chunks_size"])
             fields = {"episode_index": number, "episode_chunk": chunk}
             files = {
-                key: (
-                    join_inside(folder, _format(info["video_path"], video_key=key, **fields)),
-                    0.0,
-                )
+                key: (_file(folder, info, "video_path", video_key=key, **fields), 0.0)
                 for key in videos
             }
-            table = join_inside(folder, _format(info["data_path"], **fields))
+            table = _file(folder, info, "data_path", **fields)
             episodes.append(EpisodeEntry(number, as_int(row["length"]), table, files))
     return tasks, episodes
 
@@ -126,29 +145,29 @@ def _read_3(
     """Read tasks and episodes of version 3.0."""
     path = folder / "meta" / "tasks.parquet"
     with as_value_error(path):
-        # Instructions are the index of a pandas table, stored under this key if it has no name.
-        rows = [
-            {"task": row.pop("__index_level_0__", None), **row}
-            for row in read_table(path, folder).to_pylist()
-        ]
-        tasks = _tasks(path, rows)
+        table = read_table(path, folder)
+        # Instructions are the index of a pandas table, of any name or none.
+        index = (table.schema.pandas_metadata or {}).get("index_columns", [])
+        names = [n for n in (*index, "task", "__index_level_0__") if n in table.column_names]
+        tasks = _tasks(path, table.to_pylist(), *names[:1])
     episodes = []
-    for path in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
+    # macOS writes hidden files ._*.parquet beside those of others.
+    for path in sorted((folder / "meta" / "episodes").rglob("[!.]*.parquet")):
         with as_value_error(path):
             for row in read_table(path, folder, without="stats/").to_pylist():
                 at = {name: as_int(row[f"data/{name}"]) for name in ("chunk_index", "file_index")}
                 files = {key: _video_3(folder, info, key, row) for key in videos}
-                table = join_inside(folder, _format(info["data_path"], **at))
+                table = _file(folder, info, "data_path", **at)
                 number, length = as_int(row["episode_index"]), as_int(row["length"])
                 episodes.append(EpisodeEntry(number, length, table, files))
     return tasks, episodes
 
 
-def _tasks(path: Path, rows: Sequence[Mapping[str, Any]]) -> dict[int, str]:
+def _tasks(path: Path, rows: Sequence[Mapping[str, Any]], column: str = "task") -> dict[int, str]:
     """Return task index -> instruction."""
     tasks: dict[int, str] = {}
     for row in rows:
-        number, text = as_int(row["task_index"]), row["task"]
+        number, text = as_int(row["task_index"]), row[column]
         if not isinstance(text, str):
             raise RefusedError(f"{path}: task {number} must be text, got {text!r}")
         if tasks.setdefault(number, text) != text:
@@ -161,17 +180,28 @@ def _video_3(
 ) -> tuple[Path, float]:
     """Return an episode's video file and its start time in that file [s], in version 3.0."""
     at = {name: as_int(row[f"videos/{key}/{name}"]) for name in ("chunk_index", "file_index")}
-    start = float(row[f"videos/{key}/from_timestamp"])
-    if not 0 <= start < math.inf:
+    start = row[f"videos/{key}/from_timestamp"]
+    json_values.check(start, float, f"videos/{key}/from_timestamp")
+    if not 0 <= start < _MAX_SECONDS:
         raise ValueError(f"episode {row['episode_index']} starts at {start} s in its {key} video")
-    return join_inside(folder, _format(info["video_path"], video_key=key, **at)), start
+    return _file(folder, info, "video_path", video_key=key, **at), float(start)
 
 
-def _format(template: Any, **values: Any) -> str:
-    """Fill in a path template. `str.format` is unsafe, because it evaluates attributes."""
-    if not isinstance(template, str) or set("{}") & set(_FIELD.sub("", template)):
-        raise ValueError(f"invalid path template {template!r}")
-    return _FIELD.sub(lambda field: format(values[field[1]], field[2] or ""), template)
+def _file(folder: Path, info: Mapping[str, Any], name: str, **values: Any) -> Path:
+    """Fill in a path template of meta/info.json.
+
+    `str.format` is unsafe, because it evaluates attributes.
+    """
+    template = info.get(name)
+    text = template if isinstance(template, str) else "{}"
+    fields = {field for field, _ in _FIELD.findall(text)}
+    if set("{}") & set(_FIELD.sub("", text)) or not fields <= values.keys():
+        raise RefusedError(
+            f"{folder}/meta/info.json: {name} must be a path with the fields {', '.join(values)}, "
+            f"got {template!r}"
+        )
+    fill = lambda field: format(values[field[1]], field[2] or "")  # noqa: E731
+    return join_inside(folder, _FIELD.sub(fill, text))
 
 
 def read_table(
@@ -182,7 +212,7 @@ def read_table(
     Args:
         path: the file.
         folder: the dataset's folder.
-        columns: columns to read, without those that are missing, or None for all.
+        columns: columns to read, or None for all.
         without: prefix of columns to skip.
 
     Raises:
@@ -192,8 +222,9 @@ def read_table(
         names = file.schema_arrow.names
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise RefusedError(f"{path} has several columns {twice[0]}")
-        available = columns or names
-        selected = [name for name in available if not name.startswith(without)]
+        if missing := [name for name in columns or () if name not in names]:
+            raise KeyError(missing[0])
+        selected = [name for name in columns or names if not name.startswith(without)]
         check_memory(_size(file.metadata, set(selected)), path)
         return file.read(columns=selected)
 

@@ -10,7 +10,7 @@ import av
 import av.error
 import numpy as np
 from av.video.reformatter import VideoReformatter
-from PIL import Image, UnidentifiedImageError
+from PIL import Image, ImageOps, UnidentifiedImageError
 
 from lorasp_jax.base.files import RefusedError, as_value_error, check_memory
 
@@ -41,6 +41,8 @@ class VideoReader:
         self.path = path
         with as_value_error(path, av.error.FFmpegError):
             self._container: Any = av.open(f"file:{path}", container_options=_OPTIONS)
+            if not self._container.streams.video:
+                raise ValueError("it has no video")
             self._stream = self._container.streams.video[0]
             _check_color(self._stream.codec_context.pix_fmt or "", str(path))
         self._stream.thread_type = "AUTO"
@@ -82,6 +84,7 @@ class VideoReader:
                     shape = (-(-length // every), *image.shape)
                     check_memory(math.prod(shape), f"an episode in {self.path}")
                     images = np.empty(shape, np.uint8)
+                check_same_size(image, images[0], self.path)
                 images[number // every] = image
         self._end = start + length / fps
         return images
@@ -128,7 +131,15 @@ def decode_image(file: bytes, what: str, image_size: int = 0) -> np.ndarray:
         if image.width * image.height > (Image.MAX_IMAGE_PIXELS or math.inf):
             raise ValueError(f"an image has more than {Image.MAX_IMAGE_PIXELS} pixels")
         _check_color(image.mode, what)
+        ImageOps.exif_transpose(image, in_place=True)  # as Hugging Face's datasets reads it
         return downscale(np.asarray(image.convert("RGB")), image_size)
+
+
+def check_same_size(image: np.ndarray, first: np.ndarray, path: Path) -> None:
+    """Raise RefusedError unless two pictures `[H, W, 3]` of a file have the same size."""
+    if image.shape != first.shape:
+        sizes = " and ".join(f"{x.shape[1]} x {x.shape[0]}" for x in (first, image))
+        raise RefusedError(f"{path} has pictures of several sizes, {sizes}, in one episode")
 
 
 def _check_color(pixels: str, what: str) -> None:

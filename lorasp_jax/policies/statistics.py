@@ -9,12 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lorasp_jax.base import json_values
 from lorasp_jax.base.digest import DIGEST, verify_digest, with_digest
-from lorasp_jax.base.files import as_value_error
+from lorasp_jax.base.files import as_value_error, parse_json
 from lorasp_jax.policies.normalization import MIN_SPREAD
 
 NAMES = ("mean", "std", "min", "max", "q01", "q99", "q10", "q90")
 """Names of all supported statistics."""
+_BOUNDS = (("min", "max"), ("q01", "q99"), ("q10", "q90"))
 _UNUSED: dict[str, float] = dict(zip(NAMES, (0, 1, -1, 1, -1, 1, -1, 1), strict=True))
 """Statistics of unused slots. They make every normalization mode the identity, up to its guard
 against zero."""
@@ -126,8 +128,10 @@ class Statistics:
         """
         both: dict[str, dict[str, np.ndarray]] = {"state": {}, "action": {}}
         with as_value_error(Path("this JSON of statistics")), np.errstate(over="ignore"):
-            content = json.loads(text)
-            for key, values in (verify_digest(content) if DIGEST in content else content).items():
+            json_values.check(content := parse_json(text), {})
+            content = verify_digest(content) if DIGEST in content else content
+            json_values.check(content, {str: [float]})
+            for key, values in content.items():
                 kind, _, name = key.partition("_")
                 both[kind][name] = np.asarray(values, np.float32)  # `validate` refuses overflows
         return validate(both, "this JSON")
@@ -138,8 +142,8 @@ def validate(both: Mapping[str, Mapping[str, np.ndarray]], source: str) -> Stati
 
     Raises:
         ValueError: no statistics of one kind, unknown names, different lengths within a kind,
-            values that are not finite, or a negative standard deviation; the message names
-            `source`.
+            values that are not finite, a negative standard deviation or a lower bound above the
+            upper one; the message names `source`.
     """
     arrays = [array for stats in both.values() for array in stats.values()]
     names = {name for stats in both.values() for name in stats}
@@ -152,6 +156,10 @@ def validate(both: Mapping[str, Mapping[str, np.ndarray]], source: str) -> Stati
     negative = any((stats.get("std", np.zeros(1)) < 0).any() for stats in both.values())
     if negative or not all(np.isfinite(array).all() for array in arrays):
         raise ValueError(f"statistics in {source} must be finite, and no std negative")
+    for kind, stats in both.items():
+        for low, high in _BOUNDS:
+            if low in stats and high in stats and (stats[low] > stats[high]).any():
+                raise ValueError(f"statistics in {source} have a {low} above {high} in {kind}")
     state, action = (
         {name: jnp.asarray(array, jnp.float32) for name, array in both[kind].items()}
         for kind in ("state", "action")

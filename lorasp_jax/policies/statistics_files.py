@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import safetensors
 
-from lorasp_jax.base import hub
+from lorasp_jax.base import hub, json_values
 from lorasp_jax.base.files import (
     as_value_error,
     check_regular,
@@ -37,12 +37,19 @@ from lorasp_jax.policies.statistics import NAMES, Statistics, validate
 OURS, OPENPI, DATASET = "statistics.json", "norm_stats.json", "stats.json"
 EPISODES = "episodes_stats.jsonl"
 PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
+PIPELINE = {"steps": [{"registry_name?": str, "config?": {}, "state_file?": str}]}
+"""Schema of these, see `json_values.check`."""
 TENSOR = re.compile(
     r"(?:(?:un)?normalize_\w+\.)?(?:(?:(?P<dataset>.+)[._])?buffer[._])?"
     r"(?P<kind>observation[._]state|action)\.(?P<name>\w+)"
 )
 """Pattern of the names of statistics in LeRobot's safetensors files."""
 _EPISODE_STATISTICS = ("count", "mean", "std", "min", "max")
+_KEYS = ("observation.state", "action"), ("state", "actions")
+_KIND = {f"{name}?": [float] for name in NAMES}
+_FEATURES, _OPENPI = ({key: _KIND, action: _KIND} for key, action in _KEYS)
+_EPISODE = {key: {name: [float] for name in _EPISODE_STATISTICS} for key in _FEATURES}
+"""Schemas of statistics in JSON, see `json_values.check`."""
 Stats = dict[str, dict[str, np.ndarray]]
 """Statistics by kind ("state", "action") and name."""
 
@@ -91,19 +98,22 @@ def _ours(files: list[Path]) -> dict[str, Stats]:
 def _openpi(files: list[Path]) -> dict[str, Stats]:
     groups = {}
     for file in files:
-        stats = read_json(file)["norm_stats"]
+        json_values.check(content := read_json(file), {"norm_stats": _OPENPI}, nulls=True)
+        stats = content["norm_stats"]
         name = file.parent.as_posix().rpartition("/assets/")[2]
         groups[name] = {"state": _arrays(stats["state"]), "action": _arrays(stats["actions"])}
     return groups
 
 
 def _dataset(files: list[Path]) -> dict[str, Stats]:
-    stats = read_json(files[0])
+    json_values.check(stats := read_json(files[0]), _FEATURES, nulls=True)
     return {"": {"state": _arrays(stats["observation.state"]), "action": _arrays(stats["action"])}}
 
 
 def _episodes(files: list[Path]) -> dict[str, Stats]:
     rows = [row["stats"] for row in read_json_lines(files[0])]
+    for number, row in enumerate(rows):
+        json_values.check(row, _EPISODE, f"the statistics of line {number + 1}")
     kinds = {"state": "observation.state", "action": "action"}
     return {"": {kind: aggregate([row[name] for row in rows]) for kind, name in kinds.items()}}
 
@@ -113,9 +123,14 @@ def aggregate(episodes: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
 
     As LeRobot 0.3.3 does (compute_stats.py, aggregate_feature_stats).
     """
+    lengths = {len(stats[name]) for stats in episodes for name in _EPISODE_STATISTICS[1:]}
+    if len(lengths) > 1:
+        raise ValueError(f"statistics of one feature must have one length, got {sorted(lengths)}")
     values = {
         name: np.array([stats[name] for stats in episodes], float) for name in _EPISODE_STATISTICS
     }
+    if values["count"].shape[1:] != (1,) or (values["count"] < 1).any():
+        raise ValueError("count must be one number of steps, at least 1")
     mean, std = values["mean"], values["std"]
     with np.errstate(all="ignore"):  # non-finite values are rejected later
         weights = values["count"] / values["count"].sum()
@@ -128,8 +143,12 @@ def aggregate(episodes: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
 def _policy(files: list[Path]) -> dict[str, Stats]:
     tensors: list[tuple[str, np.ndarray]] = []
     for pipeline in (files[0].with_name(name) for name in PIPELINES):
-        for step in read_json(pipeline)["steps"]:
-            if "normalizer" in step.get("registry_name", "") and "state_file" in step:
+        json_values.check(content := read_json(pipeline), PIPELINE, nulls=True)
+        for step in content["steps"]:
+            if (
+                "normalizer" in (step.get("registry_name") or "")
+                and step.get("state_file") is not None
+            ):
                 tensors += _tensors(join_inside(pipeline.parent, step["state_file"]))
     return _group(tensors)
 

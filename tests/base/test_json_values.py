@@ -20,6 +20,14 @@ def test_valid_values(value, kind):
     check(value, kind)
 
 
+def test_nulls_of_other_projects():
+    kind = {"a": [{"b?": int}]}
+    check({"a": [{"b": None}]}, kind, nulls=True)
+    for value, nulls in (({"a": [{"b": None}]}, False), ({"a": None}, True)):
+        with pytest.raises(ValueError, match=r"^a"):
+            check(value, kind, nulls=nulls)
+
+
 @pytest.mark.parametrize(
     ("value", "kind", "name"),
     [

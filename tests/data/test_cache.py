@@ -227,6 +227,9 @@ def test_chosen_cameras(simulated, tmp_path):
         ("state", lambda x: x.astype(">f4"), "type, shape or checksum"),
         ("state", np.asfortranarray, "Fortran order"),
         ("action", lambda x: x * np.float32(np.nan), "not finite"),
+        ("action", lambda x: np.concatenate([x, x[:1]]), "action has the shape"),
+        ("state", lambda x: x[0, 0], "state has the shape"),
+        ("instruction", lambda x: x[None], "instruction has the shape"),
         ("length", lambda x: x[:0], "must not be empty"),
         (
             "length",

@@ -177,7 +177,8 @@ def test_mujocos_warnings_become_python_warnings(robots, monkeypatch):
     monkeypatch.chdir(robots)
     before = sorted(robots.rglob("*"))
     path = model(robots, "", body='<geom size="1" pos="nan 0 0"/>')
-    with pytest.warns(UserWarning, match="MuJoCo: XML contains a 'NaN'"):
+    finite = pytest.raises(ValueError, match="must be finite")
+    with pytest.warns(UserWarning, match="MuJoCo: XML contains a 'NaN'"), finite:
         reading.read(path)
     assert sorted(robots.rglob("*")) == sorted([*before, path])
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from array_record.python import array_record_module
 from PIL import Image
+from tensorflow_datasets.proto import tf_example_pb2
 
 from envs.datasets import rlds, rlds_schema
 from tests.envs.datasets.test_episodes import assert_equal, make
@@ -80,6 +81,34 @@ def test_images_without_colors(path, monkeypatch):
         rlds.read(path.parent / "depth")
 
 
+def test_lengths_of_states_and_actions(path):
+    edit(path / "metadata.json", lambda found: found.update(widths=[7, 6]))
+    with pytest.raises(ValueError, match=r"press: episode 0 is damaged .action has .* not 6 each"):
+        rlds.read(path)
+    edit(path / "metadata.json", lambda found: found.pop("widths"))  # older datasets
+    assert rlds.read(path).action.shape[2] == 7
+
+
+@pytest.mark.parametrize("number", [-1, 5, 2**40])
+def test_instructions_that_do_not_exist(number, path):
+    (file,) = path.glob("*array_record*")
+    (record, *_) = array_record_module.ArrayRecordReader(str(file)).read_all()
+    example = tf_example_pb2.Example.FromString(record)
+    fields = example.features.feature
+    fields["episode_metadata/instruction"].int64_list.value[:] = [number]
+    shared = {"instructions": ("a",), "task": "x", "robot": "y", "control_dt": 0.1, "physics_dt": 0}
+    with pytest.raises((ValueError, OverflowError)):
+        rlds_schema.episode(
+            example.SerializeToString(), {}, {}, (0, 0), shared | {"attempted": 1}
+        ).validate_numbers()
+
+
+def test_hidden_copies_of_macos(path):
+    (file,) = path.glob("*array_record*")
+    file.with_name(f"._{file.name}").write_bytes(b"\0\5\26\7")
+    assert rlds.read(path).num_episodes == make().num_episodes
+
+
 @pytest.mark.parametrize("name", ["../../harm", "/tmp/harm", "é" * 300, ""])
 def test_names_of_tasks_and_robots_are_not_paths(name, path, tmp_path):
     before = sorted(tmp_path.iterdir())
@@ -112,7 +141,7 @@ def test_values_that_are_not_finite(path):
     episodes = make()
     episodes.state[1, 0, 2] = np.nan
     rewrite(path, episodes)
-    with pytest.raises(ValueError, match=r"press is damaged .*state .* dimension 2"):
+    with pytest.raises(ValueError, match=r"press: episode 1 is damaged .*state .* dimension 2"):
         rlds.read(path)
 
 
@@ -120,5 +149,5 @@ def test_an_empty_episode(path):
     one = make()
     nothing = {name: picture[:, :0] for name, picture in one.image.items()}
     rewrite(path, dataclasses.replace(one, image=nothing, length=np.array([1, 0, 1], np.int32)))
-    with pytest.raises(ValueError, match="press is damaged"):
+    with pytest.raises(ValueError, match="press: episode 0 is damaged"):
         rlds.read(path)

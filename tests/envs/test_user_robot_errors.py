@@ -35,6 +35,11 @@ _ONE_EDIT = (
     ),
     ("joint turn needs a position actuator", '<position name="turn" joint="turn"/>', ""),
     (
+        "joint turn needs only one position actuator",
+        '<position name="turn" joint="turn"/>',
+        '<position name="turn" joint="turn"/><position joint="turn" kp="9"/>',
+    ),
+    (
         "grip (another kind, on a",
         '<position name="grip" tendon="grip" kp="400" kv="20"',
         '<motor name="grip" tendon="grip"',

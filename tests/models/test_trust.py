@@ -32,6 +32,13 @@ def test_a_pipe_is_refused(name, tmp_path):
             read(tmp_path)
 
 
+@pytest.mark.parametrize("content", [[], {"weight_map": None}, {"weight_map": {"a": "b", "c": 3}}])
+def test_an_index_of_another_form(content, tmp_path):
+    (tmp_path / INDEX).write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=rf"{INDEX} is damaged .*(must be|lacks)"):
+        weight_files(tmp_path)
+
+
 @pytest.mark.parametrize("name", ["../x.safetensors", "/etc/passwd", "", ".", 3])
 def test_file_names_must_stay_in_the_folder(name, tmp_path):
     (tmp_path / "x.safetensors").write_bytes(b"")
@@ -77,7 +84,7 @@ def test_text_files_that_are_too_large(tmp_path):
             read(tmp_path)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, 3, True])
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e60, 3, True])
 def test_weights_must_be_floating_point_and_finite(value):
     rule = layouts.copied("ours", "theirs")
     theirs = {"theirs": np.array([1, value, 2])}

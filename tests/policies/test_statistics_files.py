@@ -12,6 +12,9 @@ from tests.data.lerobots import golden
 
 RNG = np.random.default_rng(0)
 STATE, ACTION = RNG.uniform(size=(2, len(NAMES), 7)).astype(np.float32)
+for values in (STATE, ACTION):
+    for low in (2, 4, 6):  # min and max, q01 and q99, q10 and q90
+        values[low : low + 2].sort(axis=0)
 
 
 def by_name(values, names=NAMES):
@@ -69,7 +72,10 @@ def test_lerobot_dataset_by_episode():
 
 @pytest.mark.parametrize(
     "change",
-    [{"count": [0]}, {"count": [1e999]}, {"mean": [0.0]}, {"std": ["x"] * 7}, {"min": None}],
+    [
+        *[{"count": count} for count in ([0], [1e999], 5, [5, 5], [-5])],
+        *[{"mean": [0.0]}, {"std": ["x"] * 7}, {"min": None}, {"max": [[0.0]] * 7}],
+    ],
 )
 def test_damaged_lerobot_episodes(change, tmp_path):
     (row,) = (golden("v21") / "meta" / "episodes_stats.jsonl").read_text().splitlines()[:1]
@@ -166,8 +172,14 @@ def test_invalid_files_raise_one_sentence(tmp_path):
     unset = json.loads(norm_stats())
     unset["norm_stats"]["state"]["mean"][0] = float("inf")
     path.write_text(json.dumps(unset))
-    with pytest.raises(ValueError, match="finite"):
+    with pytest.raises(ValueError, match=r"mean\[0\] must be a number, got inf"):
         statistics_files.read(path)
+    for name, values in (("q01", [9.0] * 7), ("mean", {}), ("mean", [True] * 7), ("mean", 1.0)):
+        wrong = json.loads(norm_stats())
+        wrong["norm_stats"]["state"][name] = values
+        path.write_text(json.dumps(wrong))
+        with pytest.raises(ValueError, match=rf"norm_stats\.json.* {name} above|state\.{name}"):
+            statistics_files.read(path)
     unset["norm_stats"]["state"] |= {"mean": [0.0] * 7, "std": [1.0] * 6 + [-1e-3]}
     path.write_text(json.dumps(unset))
     with pytest.raises(ValueError, match="std"):

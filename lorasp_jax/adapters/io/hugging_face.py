@@ -32,6 +32,7 @@ from lorasp_jax.adapters.io.peft_full import (
     Names,
     base_parameters,
     check_biases,
+    check_saved,
     export_full_parameters,
 )
 from lorasp_jax.adapters.layers import nnx_layers
@@ -110,7 +111,8 @@ def load_peft(
     sizes = {location.path: location.child.get_value().shape for location in parameters}
     others = paths.unsupported_classes(root, einsums)
     rules, values, full_values = _match_folder(folder, shapes, sizes, others, names)
-    adapted = adaptation.adapt(model, rules, rngs=nnx.Rngs(0), einsums=einsums)
+    with paths.naming("load", folder):
+        adapted = adaptation.adapt(model, rules, rngs=nnx.Rngs(0), einsums=einsums)
     for location in paths.locate(nnx.List([adapted]), nnx.Param):
         if location.path in full_values:
             old = location.child.get_value()
@@ -164,6 +166,7 @@ def _match_folder(
             f"{known}"
         )
     check_biases(folder, config.get("bias") or "none", contents.trained, sizes, values)
+    check_saved(folder, config.get("modules_to_save") or (), contents.trained, candidates)
     trained, frozen = base_parameters(folder, contents, shapes, sizes, names)
     # These rules come first, since the bias of an adapted layer may be fully fine-tuned.
     full_rules = [(f"^{re.escape(path)}$", FullFineTuning()) for path in trained]
@@ -253,8 +256,7 @@ def _check_fits(folder: pathlib.Path, module: str, adapter: Adapter, d_in: int, 
     """Raise ValueError unless the adapter's shapes match a kernel `[I, O]`."""
     a, b = adapter["lora_a"].shape, adapter["lora_b"].shape
     rank = a[-1]
-    magnitude = adapter.get("magnitude", np.empty(d_out)).shape
-    if (a, b, magnitude) != ((d_in, rank), (rank, d_out), (d_out,)):
+    if (a, b) != ((d_in, rank), (rank, d_out)):
         raise ValueError(f"{folder}: {module} has shapes {a} and {b} for a {d_in}x{d_out} kernel")
 
 

@@ -10,7 +10,7 @@ import math
 import pathlib
 import re
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from lorasp_jax.base.files import as_value_error, read_json
 from lorasp_jax.peft.fields import short
 
 CONFIG, TENSORS = "adapter_config.json", "adapter_model.safetensors"
+PICKLE = "adapter_model.bin"
 PREFIX = "base_model.model."
 # A state dict that PEFT did not save itself still has the adapter's name in its keys.
 _TENSOR = re.compile(
@@ -46,6 +47,8 @@ _FIELDS: dict[str, Any] = {
     "peft_type": str,
     "use_dora?": bool,
     "use_rslora?": bool,
+    "r?": float,
+    "rank_pattern?": {},
     "lora_alpha?": float,
     "alpha_pattern?": {str: float},
     "init_r?": int,
@@ -85,7 +88,7 @@ def read_folder(folder: pathlib.Path) -> PeftFolder:
     _refuse_other_folders(folder)
     with as_value_error(folder / CONFIG):
         config = read_json(folder / CONFIG)
-        json_values.check({name: v for name, v in config.items() if v is not None}, _FIELDS)
+        json_values.check(config, _FIELDS, nulls=True)
         if config.get("bias") not in (None, "none", "all", "lora_only"):
             raise ValueError(f"bias must be 'none', 'all' or 'lora_only', got {config['bias']!r}")
     _, tensors = read_tensors(folder / TENSORS)
@@ -102,7 +105,8 @@ def read_folder(folder: pathlib.Path) -> PeftFolder:
         else:
             raise ValueError(f"{folder} has the unexpected tensor {short(name)}")
         if key in values or len(adapter_names) > 1:
-            raise ValueError(f"{folder} has several tensors for {short(name)}: save one adapter")
+            what = "tensors" if key in values else "adapters"
+            raise ValueError(f"{folder} has several {what} for {short(name)}: save one adapter")
         values[key] = tensor.astype(np.float32)
     with paths.naming("load", folder):
         adapters = {name: _from_peft(config, name, tensors) for name, tensors in modules.items()}
@@ -110,8 +114,13 @@ def read_folder(folder: pathlib.Path) -> PeftFolder:
 
 
 def _refuse_other_folders(folder: pathlib.Path) -> None:
-    """Raise ValueError for a folder of `save_adapters`, or one above a PEFT folder."""
+    """Raise ValueError for a folder of `save_adapters`, one above a PEFT folder, or a pickle."""
     if (folder / CONFIG).exists():
+        if (folder / PICKLE).exists() and not (folder / TENSORS).exists():
+            raise ValueError(
+                f"{folder} has its tensors in {PICKLE}, a pickle, which is never opened: load it "
+                f"in PEFT and save it again, which writes {TENSORS}"
+            )
         return
     if (folder / DESCRIPTION).exists():
         raise ValueError(f"{folder} is a folder of save_adapters: load it with load_adapters")
@@ -134,15 +143,19 @@ def _check_supported(folder: pathlib.Path, config: Mapping[str, Any]) -> None:
 
 
 def _is_fully_trained(config: Mapping[str, Any], module: str, kind: str) -> bool:
-    """Whether the config says that a weight or bias of the module was fully trained.
+    """Whether the config says that a weight or bias of the module was fully trained."""
+    trains_bias = kind == "bias" and config.get("bias") in ("all", "lora_only")
+    return trains_bias or is_saved(config.get("modules_to_save") or (), module)
 
-    As in PEFT (_set_trainable of 0.21.2), an entry of modules_to_save is the end of a name, also in
-    the middle of a word, and comprises the modules inside.
+
+def is_saved(entries: Sequence[str], module: str) -> bool:
+    """Whether the entries of modules_to_save comprise a module.
+
+    As in PEFT (_set_trainable of 0.21.2), an entry is the end of a name, also in the middle of a
+    word, and comprises the modules inside.
     """
     ends = (dot.start() for dot in re.finditer(r"\.|$", module))
-    saved = tuple(config.get("modules_to_save") or ())
-    is_saved = any(module[:end].endswith(saved) for end in ends)
-    return is_saved or (kind == "bias" and config.get("bias") in ("all", "lora_only"))
+    return any(module[:end].endswith(tuple(entries)) for end in ends)
 
 
 def _from_peft(config: Mapping[str, Any], module: str, tensors: Adapter) -> Adapter:
@@ -152,7 +165,7 @@ def _from_peft(config: Mapping[str, Any], module: str, tensors: Adapter) -> Adap
     expected |= {"lora_magnitude_vector"} if config.get("use_dora") else set()
     if expected != tensors.keys():
         raise ValueError(f"{module} must have {sorted(expected)}, got {sorted(tensors)}")
-    if not (alpha := _alpha(config, module)):
+    if not (alpha := _by_pattern(config, "alpha_pattern", "lora_alpha", module)):
         raise ValueError(f"{module} needs a lora_alpha other than 0 for its scale, got {alpha}")
     if not ada and not len(tensors["lora_A"]):
         raise ValueError(f"{module} has rank 0, but a rank must be at least 1")
@@ -167,10 +180,15 @@ def _from_peft(config: Mapping[str, Any], module: str, tensors: Adapter) -> Adap
         a = a * e
     else:
         rank = a.shape[1]
+        if (expected_rank := _by_pattern(config, "rank_pattern", "r", module)) not in (None, rank):
+            raise ValueError(f"{module} has rank {rank}, but {CONFIG} says {expected_rank}")
         scale = alpha / (math.sqrt(rank) if config.get("use_rslora") else rank)
     adapter = {"lora_a": a, "lora_b": b, "scale": np.float32(scale)}
     if "lora_magnitude_vector" in tensors:
-        adapter["magnitude"] = tensors["lora_magnitude_vector"].reshape(-1)
+        magnitude, outputs = tensors["lora_magnitude_vector"], b.shape[1]
+        if magnitude.size != outputs or outputs not in magnitude.shape:
+            raise ValueError(f"{module} has {outputs} outputs, a magnitude of {magnitude.shape}")
+        adapter["magnitude"] = magnitude.reshape(-1)
     return adapter
 
 
@@ -192,25 +210,23 @@ def to_torch(kernel: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(kernel.transpose(-1, -2, *range(kernel.ndim - 2)))
 
 
-def _alpha(config: Mapping[str, Any], module: str) -> Any:
-    """α of a module: that of the first pattern that matches its name or a suffix after a dot.
+def _by_pattern(config: Mapping[str, Any], field: str, default: str, module: str) -> Any:
+    """α or rank of a module: that of the first pattern that matches its name's end after a dot.
 
-    As in PEFT (get_pattern_key of 0.21.2), whose AdaLoRA has no patterns.
+    As in PEFT (get_pattern_key of 0.21.2), whose AdaLoRA has no such patterns.
     """
-    patterns = config.get("alpha_pattern") or {} if config["peft_type"] == "LORA" else {}
-    for pattern, alpha in patterns.items():
-        _check_cost(pattern, module)
+    patterns = config.get(field) or {} if config["peft_type"] == "LORA" else {}
+    for pattern, value in patterns.items():
+        _check_cost(field, pattern, module)
         try:
             if re.match(rf"(.*\.)?({pattern})$", module):
-                return alpha
+                return value
         except (re.error, RecursionError, OverflowError) as error:
-            raise ValueError(
-                f"alpha_pattern has {short(pattern)}, which is wrong: {error}"
-            ) from error
-    return config.get("lora_alpha")
+            raise ValueError(f"{field} has {short(pattern)}, which is wrong: {error}") from error
+    return config.get(default)
 
 
-def _check_cost(pattern: str, module: str) -> None:
+def _check_cost(field: str, pattern: str, module: str) -> None:
     """Raise ValueError if matching an untrusted pattern could take forever, as (a+)+b does.
 
     Without repeated groups and back references, each repetition has at most as many ends as the
@@ -222,6 +238,6 @@ def _check_cost(pattern: str, module: str) -> None:
     cost = math.log(len(module)) * (1 + repetitions) + math.log(bars / groups + 1) * groups
     if re.search(r"\)[*+{]|\\|\(\?(?!<?[=!]|:)", plain) or cost > math.log(_STEPS):
         raise ValueError(
-            f"alpha_pattern has {short(pattern)}: repeated groups, back references, named groups, "
+            f"{field} has {short(pattern)}: repeated groups, back references, named groups, "
             "flags and many repetitions are not supported, as they may take forever to match"
         )

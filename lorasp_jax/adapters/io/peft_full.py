@@ -20,6 +20,7 @@ from lorasp_jax.adapters.io.peft_folders import (
     FullTensors,
     PeftFolder,
     from_torch,
+    is_saved,
 )
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdapterParam, Dense
@@ -105,6 +106,16 @@ def check_biases(
     trained = modules if bias == "all" else set(modules) & set(adapted)
     if bias != "none" and trained and not any(kind == "bias" for _, kind in full):
         raise ValueError(f"{folder} was trained with bias {bias!r}, but has no bias tensors")
+
+
+def check_saved(
+    folder: pathlib.Path, entries: Sequence[str], full: FullTensors, modules: Collection[str]
+) -> None:
+    """Raise ValueError if the folder lacks a module of the model that `modules_to_save` names."""
+    for entry in entries:
+        lost = [name for name in modules if is_saved([entry], name)]
+        if lost and not any(is_saved([entry], name) for name, _ in full):
+            raise ValueError(f"{folder} lacks {short(lost[0])}, which is in its modules_to_save")
 
 
 def export_full_parameters(

@@ -115,6 +115,9 @@ def to_ours(
         array = np.asarray(theirs.pop(name))
         if array.shape != shape:
             raise ModelMismatchError(f"{name} of {source} is {array.shape}, expected {shape}")
+        if array.dtype == np.float64:
+            with np.errstate(over="ignore"):  # overflows to inf, which is refused
+                array = array.astype(np.float32)
         if not jnp.issubdtype(array.dtype, jnp.floating) or not np.isfinite(array).all():
             raise ValueError(f"{name} of {source} must be floating point and finite")
         return array

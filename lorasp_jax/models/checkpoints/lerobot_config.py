@@ -11,6 +11,7 @@ import importlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, get_args
 
+from lorasp_jax.base import json_values
 from lorasp_jax.models import backbone
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.inputs import Mode
@@ -24,9 +25,34 @@ _FIXED: Fields = {
     "adapt_to_pi_aloha": False,
     "use_delta_joint_actions_aloha": False,
 }
+FIELDS: Fields = {
+    "type": str,
+    "input_features?": {str: {"type": str}},
+    "output_features?": {str: {}},
+    "normalization_mapping?": {str: str},
+    "use_relative_actions?": bool,
+    "relative_exclude_joints?": [str],
+    "action_feature_names?": [str],
+    "image_resolution?": (int, int),
+    "resize_imgs_with_padding?": (int, int),
+    "empty_cameras?": int,
+    "num_vlm_layers?": int,
+    "expert_width_multiplier?": float,
+}
+_OPTIONS: Fields = {
+    "norm_map?": {str: str},
+    "rename_map?": {str: str},
+    "enabled?": bool,
+    "exclude_joints?": [str],
+    "action_names?": [str],
+    "max_length?": int,
+}
+STEPS: Fields = {"steps": [{"registry_name?": str, "config?": _OPTIONS}]}
+"""Schemas of config.json and of its preprocessor, see `json_values.check`."""
 PREPROCESSOR = "policy_preprocessor.json"
 EMPTY = "empty_camera_"
 """Prefix of the cameras that LeRobot feeds with black images."""
+_MAX_CAMERAS = 100
 _STATE_PROMPT = "pi05_prepare_state_tokenizer_processor_step"
 _IDENTITY = dict.fromkeys(("VISUAL", "STATE", "ACTION"), "IDENTITY")
 
@@ -60,7 +86,8 @@ def preprocessed(fields: Fields, preprocessor: Fields) -> dict[str, Any]:
         ValueError: an unsupported option of a step.
         AttributeError, KeyError, TypeError: a value of the wrong type.
     """
-    steps = {s.get("registry_name"): s.get("config", {}) for s in preprocessor["steps"]}
+    json_values.check(preprocessor, STEPS, nulls=True)
+    steps = {s.get("registry_name"): s.get("config") or {} for s in preprocessor["steps"]}
     found: dict[str, Any] = {"prompt_state": _STATE_PROMPT in steps}
     require(steps.get(_STATE_PROMPT, {}), {"include_state_in_prompt": True})
     if relative := steps.get("relative_actions_processor"):
@@ -120,7 +147,7 @@ def _shared_fields(config: BackboneConfig, fields: Fields) -> dict[str, Any]:
         raise ValueError(f"dimensions must be equal and images square, got {dims} and {size}")
     inputs = config.inputs
     modes = {"VISUAL": "IDENTITY", "STATE": inputs.state.upper(), "ACTION": inputs.action.upper()}
-    modes |= fields.get("normalization_mapping", {})
+    modes |= fields.get("normalization_mapping") or {}
     known = modes.keys() == {"VISUAL", "STATE", "ACTION"} and _MODES.keys() >= {*modes.values()}
     if modes["VISUAL"] != "IDENTITY" or not known:
         raise ValueError(f"normalization_mapping is not supported: {modes}")
@@ -149,7 +176,8 @@ def _delta(fields: Fields) -> tuple[bool, ...]:
     if not fields.get("use_relative_actions"):
         return ()
     size = fields["output_features"]["action"]["shape"][0]
-    words = [word.lower() for word in fields.get("relative_exclude_joints", ["gripper"])]
+    excluded = fields.get("relative_exclude_joints", ["gripper"])
+    words = [word.lower() for word in excluded or ()]
     names = (fields.get("action_feature_names") or [])[:size]
     relative = [not any(word in name.lower() for word in words) for name in names]
     return (*relative, *[True] * (size - len(relative)))
@@ -161,7 +189,9 @@ def _cameras(fields: Fields) -> tuple[str, ...]:
     for key, feature in (fields.get("input_features") or {}).items():
         if feature["type"] == "VISUAL":
             names.append(_camera(key))
-    empty = [f"{EMPTY}{i}" for i in range(fields.get("empty_cameras", 0))]
+    if (count := fields.get("empty_cameras") or 0) > _MAX_CAMERAS:
+        raise ValueError(f"empty_cameras must be at most {_MAX_CAMERAS}, got {count}")
+    empty = [f"{EMPTY}{i}" for i in range(count)]
     return tuple(dict.fromkeys([*names, *empty]))
 
 

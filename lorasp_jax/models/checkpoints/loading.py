@@ -176,6 +176,8 @@ def _read_fields(folder: Path) -> dict[str, Any]:
     with as_value_error(path):
         fields = read_json(path) if path.exists() else {}
         json_values.check(fields, {})
+        if "type" in fields:
+            json_values.check(fields, lerobot_config.FIELDS, nulls=True)
     if "type" not in fields or not preprocessor.exists():
         return fields
     with as_value_error(preprocessor):

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import safetensors
 
+from lorasp_jax.base import json_values
 from lorasp_jax.base.files import (
     as_value_error,
     check_memory,
@@ -33,7 +34,8 @@ def weight_files(folder: Path) -> list[Path]:
     if (folder / SINGLE).exists() or not index.exists():
         return [folder / SINGLE]
     with as_value_error(index):
-        names = sorted(set(read_json(index)["weight_map"].values()))
+        json_values.check(content := read_json(index), {"weight_map": {str: str}})
+    names = sorted(set(content["weight_map"].values()))
     return [join_inside(folder, name) for name in names]
 
 
@@ -50,14 +52,14 @@ class TensorFiles(MutableMapping[str, np.ndarray]):
     """
 
     def __init__(self, files: list[Path], rename: Callable[[str], str] = str) -> None:
-        self._tensors: dict[str, tuple[Any, str]] = {}
+        self._tensors: dict[str, tuple[Any, str, Path]] = {}
         for path in files:
             with as_value_error(path, safetensors.SafetensorError):
                 file = safetensors.safe_open(check_regular(path), framework="np")
                 for stored in file.keys():  # noqa: SIM118, safe_open is not iterable
                     if (name := rename(stored)) in self._tensors:
                         raise ValueError(f"it has {name} twice, also as {stored}")
-                    self._tensors[name] = file, stored
+                    self._tensors[name] = file, stored, path
 
     def rename(self, old: str, new: str) -> None:
         """Rename a tensor in this mapping; the file stays unchanged."""
@@ -65,12 +67,13 @@ class TensorFiles(MutableMapping[str, np.ndarray]):
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Read a tensor; raise ValueError if it is float8 or larger than this machine's memory."""
-        file, stored = self._tensors[name]
+        file, stored, path = self._tensors[name]
         tensor = file.get_slice(stored)
         bits = re.search(r"\d+", tensor.get_dtype())  # "BF16", "F8_E4M3", "BOOL"
         check_memory(math.prod(tensor.get_shape()) * (int(bits[0]) if bits else 8) // 8, name)
         if tensor.get_dtype().startswith("F8"):
-            raise ValueError(f"{name} is in {tensor.get_dtype()}: convert it to bf16 or float32")
+            dtype = tensor.get_dtype()
+            raise ValueError(f"{name} in {path} is in {dtype}: convert it to bf16 or float32")
         return file.get_tensor(stored)
 
     def __delitem__(self, name: str) -> None:

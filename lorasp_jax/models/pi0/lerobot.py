@@ -18,12 +18,17 @@ def pi0_config(fields: Mapping[str, Any]) -> Pi0Config:
     """Return a config with the published sizes of the Gemma variants that the fields name."""
     config = Pi0Config.base()
     sizes = {"gemma_2b": config.language, "gemma_300m": config.action}
-    return dataclasses.replace(
-        config,
-        language=sizes[fields.get("paligemma_variant", "gemma_2b")],
-        action=sizes[fields.get("action_expert_variant", "gemma_300m")],
-        inputs=LEROBOT_PI0,
+
+    def size(field: str, default: str) -> Any:
+        if (variant := fields.get(field, default)) not in [*sizes]:
+            raise ValueError(f"{field} must be one of {', '.join(sizes)}, got {variant!r}")
+        return sizes[variant]
+
+    language, action = (
+        size("paligemma_variant", "gemma_2b"),
+        size("action_expert_variant", "gemma_300m"),
     )
+    return dataclasses.replace(config, language=language, action=action, inputs=LEROBOT_PI0)
 
 
 def pi05_config(fields: Mapping[str, Any]) -> Pi0Config:

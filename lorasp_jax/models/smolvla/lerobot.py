@@ -29,8 +29,8 @@ def smolvla_config(fields: Mapping[str, Any]) -> SmolVLAConfig:
         layers = fields["num_expert_layers"]
         raise ValueError(f"num_expert_layers must equal num_vlm_layers = {depth}, got {layers!r}")
     action = config.action
-    if "expert_width_multiplier" in fields:
-        width = int(config.language.width * fields["expert_width_multiplier"])
+    if (multiplier := fields.get("expert_width_multiplier")) is not None:
+        width = int(config.language.width * multiplier)
         # 2/3 of 4 * width, rounded up to a multiple of 256 (smolvlm_with_expert.py).
         mlp = 256 * math.ceil(4 * int(2 * width / 3) / 256)
         action = dataclasses.replace(action, width=width, mlp=mlp)

@@ -126,7 +126,7 @@ def test_stacks(tmp_path):
         return tensors
 
     edit_tensors(tmp_path, shrink)
-    edit_config(tmp_path, alpha_pattern={"1.layer": 6.0})
+    edit_config(tmp_path, alpha_pattern={"1.layer": 6.0}, rank_pattern={"1.layer": 1})
     again = hugging_face.load_peft(tmp_path, Stack(), names=module)
     ours, theirs = (adaptation.merge(m).layer.kernel.get_value() for m in (again, model))
     np.testing.assert_allclose(ours[::2], theirs[::2], atol=1e-5)

@@ -27,6 +27,9 @@ BAD_PATTERNS = (
         *[({"alpha_pattern": bad}, "alpha_pattern") for bad in ({"lin.0": "8"}, 3)],
         *[({"alpha_pattern": {p: 8}}, "alpha_pattern has") for p in BAD_PATTERNS],
         ({"alpha_pattern": {"l(": 8}}, "which is wrong"),
+        ({"rank_pattern": {"lin.0": 3}}, "lin.0 has rank 4, but adapter_config.json says 3"),
+        *[({"r": bad}, "r must be a number|says") for bad in ("4", 8, True)],
+        ({"modules_to_save": ["lin.1"]}, "lacks 'lin.1', which is in its modules_to_save"),
         ({"bias": 0}, "bias"),
         ({"init_lora_weights": "pissa"}, "init_lora_weights"),
     ],
@@ -36,6 +39,21 @@ def test_unsupported_configs(copy, changes, name):
         name = "lora_E"  # is missing
     edit_config(copy, **changes)
     with pytest.raises(ValueError, match=name):
+        hugging_face.load_peft(copy, Net())
+
+
+def test_a_config_that_is_no_object(copy):
+    for text in ("[]", "null"):
+        (copy / hugging_face.CONFIG).write_text(text)
+        with pytest.raises(
+            ValueError, match=r"adapter_config.json is damaged .it must be an object"
+        ):
+            hugging_face.load_peft(copy, Net())
+
+
+def test_pickles_are_never_opened(copy):
+    (copy / hugging_face.TENSORS).rename(copy / "adapter_model.bin")
+    with pytest.raises(ValueError, match=r"adapter_model.bin, a pickle, .* save it again"):
         hugging_face.load_peft(copy, Net())
 
 
@@ -95,6 +113,15 @@ def test_invalid_tensors(copy, change, message):
     edit_tensors(copy, change)
     with pytest.raises(ValueError, match=message):
         hugging_face.load_peft(copy, Net())
+
+
+def test_magnitudes_fit_the_outputs(tmp_path):
+    hugging_face.save_peft(tmp_path, adapted(("lin/0", DoRA(rank=2))))
+    name = "base_model.model.lin.0.lora_magnitude_vector"
+    for shape in ((4, 10), (39,)):
+        edit_tensors(tmp_path, lambda t, shape=shape: t | {name: np.ones(shape, np.float32)})
+        with pytest.raises(ValueError, match=r"lin.0 has 40 outputs, a magnitude of \("):
+            hugging_face.load_peft(tmp_path, Net())
 
 
 @pytest.mark.parametrize(

@@ -165,6 +165,24 @@ def test_a_pipeline_without_the_state_has_prompts_without_it(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"use_relative_actions": "false"}, "use_relative_actions must be true or false"),
+        ({"relative_exclude_joints": "gripper"}, "relative_exclude_joints must be a list"),
+        ({"input_features": {"a": None}}, "input_features.a must be an object"),
+        ({"expert_width_multiplier": "0.75"}, "expert_width_multiplier must be a number"),
+        ({"empty_cameras": 10**9}, "empty_cameras must be at most 100"),
+        ({"type": "pi0", "paligemma_variant": "gemma_9b"}, "paligemma_variant must be one of"),
+    ],
+)
+def test_fields_of_the_wrong_type_are_named(change, name, tmp_path):
+    (tmp_path / "config.json").write_text(json.dumps(SMOLVLA | change))
+    (tmp_path / "model.safetensors").touch()
+    with pytest.raises(ValueError, match=rf"config\.json is damaged .{name}"):
+        loading.load_config(tmp_path)
+
+
+@pytest.mark.parametrize(
     ("step", "change", "name"),
     [
         ("normalizer_processor", {"eps": 1e-3}, "eps"),
