@@ -84,7 +84,7 @@ def run_config(row: dict[str, Any]) -> Config:
         remat=row.get("remat", "auto"),
     )
     optim = OptimConfig(batch_size=row["batch"], accumulate=row.get("parts", 1))
-    data = DataConfig(source="recordings")
+    data = DataConfig(source=("recordings",))
     parts = {"model": model, "optim": optim, "data": data}
     config = Config(name="benchmark", scale="", peft=method, targets=targets, **parts)
     if "base" in row:
