@@ -141,6 +141,7 @@ def whole_run(size: str, folder: Path) -> dict[str, Any]:
     from lorasp_jax.data import cache
     from lorasp_jax.models.checkpoints import native
 
+    jax.config.update("jax_platforms", "cpu")
     backbone = dataclasses.replace(sized("pi0", size), param_dtype="bfloat16")
     graphdef, state = nnx.split(nnx.eval_shape(lambda: backbone.create(nnx.Rngs(0))))
     native.save(folder / "base", nnx.merge(graphdef, values(state, np.asarray)))
@@ -208,9 +209,6 @@ def start(row: dict[str, Any], options: argparse.Namespace, total: float) -> sub
     """Start the process of a row, with its share of the GPU."""
     share = (fit.read_size(row["limit"]) - fit.CONTEXT) / total
     environment = os.environ | {"XLA_PYTHON_CLIENT_MEM_FRACTION": f"{share:.4f}"}
-    if row.get("row") == "whole run":
-        # This process only prepares: the GPU is for the one that it starts.
-        environment["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
     command = [sys.executable, "-m", "benchmarks.small_cards", "--row", json.dumps(row)]
     return subprocess.Popen([*command, "--json", str(options.json)], env=environment)
 
@@ -218,6 +216,12 @@ def start(row: dict[str, Any], options: argparse.Namespace, total: float) -> sub
 def read(path: Path) -> list[dict[str, Any]]:
     """Return the rows that have been measured."""
     return [*map(json.loads, path.read_text().splitlines())] if path.exists() else []
+
+
+def waiting(rows: list[dict[str, Any]], results: Path) -> list[dict[str, Any]]:
+    """Return the rows that are not among the results."""
+    done = read(results)
+    return [row for row in rows if not any(row.items() <= each.items() for each in done)]
 
 
 def main() -> None:
@@ -232,21 +236,20 @@ def main() -> None:
     if options.row:
         work(options.row, options.json)
         return
+    jax.config.update("jax_platforms", "cpu")  # the GPU is for the processes of the rows
     began, total = time.perf_counter(), gpu_bytes("total")
     whole = {"size": options.sizes[1], "limit": "12GB", "row": "whole run"}
     rows = [{"row": "context", "limit": "12GB"}, whole, *table(options.sizes)]
-    waiting = [
-        row for row in rows if not any(row.items() <= each.items() for each in read(options.json))
-    ]
+    left = waiting(rows, options.json)
     running: list[tuple[subprocess.Popen, float]] = []
-    while (waiting or running) and time.perf_counter() - began < options.seconds:
+    while (left or running) and time.perf_counter() - began < options.seconds:
         running = [(process, held) for process, held in running if process.poll() is None]
-        alone = waiting and waiting[0].get("row") == "context"
+        alone = left and left[0].get("row") == "context"
         slots = 1 if alone or any(held == 0 for _, held in running) else options.parallel
-        if waiting and len(running) < slots:
-            held = fit.read_size(waiting[0]["limit"])
+        if left and len(running) < slots:
+            held = fit.read_size(left[0]["limit"])
             if sum(held for _, held in running) + held < 0.96 * total:
-                row = waiting.pop(0)
+                row = left.pop(0)
                 running.append((start(row, options, total), 0 if alone else held))
                 continue
         time.sleep(0.5)

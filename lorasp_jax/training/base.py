@@ -70,7 +70,7 @@ def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str
     return model, models.weights_hash(model)
 
 
-def _host() -> jax.Device:
+def _host() -> Any:
     """Return the CPU as a JAX device; raise ValueError if JAX_PLATFORMS leaves it out."""
     try:
         return jax.local_devices(backend="cpu")[0]

@@ -92,12 +92,14 @@ def estimate_memory(config: Config, backbone: BackboneConfig) -> Memory:
         _of_one_window(config), dataclasses.replace(backbone, remat="none")
     )
     saved = functools.partial(_saved_bytes, config, size=micro_batch)
+    batch = nbytes(abstract_batch(backbone, local_batch))
+    accumulates = config.optim.accumulate > 1  # which sorts a copy of the batch into micro-batches
     return Memory(
         base=base,
         adapters=adapters,
-        gradients=adapters * (1 if config.optim.accumulate == 1 else 2),
+        gradients=adapters * (1 + accumulates),
         optimizer=optimizer,
-        activations=saved(backbone) + nbytes(abstract_batch(backbone, local_batch)),
+        activations=saved(backbone) + batch * (1 + accumulates),
         recomputation=0 if backbone.remat == "none" else _recomputed_bytes(saved, backbone),
     )
 
