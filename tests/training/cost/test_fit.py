@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -25,7 +26,7 @@ CONFIG = Config(
     data=DataConfig(source="recordings"),
     optim=OptimConfig(batch_size=64),
 )
-MIB_GB = preflight.MIB / 1e9
+MIB_GB, NOWHERE = preflight.MIB / 1e9, Path("nowhere")
 
 
 @pytest.fixture
@@ -46,9 +47,9 @@ def sizes(monkeypatch):
     monkeypatch.setattr(fit, "expected_peak", peak)
 
 
-def chosen(mib, config=CONFIG, given=(), folder=None):
+def chosen(mib, config=CONFIG, given=()):
     """Return remat, accumulation and dtypes that fit into so many MiB."""
-    found = fit.fitted(config, f"{mib * MIB_GB:.4f}GB", given, folder, Console(quiet=True))
+    found = fit.fitted(config, f"{mib * MIB_GB:.4f}GB", given, NOWHERE, Console(quiet=True))
     assert dataclasses.replace(found, model=config.model, optim=config.optim) == config
     assert found.optim.batch_size == config.optim.batch_size
     model = found.model
@@ -90,8 +91,8 @@ def test_given_settings_are_kept(sizes):
 def test_the_least_memory_in_the_message_fits(sizes):
     with pytest.raises(ValueError, match=r"does not fit into 0\.0100GB") as caught:
         chosen(0.01 / MIB_GB)
-    least = re.search(r"--fit ([\d.]+GB)", str(caught.value))[1]
-    fit.fitted(CONFIG, least, (), None, Console(quiet=True))
+    (least,) = re.findall(r"--fit ([\d.]+GB)", str(caught.value))
+    fit.fitted(CONFIG, least, (), NOWHERE, Console(quiet=True))
     assert "\n" not in str(caught.value)
 
 
@@ -100,12 +101,12 @@ def test_full_fine_tuning_keeps_its_base(sizes):
     assert {candidate.model.base_dtype for candidate, _ in fit.ranked(full)} == {""}
 
 
-def test_on_a_gpu_the_plan_of_the_compiler_decides(sizes, monkeypatch, tmp_path):
+def test_on_a_gpu_the_plan_of_the_compiler_decides(sizes, monkeypatch):
     monkeypatch.setattr(fit.jax, "default_backend", lambda: "gpu")
     plans = iter([700, 300])
     monkeypatch.setattr(fit, "compile_step", lambda *_: (None,))
     monkeypatch.setattr(fit, "planned_bytes", lambda _: {"all": next(plans) * preflight.MIB})
-    assert chosen(657, folder=tmp_path) == ("none", 1, "bfloat16", "")
+    assert chosen(657) == ("none", 1, "bfloat16", "")
 
 
 def test_a_resumed_run_keeps_what_was_chosen(sizes, tmp_path):
