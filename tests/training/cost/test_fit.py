@@ -33,6 +33,7 @@ MIB_GB, NOWHERE = preflight.MIB / 1e9, Path("nowhere")
 def sizes(monkeypatch):
     """A GPU without a context, a device, and peaks that settings lower to known values [MiB]."""
     monkeypatch.setattr(fit, "CONTEXT", 0)
+    monkeypatch.setattr(fit, "FILLED", 1)
     monkeypatch.setattr(fit.jax, "device_count", lambda: 1)
     monkeypatch.setattr(fit, "base_model", lambda *_, **__: (SimpleNamespace(config=TINY), ""))
     stored = {"": 400, "int8": 100, "nf4": 50}
@@ -63,9 +64,9 @@ def chosen(mib, config=CONFIG, given=()):
         (655, ("none", 1, "bfloat16", "")),  # costs nothing
         (454, ("none", 2, "bfloat16", "")),  # half of the windows at a time, before recomputing
         (230, ("products", 8, "bfloat16", "")),  # costs less than ("none", 16)
-        (210, ("products", 16, "bfloat16", "")),
+        (210, ("narrow", 8, "bfloat16", "")),
         (200, ("none", 2, "bfloat16", "int8")),  # rounding comes after what changes no result
-        (40, ("products", 16, "bfloat16", "nf4")),
+        (40, ("narrow", 8, "bfloat16", "nf4")),
         (25.7, ("full", 64, "bfloat16", "nf4")),
     ],
 )
@@ -88,7 +89,15 @@ def test_given_settings_are_kept(sizes):
     assert chosen(900, given=names) == ("none", 1, "float32", "")
 
 
-def test_the_least_memory_in_the_message_fits(sizes):
+def test_a_part_of_the_memory_stays_free(sizes, monkeypatch):
+    monkeypatch.setattr(fit, "FILLED", 0.9)
+    assert chosen(400 + 4 * 64) == ("none", 1, "bfloat16", "")
+    assert chosen((400 + 4 * 64) / 0.9 + 1) == ("none", 1, "float32", "")
+
+
+@pytest.mark.parametrize("filled", [1, 0.9])
+def test_the_least_memory_in_the_message_fits(sizes, filled, monkeypatch):
+    monkeypatch.setattr(fit, "FILLED", filled)
     with pytest.raises(ValueError, match=r"does not fit into 0\.0100GB") as caught:
         chosen(0.01 / MIB_GB)
     (least,) = re.findall(r"--fit ([\d.]+GB)", str(caught.value))
