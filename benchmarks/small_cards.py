@@ -12,7 +12,7 @@ others show storage, micro-batches and rematerialization. One row is a whole run
 beside others. Rows that are in the file already are left out, unless they failed.
 
 Memory [GiB]: "expected" by the estimate, in training and evaluating; "planned" by XLA, with
-arguments; "peak" of the allocator; "in use" and "peak before" when a whole run takes its first step.
+arguments; "peak" of the allocator; "in use" and "peak before" at the first step of a whole run.
 """
 
 import argparse

@@ -88,10 +88,10 @@ def fitted(
             _describe(candidate, size, peak, console)
             return candidate
         least = min(least, peak)
+    need = (least / FILLED + CONTEXT) / UNITS["GB"] + 0.05
     raise ValueError(
         f"this run does not fit into {size}: its batch size and given settings need at least "
-        f"--fit {(least / FILLED + CONTEXT) / UNITS['GB'] + 0.05:.1f}GB; see what else saves memory in "
-        "docs/launch.md"
+        f"--fit {need:.1f}GB; see what else saves memory in docs/launch.md"
     )
 
 
@@ -187,5 +187,7 @@ def _describe(config: Config, size: str, peak: float, console: Console) -> None:
         "--model.base-dtype": model.base_dtype or "''",
     }
     options = " ".join(f"{name} {value}" for name, value in chosen.items())
-    text = f"--fit {size} chose {options}: {peak / GIB:.1f} of {allocator / GIB:.1f} GiB at the peak"
+    text = (
+        f"--fit {size} chose {options}: {peak / GIB:.1f} of {allocator / GIB:.1f} GiB at the peak"
+    )
     console.print(text, soft_wrap=True, markup=False)
