@@ -1,6 +1,7 @@
 """Training on small GPUs: memory and speed with JAX's allocator limited to 12, 16 and 24 GB.
 
     python -m benchmarks.small_cards --json small_cards.jsonl
+    python -m benchmarks.small_cards --json small_cards.jsonl --only "whole run" LoRA-SP
     python -m benchmarks.small_cards --json small_cards.jsonl --sizes nano nano_pi05    # on a CPU
 
 Each row is a process of its own whose allocator has what `--fit` leaves of the GPU. Several compile
@@ -8,10 +9,10 @@ side by side; one at a time is timed: training's loop of steps, with random weig
 stored and a batch that is on the device. Rows with a batch of 32 have what `--fit` chooses; the
 others show storage, micro-batches and rematerialization. One row is a whole run, `train.py --fit
 12GB`: it loads a checkpoint in bf16, trains and measures held-out episodes; its speed is that
-beside others. Rows that are in the file already are left out.
+beside others. Rows that are in the file already are left out, unless they failed.
 
 Memory [GiB]: "expected" by the estimate, in training and evaluating; "planned" by XLA, with
-arguments; "peak" of the allocator.
+arguments; "peak" of the allocator; "in use" and "peak before" at the first step of a whole run.
 """
 
 import argparse
@@ -19,12 +20,13 @@ import dataclasses
 import fcntl
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +61,8 @@ def table(sizes: list[str]) -> list[dict[str, Any]]:
     pi0, pi05 = sizes
     four = {"size": pi05, "method": "LoRA", "limit": "12GB", "batch": 4}
     stored = [
-        four | {"base": base, "remat": "products", "parts": 1} for base in ("nf4", "float8", "int8")
+        four | {"limit": "16GB", "base": base, "remat": "products", "parts": 1}
+        for base in ("nf4", "float8", "int8")
     ]
     fitted = [
         {"size": size, "method": method, "limit": limit, "batch": 32}
@@ -72,8 +75,8 @@ def table(sizes: list[str]) -> list[dict[str, Any]]:
     return [*stored, *fitted, *parts, *remats]
 
 
-def run_config(row: dict[str, Any]) -> Config:
-    """Return a run's config; rows without storage have what `--fit` chooses."""
+def run_configs(row: dict[str, Any]) -> Iterator[Config]:
+    """Yield the configs to try; rows without storage have what `--fit` considers."""
     method, targets = METHODS[row["method"]]
     model = ModelConfig(
         size=row["size"],
@@ -88,9 +91,14 @@ def run_config(row: dict[str, Any]) -> Config:
     parts = {"model": model, "optim": optim, "data": data}
     config = Config(name="benchmark", scale="", peft=method, targets=targets, **parts)
     if "base" in row:
-        return config
-    budget = fit.read_size(row["limit"]) - fit.CONTEXT
-    return next(config for config, peak in fit.ranked(config) if peak <= budget)
+        yield config
+        return
+    least = float("inf")
+    for candidate, peak in fit.ranked(config):
+        least = min(least, peak)
+        if peak <= fit.budget(row["limit"]):
+            yield candidate
+    raise ValueError(f"nothing fits into {row['limit']}: expected {least / GIB:.1f} GiB or more")
 
 
 def values(shapes: Any, place: Callable[[np.ndarray], Any] = jnp.asarray) -> Any:
@@ -107,21 +115,10 @@ def values(shapes: Any, place: Callable[[np.ndarray], Any] = jnp.asarray) -> Any
 
 def measure(row: dict[str, Any], lock: Path) -> dict[str, Any]:
     """Train for some steps and return a row of the table."""
-    config, start = run_config(row), time.perf_counter()
-    model, optim = config.model, config.optim
-    base, _ = base_model(config, abstract=True)
-    backbone = dataclasses.replace(base.config, remat=model.remat)
-    found = {
-        "base": model.base_dtype or model.param_dtype,
-        "remat": model.remat,
-        "parts": optim.accumulate,
-        "expected": preflight.estimate_memory(config, backbone).peak / GIB,
-        "evaluating": preflight.sampling_peak(config, backbone) / GIB,
-    }
-    shapes = preflight.abstract_model(config, backbone)
-    step = Step(backbone, config, model=shapes, loop=LOOP)
-    planned = planned_bytes(step.compiled)
-    found |= {"planned": sum(planned.values()) / GIB, "compiled": time.perf_counter() - start}
+    for config in run_configs(row):
+        step, shapes, found = compile_step(config)
+        if "base" in row or found["planned"] * GIB <= fit.budget(row["limit"]):
+            break
     _, adapters, frozen = adaptation.split(shapes)
     with lock.open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
@@ -130,6 +127,24 @@ def measure(row: dict[str, Any], lock: Path) -> dict[str, Any]:
     stats = jax.local_devices()[0].memory_stats() or {}
     used = {name: stats.get(key, 0) / GIB for name, key in STATS.items()}
     return row | found | used | {"ms": 1e3 * seconds, "samples/s": row["batch"] / seconds}
+
+
+def compile_step(config: Config) -> tuple[Step, Any, dict[str, Any]]:
+    """Return the compiled step, the model's shapes, and columns of the table."""
+    model, start = config.model, time.perf_counter()
+    base, _ = base_model(config, abstract=True)
+    backbone = dataclasses.replace(base.config, remat=model.remat)
+    found = {
+        "base": model.base_dtype or model.param_dtype,
+        "remat": model.remat,
+        "parts": config.optim.accumulate,
+        "expected": preflight.estimate_memory(config, backbone).peak / GIB,
+        "evaluating": preflight.sampling_peak(config, backbone) / GIB,
+    }
+    shapes = preflight.abstract_model(config, backbone)
+    step = Step(backbone, config, model=shapes, loop=LOOP)
+    planned = sum(planned_bytes(step.compiled).values()) / GIB
+    return step, shapes, found | {"planned": planned, "compiled": time.perf_counter() - start}
 
 
 STATS = {"peak": "peak_bytes_in_use", "allocator": "bytes_limit"}
@@ -141,6 +156,7 @@ def whole_run(size: str, folder: Path) -> dict[str, Any]:
     from lorasp_jax.data import cache
     from lorasp_jax.models.checkpoints import native
 
+    jax.config.update("jax_platforms", "cpu")
     backbone = dataclasses.replace(sized("pi0", size), param_dtype="bfloat16")
     graphdef, state = nnx.split(nnx.eval_shape(lambda: backbone.create(nnx.Rngs(0))))
     native.save(folder / "base", nnx.merge(graphdef, values(state, np.asarray)))
@@ -163,10 +179,40 @@ def whole_run(size: str, folder: Path) -> dict[str, Any]:
         "--evaluation.execute-steps": "1",
     }
     arguments = [text for option in options.items() for text in option]
-    subprocess.run([sys.executable, "train.py", *arguments], check=True)
+    command = [sys.executable, "-m", "benchmarks.small_cards", "--train", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    output = done.stdout + done.stderr
+    print(output)
+    found = re.findall(rf"^{BEFORE}(.*)$", output, re.MULTILINE)
+    before = json.loads(found[-1]) if found else {}
+    if done.returncode:
+        return before | {"error": done.stderr[-800:] or output[-800:]}
     rows = (Path("runs") / options["--name"] / "metrics.jsonl").read_text().splitlines()
     last = json.loads(rows[-1])
-    return {"peak": last.get("memory/peak_gib", 0), "samples/s": last["speed/samples_per_second"]}
+    figures = {"peak": "memory/peak_gib", "samples/s": "speed/samples_per_second"}
+    return before | {name: last.get(key, 0) for name, key in figures.items()}
+
+
+BEFORE = "before the first step: "
+
+
+def train(arguments: list[str]) -> int:
+    """Train as `train.py` does, but print the memory [GiB] before the first step."""
+    from lorasp_jax.cli import train
+    from lorasp_jax.training.program import Program
+
+    call, names = Program.__call__, {"in use": "bytes_in_use", "peak before": "peak_bytes_in_use"}
+
+    def printing(program: Program, state: Any, key: jax.Array, done: int, count: int) -> Any:
+        program.compile(state, count).result()
+        if done == 0:
+            stats = jax.local_devices()[0].memory_stats() or {}
+            used = {name: stats.get(key, 0) / GIB for name, key in names.items()}
+            print(f"\n{BEFORE}{json.dumps(used)}", flush=True)
+        return call(program, state, key, done, count)
+
+    Program.__call__ = printing
+    return train.main(arguments)
 
 
 def work(row: dict[str, Any], results: Path) -> None:
@@ -208,9 +254,6 @@ def start(row: dict[str, Any], options: argparse.Namespace, total: float) -> sub
     """Start the process of a row, with its share of the GPU."""
     share = (fit.read_size(row["limit"]) - fit.CONTEXT) / total
     environment = os.environ | {"XLA_PYTHON_CLIENT_MEM_FRACTION": f"{share:.4f}"}
-    if row.get("row") == "whole run":
-        # This process only prepares: the GPU is for the one that it starts.
-        environment["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
     command = [sys.executable, "-m", "benchmarks.small_cards", "--row", json.dumps(row)]
     return subprocess.Popen([*command, "--json", str(options.json)], env=environment)
 
@@ -220,10 +263,19 @@ def read(path: Path) -> list[dict[str, Any]]:
     return [*map(json.loads, path.read_text().splitlines())] if path.exists() else []
 
 
+def waiting(rows: list[dict[str, Any]], results: Path) -> list[dict[str, Any]]:
+    """Return the rows that are not among the results, or failed."""
+    done = [row for row in read(results) if "error" not in row]
+    return [row for row in rows if not any(row.items() <= each.items() for each in done)]
+
+
 def main() -> None:
     """Run the benchmark from the command line."""
+    if sys.argv[1:2] == ["--train"]:
+        sys.exit(train(sys.argv[2:]))
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--json", type=Path, required=True, help="file for the results")
+    parser.add_argument("--only", nargs="+", help="rows with one of these values, such as LoRA-SP")
     parser.add_argument("--sizes", nargs=2, default=["base", "base_pi05"], help="pi0's and pi0.5's")
     parser.add_argument("--parallel", type=int, default=8, help="processes at a time")
     parser.add_argument("--seconds", type=float, default=1e9, help="stop after this time")
@@ -232,21 +284,22 @@ def main() -> None:
     if options.row:
         work(options.row, options.json)
         return
+    jax.config.update("jax_platforms", "cpu")  # the GPU is for the processes of the rows
     began, total = time.perf_counter(), gpu_bytes("total")
     whole = {"size": options.sizes[1], "limit": "12GB", "row": "whole run"}
     rows = [{"row": "context", "limit": "12GB"}, whole, *table(options.sizes)]
-    waiting = [
-        row for row in rows if not any(row.items() <= each.items() for each in read(options.json))
-    ]
+    only = options.only
+    rows = [row for row in rows if only is None or any(value in only for value in row.values())]
+    left = waiting(rows, options.json)
     running: list[tuple[subprocess.Popen, float]] = []
-    while (waiting or running) and time.perf_counter() - began < options.seconds:
+    while (left or running) and time.perf_counter() - began < options.seconds:
         running = [(process, held) for process, held in running if process.poll() is None]
-        alone = waiting and waiting[0].get("row") == "context"
+        alone = left and left[0].get("row") == "context"
         slots = 1 if alone or any(held == 0 for _, held in running) else options.parallel
-        if waiting and len(running) < slots:
-            held = fit.read_size(waiting[0]["limit"])
+        if left and len(running) < slots:
+            held = fit.read_size(left[0]["limit"])
             if sum(held for _, held in running) + held < 0.96 * total:
-                row = waiting.pop(0)
+                row = left.pop(0)
                 running.append((start(row, options, total), 0 if alone else held))
                 continue
         time.sleep(0.5)

@@ -7,7 +7,7 @@ import json
 import jax
 import pytest
 
-from benchmarks import compile_time, data, deployment, long_run, scaling, serving
+from benchmarks import compile_time, data, deployment, long_run, scaling, serving, small_cards
 from benchmarks.deployment import Case
 from lorasp_jax import peft
 from lorasp_jax.data.cache import Cache
@@ -62,6 +62,23 @@ def test_data_reading(tmp_path):
     assert row["windows/s"] > 0
     cache = Cache(tmp_path / "4x6")
     assert (len(cache), cache.num_steps, cache.cameras["wrist"]) == (2, 500, [4, 6])
+
+
+@pytest.mark.slow
+def test_small_cards(tmp_path):
+    """A row that `--fit` chooses, which a second call leaves out, and one with given settings."""
+    rows = small_cards.table(["nano", "nano_pi05"])
+    assert len({json.dumps(row) for row in rows}) == len(rows) == 19
+    results = tmp_path / "rows.jsonl"
+    for row in (rows[0], rows[3]):
+        assert small_cards.waiting([row], results) == [row]
+        small_cards.work(row, results)
+        assert small_cards.waiting([row], results) == []
+    given, fitted = small_cards.read(results)
+    assert (given["base"], given["remat"], given["parts"]) == ("nf4", "products", 1)
+    assert fitted["remat"] == "none"
+    for row in (given, fitted):
+        assert row["planned"] > 0 < row["samples/s"]
 
 
 @pytest.mark.slow

@@ -142,18 +142,24 @@ def with_config(model: Backbone, **changes: Any) -> Backbone:
 def quantized(model: Any, kind: quantization.Kind | Literal[""] | None) -> Any:
     """Return the model with the layers of its three towers quantized, or unchanged if no `kind`.
 
-    Layers that are trained in full stay as they are. Kernels in host memory go to the device one at
-    a time, and then everything else does.
+    Layers that are trained in full stay as they are. A base in host memory goes to the device when
+    all of it is quantized: full-size kernels, once freed, would leave gaps between its arrays, and
+    XLA needs its temporary memory in one piece. For the same reason, adapters then stay in host
+    memory, since training copies them.
     """
     if not kind:
         return model
     trained = paths.locate(nnx.List([model]), AdapterParam)
     kept = [location.path.rpartition("/")[0] for location in trained if location.name == "kernel"]
     rules = [(f"^{re.escape(path)}$", None) for path in kept]
-    model = quantization.quantize(model, [*rules, (_TOWERS, kind)]).model
-    graphdef, state = nnx.split(model)
-    to_device = lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x  # noqa: E731
-    return nnx.merge(graphdef, jax.tree.map(to_device, state))
+    graphdef, adapters, frozen = adaptation.split(
+        quantization.quantize(model, [*rules, (_TOWERS, kind)]).model
+    )
+    if any(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(frozen)):
+        del model, trained  # which hold adapters on the device
+        adapters = jax.device_get(adapters)
+        frozen = jax.tree.map(jnp.asarray, frozen)
+    return nnx.merge(graphdef, adapters, frozen)
 
 
 def in_bf16(model: Any) -> Any:

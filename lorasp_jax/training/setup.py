@@ -264,8 +264,11 @@ def _adapt(
 ) -> Backbone:
     """Add adapters by rule, initialized from the run's seed, and quantize the base."""
     rngs = nnx.Rngs(RandomStream.ADAPTERS.key(config.seed))
-    adapted = adaptation.adapt(model, adapter_rules, rngs=rngs, statistics=statistics)
-    return quantized(adapted, config.model.base_dtype)
+    # No variable holds the adapted model, whose memory `quantized` frees.
+    return quantized(
+        adaptation.adapt(model, adapter_rules, rngs=rngs, statistics=statistics),
+        config.model.base_dtype,
+    )
 
 
 def input_moments(run: Run, model: Backbone, processor: Processor) -> dict[str, jax.Array]:

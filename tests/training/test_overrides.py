@@ -51,6 +51,15 @@ def test_method_by_name_keeps_the_rank():
     assert parse(MULTITASK).resume is False
 
 
+def test_fit_knows_which_settings_are_given():
+    command = parse(
+        [*MULTITASK, "--fit", "16GB", "--model.base-dtype=nf4", "--optim.accumulate", "2"]
+    )
+    assert command.fit == "16GB"
+    assert command.given == {"model.base_dtype", "optim.accumulate"}
+    assert parse(MULTITASK).fit is None
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -101,6 +101,23 @@ def test_a_bundled_base_learns_another_control_period_from_recordings():
     assert digest == models.weights_hash(ROOT / "assets" / "pi0_nano")
 
 
+def test_a_base_to_be_quantized_stays_on_the_host(monkeypatch):
+    """A small GPU never holds more of it unquantized than one kernel."""
+    model = ModelConfig(checkpoint="assets/pi0_nano", base_dtype="nf4")
+    config = dataclasses.replace(CONFIG, model=model, targets=("q_proj",))
+    with jax.default_device(jax.devices()[1]):
+        found, digest = base.base_model(config)
+        assert digest == models.weights_hash(ROOT / "assets" / "pi0_nano")
+        assert {type(x) for x in jax.tree.leaves(nnx.state(found))} == {np.ndarray}
+        adapted = setup._adapt(config, found, rules.rules(config))
+    _, adapters, frozen = adaptation.split(adapted)
+    assert {type(x) for x in jax.tree.leaves(adapters)} == {np.ndarray}
+    assert {x.devices().pop() for x in jax.tree.leaves(frozen)} == {jax.devices()[1]}
+    monkeypatch.setattr(jax, "local_devices", lambda **_: jax.devices("unknown"))
+    with pytest.raises(ValueError, match=r"set JAX_PLATFORMS=.*,cpu"):
+        base.base_model(config)
+
+
 def test_lerobot_policies_are_preprocessed_as_their_config_says(config, tmp_path, monkeypatch):
     fields = {
         "type": "pi0",

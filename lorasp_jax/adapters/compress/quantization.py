@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 
 from lorasp_jax.adapters import adaptation, paths
@@ -52,7 +53,8 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
     """Quantize the kernels of dense layers and einsums by path rules.
 
     Args:
-        model: not modified; the result shares all other arrays.
+        model: not modified; the result shares all other arrays. Kernels in host memory, which are
+            quantized on the device one at a time, stay there.
         rules: (pattern, kind) pairs, where kind is "float8", "int8", "nf4" or None. As for `adapt`,
             the first match wins, and None skips the path. Rules apply to `Dense`, `nnx.Linear`,
             `nnx.LinearGeneral`, `nnx.Einsum` and adapted layers of other einsum classes.
@@ -124,10 +126,13 @@ def _quantize_layer(layer: nnx.Module, kind: Kind, shared: Shared) -> tuple[Adap
         raise ValueError("its kernel is already quantized")
     key = id(variable), getattr(layer, "kernel_equation", ""), kind
     if key not in shared:
+        on_host = isinstance(kernel, np.ndarray)
         kernel = jnp.asarray(kernel)  # a kernel on the host is copied to the device only once
         quantized_kernel = quantize_kernel(kernel, kind)
-        layer.set_kernel_matrices(quantized_kernel)
         error = _error(kernel, quantized_kernel)
+        if on_host:
+            quantized_kernel = jax.device_get(quantized_kernel)
+        layer.set_kernel_matrices(quantized_kernel)
         error = math.nan if isinstance(error, jax.core.Tracer) else float(error)
         shared[key] = layer.kernel_variable(), variable, error
     new, _, error = shared[key]

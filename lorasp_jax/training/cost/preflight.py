@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from flax import nnx
 
 from lorasp_jax.adapters import adaptation
@@ -92,14 +93,23 @@ def estimate_memory(config: Config, backbone: BackboneConfig) -> Memory:
         _of_one_window(config), dataclasses.replace(backbone, remat="none")
     )
     saved = functools.partial(_saved_bytes, config, size=micro_batch)
+    batch = nbytes(abstract_batch(backbone, local_batch))
+    accumulates = config.optim.accumulate > 1  # which sorts a copy of the batch into micro-batches
     return Memory(
         base=base,
         adapters=adapters,
-        gradients=adapters * (1 if config.optim.accumulate == 1 else 2),
+        # Over micro-batches, XLA keeps a sum and the adapters in the compute dtype.
+        gradients=adapters * (1 + accumulates * (1 + _cast_share(backbone))),
         optimizer=optimizer,
-        activations=saved(backbone) + nbytes(abstract_batch(backbone, local_batch)),
+        activations=saved(backbone) + batch * (1 + accumulates),
         recomputation=0 if backbone.remat == "none" else _recomputed_bytes(saved, backbone),
     )
+
+
+def _cast_share(backbone: BackboneConfig) -> float:
+    """Return the size of the adapters, which are f32, in the compute dtype, relative to theirs."""
+    size = jnp.dtype(backbone.dtype).itemsize
+    return size / 4 if size < 4 else 0
 
 
 def sampling_peak(config: Config, backbone: BackboneConfig) -> float:
