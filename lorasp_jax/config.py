@@ -195,7 +195,7 @@ class DataConfig:
     trains; a multiple of log_every. 0: never."""
 
     def __post_init__(self) -> None:
-        given = (self.source,) if isinstance(self.source, str) else self.source  # one, in Python
+        given = self.source if isinstance(self.source, list | tuple) else (self.source,)
         object.__setattr__(self, "source", tuple(filter(None, given)))
         fields.check_fields(self)
         _at_least(1, self, "episodes", "num_envs")

@@ -32,7 +32,7 @@ from lorasp_jax.base.locks import locked
 from lorasp_jax.base.writing import atomic_folder
 from lorasp_jax.data.batches import Steps
 from lorasp_jax.data.cache_writer import Column, map_column
-from lorasp_jax.data.joined import Joined, Part, Renamed
+from lorasp_jax.data.joined import Joined, Part, Renamed, parts_of
 from lorasp_jax.data.source import Progress, Source, dimension_names, grippers
 
 FORMAT = "lorasp-cache-2"
@@ -108,7 +108,7 @@ class _Writer:
 
     def __init__(self, folder: Path, source: Source) -> None:
         self.num_steps = 0
-        self._parts = source.parts if isinstance(source, Cache | Joined) else ()
+        self._parts = parts_of(source)
         self._dimensions = _dimensions(source)
         self._folder, self._metadata = folder, {}
         self._tasks: list[str] = []

@@ -47,6 +47,12 @@ class Renamed:
         self.sources: Mapping[str, Source] = {"": source}
         self.names: dict[str, list[str]] = dimension_names(source)
         self.grippers: dict[str, list[int]] = getattr(source, "grippers", {})
+        self.parts: tuple[Part, ...] = tuple(
+            dataclasses.replace(
+                part, cameras=tuple(n for n, x in cameras.items() if x in part.cameras)
+            )
+            for part in parts_of(source)
+        )
 
     def __len__(self) -> int:
         """Number of episodes."""
@@ -101,6 +107,11 @@ class Joined:
             for camera, reason in {**not_chosen, **each.left_out}.items()
             if camera in {*each.cameras, *each.left_out}
         }
+        for name, each in sources.items():
+            if any(len(part.cameras) < len(each.cameras) for part in parts_of(each)):
+                raise ValueError(
+                    f"{name} holds datasets of which some lack a camera: name them in its place"
+                )
         self.parts: tuple[Part, ...] = tuple(
             Part(name, len(each), tuple(camera for camera in chosen if camera in each.cameras))
             for name, each in sources.items()

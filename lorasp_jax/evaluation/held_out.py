@@ -223,13 +223,9 @@ def measure(policy: Policy, found: Windows, *, num_steps: int = 10) -> HeldOut:
         found: from `windows`.
         num_steps: Euler steps of the flow-matching sampler.
     """
-    sampling, chunks, sums = policy.with_sampler(), [], []
-    for batch, state, fresh, keys in _batches(policy, found):
-        sums.append(_loss(policy.model, batch, fresh, keys[0]))
-        actions = _actions(sampling, batch.observation, state, keys[1], num_steps=num_steps)
-        chunks.append(np.asarray(actions)[fresh])
+    sums = [_loss(policy.model, b, fresh, keys[0]) for b, _, fresh, keys in _batches(policy, found)]
     loss, valid = np.array(jax.device_get(sums), np.float64).T.sum(axis=1).tolist()
-    actions = np.concatenate(chunks)
+    actions = sample(policy, found, num_steps=num_steps)
     compared = actions, found.still[:, None], found.previous[:, None]
     errors = (_errors(values, found.raw) for values in compared)
     return HeldOut(

@@ -85,7 +85,7 @@ def _check_parts(data: DataConfig, model: BackboneConfig, parts: Sequence[Part])
             "data.replay needs demonstrations of what the base was taught: name their dataset last "
             f"in data.source, after the others; {known}"
         )
-    if data.weights and len(data.weights) != len(parts) - bool(data.replay):
+    if data.weights and len(data.weights) != max(1, len(parts) - bool(data.replay)):
         raise ValueError(
             f"data.weights needs a number for each dataset{' but the last' * bool(data.replay)}, "
             f"got {len(data.weights)}; {known}"

@@ -77,6 +77,19 @@ def test_a_cache_knows_what_it_was_joined_from(joined, tmp_path):
     assert [part.cameras for part in Cache(tmp_path / "cache", ["wrist"]).parts] == [("wrist",), ()]
 
 
+def test_a_joined_cache_keeps_what_it_lacks(joined, folder, tmp_path):
+    """Under other names of its cameras, too; joined again, black images would look recorded."""
+    cache.write([joined], tmp_path / "cache", quietly)
+    lines = 'path = "cache"\n[cameras]\na = "side"\nb = "wrist"\n'
+    (tmp_path / "other.toml").write_text(lines)
+    found = open_source(tmp_path / "other.toml")
+    cache.write([found], tmp_path / "copy", quietly)
+    for each in (found, Cache(tmp_path / "copy")):
+        assert [part.cameras for part in each.parts] == [("a", "b"), ("a",)]
+    with pytest.raises(ValueError, match="cache holds datasets of which some lack a camera"):
+        open_sources([tmp_path / "cache", golden("v3")], KEYS)
+
+
 def test_images_of_other_sizes_are_fitted_or_refused(folder, tmp_path):
     wide = random_episodes("press", 1)
     wide = dataclasses.replace(wide, image={"cam_high": wide.image["side"][:, :, :16]})

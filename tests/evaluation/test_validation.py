@@ -176,7 +176,7 @@ def test_errors_by_instruction(recorded):
     phrase = next(iter(result.instructions))
     rows = np.array([other == phrase for other in found.phrase])
     inside = np.asarray(found.raw.inside)[rows]
-    spread = held_out._spread(found.raw)
+    spread = held_out._spread(found.raw)[rows]
     off = np.abs(result.actions - found.raw.actions)[rows] / spread
     assert worst == pytest.approx(off[inside].mean(), rel=1e-5)
     still = np.abs(found.still[:, None] - found.raw.actions)[rows] / spread

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -282,6 +283,9 @@ def test_on_the_command_line_and_in_the_file_of_a_run():
         assert written["source"] == "a"
         assert not {"weights", "statistics", "replay"} & written.keys()
     assert to_json(dataclasses.replace(CONFIG, data=DataConfig("")))["data"]["source"] == ""
+    assert DataConfig(["a", "b"]).source == ("a", "b")
+    with pytest.raises(ValueError, match="source must be"):
+        DataConfig(Path("a"))
     for wrong in ({"weights": (0.0,)}, {"replay": 1.0}, {"statistics": "none"}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             DataConfig("a", **wrong)
