@@ -57,8 +57,8 @@ def inspect(options: argparse.Namespace, console: Console) -> None:
 def convert(options: argparse.Namespace, console: Console) -> None:
     """Convert datasets to a cache for training, or one dataset to RLDS or LeRobot v3.0."""
     from lorasp_jax.data import cache, lerobot_export, rlds_export
-    from lorasp_jax.data.opening import open_sources
-    from lorasp_jax.data.source import describe_left_out
+    from lorasp_jax.data.opening import open_source, open_sources
+    from lorasp_jax.data.source import describe_left_out, grippers
 
     count = len(options.paths)
     if options.to != "cache" and count > 1:
@@ -76,6 +76,12 @@ def convert(options: argparse.Namespace, console: Console) -> None:
         else:
             cache.write([source], options.out, progress)
     console.print(f"{options.out}: {len(source)} episodes", soft_wrap=True, highlight=False)
+    known, read = grippers(source), grippers(open_source(options.out))
+    if read != known:
+        text = (
+            f"{options.out} does not say that the grippers are dimensions {known}, as a cache does"
+        )
+        console.print(f"{text}: it is read with {read}", soft_wrap=True, highlight=False)
 
 
 def parser(program: str) -> argparse.ArgumentParser:

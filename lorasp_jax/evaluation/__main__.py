@@ -32,7 +32,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     parser.add_argument("--data", required=True, metavar="DATASET", help=text)
     text = "for which of the run's datasets the policy acts, if they differ (default: the first)"
     parser.add_argument("--dataset", default="", metavar="NAME", help=text)
-    text = "numbers of the episodes (default: all)"
+    text = "numbers of the episodes (default: all, or those of --dataset in a cache of several)"
     parser.add_argument("--episodes", nargs="+", type=int, metavar="N", help=text)
     text = "flow-matching steps per chunk (default: %(default)s)"
     parser.add_argument("--denoise-steps", type=int, default=10, metavar="N", help=text)
@@ -56,7 +56,8 @@ def evaluate(options: argparse.Namespace, console: Console) -> None:
 
     cache.enable()
     source = open_source(options.data, keys_of(options))
-    period = export.describe(options.run)["control_dt"]
+    described = export.describe(options.run)
+    period = described["control_dt"]
     if not same_period(source.control_dt, period):
         shorter = source.control_dt < period
         remedy = "pass --every N to keep every N-th frame" if shorter else "record more often"
@@ -64,7 +65,8 @@ def evaluate(options: argparse.Namespace, console: Console) -> None:
             f"{options.data} has a control period of {source.control_dt:.4g} s, but {options.run} "
             f"was trained with {period:.4g} s: {remedy}"
         )
-    numbers = options.episodes or [*range(len(source))]
+    acts_for = options.dataset or described["policy"].get("dataset", "")
+    numbers = options.episodes or held_out.episodes_of(source, acts_for)
     if wrong := [number for number in numbers if not 0 <= number < len(source)]:
         raise ValueError(f"--episodes must be 0 to {len(source) - 1}, got {wrong[0]}")
     policy = export.load_policy(options.run, dataset=options.dataset)

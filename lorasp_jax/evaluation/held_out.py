@@ -194,6 +194,15 @@ def windows(
     )
 
 
+def episodes_of(source: Source, dataset: str) -> list[int]:
+    """Return the numbers of the episodes of one of the datasets in a cache, or of all episodes."""
+    if isinstance(source, Cache):
+        names = [part.name for part in source.parts]
+        if dataset in names:
+            return np.flatnonzero(source.dataset == names.index(dataset)).tolist()
+    return [*range(len(source))]
+
+
 def _steps(episode: Episodes, policy: Policy) -> Steps:
     """Return the steps of an episode, with instructions as rows of the policy's prompts."""
     if episode.actions != "joint":

@@ -26,21 +26,13 @@ from lorasp_jax.data.stream import Stream
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.policies.policy import Policy
-from lorasp_jax.policies.processor import (
-    Processor,
-    robot_slots,
-)
+from lorasp_jax.policies.processor import Processor, robot_slots
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Tokenizer, load_tokenizer
 from lorasp_jax.training import dataset, rules
 from lorasp_jax.training.base import base_model, quantized, with_config
 from lorasp_jax.training.cost import preflight
-from lorasp_jax.training.demonstrations import (
-    Demonstrations,
-    Progress,
-    demonstrations,
-    in_thread,
-)
+from lorasp_jax.training.demonstrations import Demonstrations, Progress, demonstrations, in_thread
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.processors import of_datasets, processor

@@ -79,6 +79,14 @@ def test_convert_between_all_formats(capsys, tmp_path):
     assert info["description"] == "Recorded episodes of dataset by piper."
 
 
+@pytest.mark.parametrize(("to", "loses"), [("rlds", True), ("lerobot", True), ("cache", False)])
+def test_grippers_that_a_format_loses_are_named(to, loses, capsys, tmp_path):
+    arguments = ["convert", golden("v3"), "--to", to, "--out", tmp_path / "out"]
+    code, text, _ = run(capsys, *arguments, "--grippers", "0")
+    assert code == 0
+    assert ("grippers are dimensions [0]" in text) == loses
+
+
 def test_rlds_in_several_files(tmp_path, monkeypatch):
     monkeypatch.setattr(rlds_export, "EPISODES_PER_FILE", 3)
     reports = []

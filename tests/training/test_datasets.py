@@ -17,11 +17,12 @@ from lorasp_jax.config import DataConfig
 from lorasp_jax.data import cache
 from lorasp_jax.data.batches import draw, encode
 from lorasp_jax.data.opening import open_source
-from lorasp_jax.evaluation.held_out import measure, sample, windows
+from lorasp_jax.evaluation.held_out import episodes_of, measure, sample, windows
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.report.html import write_report
 from lorasp_jax.training import dataset, early, export, setup
 from lorasp_jax.training.batches import DrawnBatches
+from lorasp_jax.training.cost import fit
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.overrides import parse
@@ -131,6 +132,8 @@ def test_held_out_windows_act_by_their_dataset(run):
         np.testing.assert_allclose(chunks[rows], expected[rows], rtol=1e-4, atol=1e-5)
         assert np.abs(expected[~rows] - chunks[~rows]).max() > 0.1
     assert 0.1 < measure(run.policy, found, num_steps=2).hold.mean < 10  # by each one's spread
+    for name, numbers in (("near", [0, 1, 2]), ("far", [3, 4, 5]), ("", [*range(6)])):
+        assert episodes_of(run.recordings, name) == numbers
 
 
 def test_the_run_says_what_it_learns_from(run, tmp_path):
@@ -334,3 +337,14 @@ def test_what_cannot_be_replayed(changes, sentence):
         replayed_tasks(dataclasses.replace(REPLAY, **changes))
     with pytest.raises(ValueError, match=r"fresh_every .* data\.replay"):
         DataConfig(replay=0.1, fresh_every=50)
+
+
+def test_a_run_that_replays_tasks_of_its_base_is_compiled_to_fit(tmp_path, monkeypatch):
+    """From shapes alone, without the base, which says what it was taught."""
+    seen = []
+    monkeypatch.setattr(fit, "ranked", lambda *_: iter([(REPLAY, 0.0)]))
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(fit, "planned_bytes", lambda _: {})
+    monkeypatch.setattr(fit, "compile_step", lambda config, *_: seen.append(config) or [None])
+    assert fit.fitted(REPLAY, "8GB", (), tmp_path, Console(quiet=True)) is REPLAY
+    assert replayed_tasks(seen[0]) == ()

@@ -174,8 +174,13 @@ def _candidates(config: Config, given: Collection[str]) -> list[Config]:
 
 
 def _without_weights(config: Config) -> Config:
-    """Return the config with a random base, of which only shapes are used."""
-    return dataclasses.replace(config, model=dataclasses.replace(config.model, checkpoint=""))
+    """Return the config with a random base, of which only shapes are used and no tasks replayed."""
+    replay = config.data.replay if config.data.source else 0.0
+    return dataclasses.replace(
+        config,
+        model=dataclasses.replace(config.model, checkpoint=""),
+        data=dataclasses.replace(config.data, replay=replay),
+    )
 
 
 def _describe(config: Config, size: str, peak: float, console: Console) -> None:
