@@ -21,7 +21,7 @@ def get_config(scale: str) -> Config:
         config.model,
         backbone="smolvla",
         checkpoint="hf://lerobot/smolvla_base",
-        relative_actions=False,
+        relative_actions=None,
         tokenizer="hf://HuggingFaceTB/SmolVLM2-500M-Video-Instruct",
     )
     return dataclasses.replace(config, name="multitask_smolvla", model=model, image_size=256)

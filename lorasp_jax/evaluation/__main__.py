@@ -65,7 +65,7 @@ def evaluate(options: argparse.Namespace, console: Console) -> None:
             f"{options.data} has a control period of {source.control_dt:.4g} s, but {options.run} "
             f"was trained with {period:.4g} s: {remedy}"
         )
-    acts_for = options.dataset or described["policy"].get("dataset", "")
+    acts_for = options.dataset or described.get("policy", {}).get("dataset", "")
     numbers = options.episodes or held_out.episodes_of(source, acts_for)
     if wrong := [number for number in numbers if not 0 <= number < len(source)]:
         raise ValueError(f"--episodes must be 0 to {len(source) - 1}, got {wrong[0]}")

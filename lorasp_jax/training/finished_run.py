@@ -15,7 +15,7 @@ from lorasp_jax.config import (
     OptimConfig,
 )
 from lorasp_jax.training import records
-from lorasp_jax.training.run_folder import CONFIG_FILE, read_json, recorded_ranges
+from lorasp_jax.training.run_folder import CONFIG_FILE, RELATIVE, read_json, recorded_ranges
 
 _GROUPS: dict[str, Any] = {
     "model": ModelConfig,
@@ -56,6 +56,8 @@ def _from_json(recorded: Mapping[str, Any], tasks: tuple[str, ...]) -> Config:
     for name in ("source", "weights", "cameras"):
         data[name] = tuple(data.get(name, ()))
     fields["data"] = data
+    model = fields["model"]
+    fields["model"] = {**model, "relative_actions": RELATIVE[model["relative_actions"]]}
     for name, group in _GROUPS.items():
         fields[name] = group(**fields[name])
     fields["peft"] = recorded_method(fields["peft"])

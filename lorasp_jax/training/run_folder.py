@@ -49,13 +49,17 @@ _OPTIONAL = (
 results files of studies do not have them."""
 
 
+RELATIVE: dict[bool | None, bool | None] = {None: False, False: None, True: True}
+"""`relative_actions` -> as recorded, and back: False once meant what None does."""
+
+
 def to_json(config: Config) -> dict[str, Any]:
     """Convert a config to JSON values, including the name of the adapter method.
 
     `scene` has only the ranges that differ from the defaults, and is absent if none do.
     """
     fields = json.loads(json.dumps(dataclasses.asdict(config)))
-    fields["model"]["relative_actions"] = bool(config.model.relative_actions)  # as it once was
+    fields["model"]["relative_actions"] = RELATIVE[config.model.relative_actions]
     for group, name in _OPTIONAL:
         if not fields[group][name]:
             del fields[group][name]

@@ -26,6 +26,10 @@ TASKS = {task: RESULTS["tasks"]["press"] for task in CONFIG.tasks}
         {"data": DataConfig(source="x", augment=AugmentConfig("none"), validation=("0",))},
         {"data": DataConfig(("a", "b"), weights=(2.0,), replay=0.1, statistics="each")},
         {"adapt": ("language=lora:4", "action=full")},
+        *(
+            {"model": dataclasses.replace(CONFIG.model, relative_actions=relative)}
+            for relative in (None, False, True)
+        ),
     ],
 )
 def test_configs_are_read_as_written(tmp_path, changes):

@@ -29,9 +29,7 @@ def shared_demonstrations(
     seed takes its own at random.
     """
     count = config.data.episodes
-    shared = dataclasses.replace(
-        config, seed=0, data=dataclasses.replace(config.data, episodes=pool or count)
-    )
+    shared = _collecting(config, pool or count, seed=0)
     found = _shared(study_folder / "demonstrations", shared, progress)
     if not pool:
         return found
@@ -52,14 +50,17 @@ def settings(config: Config) -> Config:
     """
     if config.seed == SEED:
         raise ValueError(f"seed {SEED} is reserved for held-out episodes")
-    data = dataclasses.replace(config.data, episodes=EPISODES)
-    return dataclasses.replace(config, data=data, seed=SEED)
+    return _collecting(config, EPISODES, SEED)
+
+
+def _collecting(config: Config, episodes: int, seed: int) -> Config:
+    """Return the config of a collection, with none of the settings of training on it."""
+    kept = {name: getattr(config.data, name) for name in ("num_envs", "action_noise")}
+    return dataclasses.replace(config, data=DataConfig(episodes=episodes, **kept), seed=seed)
 
 
 def _shared(root: Path, config: Config, progress: Progress = lambda *_: None) -> Demonstrations:
     """Load each task's episodes from a folder named after the settings, or collect them there."""
-    kept = {name: getattr(config.data, name) for name in ("episodes", "num_envs", "action_noise")}
-    config = dataclasses.replace(config, data=DataConfig(**kept))
     settings = {
         "robot": config.robot,
         "data": to_json(config)["data"],

@@ -52,7 +52,7 @@ def test_policies_differ_in_what_their_names_say(results):
 def test_page(results, tmp_path, monkeypatch):
     monkeypatch.setattr(statistics, "DRAWS", 100)
     monkeypatch.setattr(page, "DRAWS", 100)
-    statistics._counts.cache_clear()
+    monkeypatch.setattr(statistics, "_counts", statistics._counts.__wrapped__)
     made = page.blocks(STUDY, results, tmp_path)
     made = {name: table.replace("\u00a0", " ") for name, table in made.items()}
     assert (tmp_path / "success.svg").read_text().count("LoRA-SP, R = 64") >= 1
