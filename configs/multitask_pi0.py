@@ -5,9 +5,9 @@
         --model.tokenizer FILE
 
 Weights and tokenizer are downloaded from public buckets unless you pass your own; weights may be in
-openpi's or LeRobot's layout. Needs a GPU with 24 GB, and there XLA_PYTHON_CLIENT_MEM_FRACTION=0.95
-in the environment; with more memory it recomputes less and trains faster. `--fsdp N` shards the
-base over N devices. The third of pi0's camera slots is masked.
+openpi's or LeRobot's layout. `--fit 24GB` fits the run to a GPU; with more memory it recomputes
+less and trains faster. `--fsdp N` shards the base over N devices. The third of pi0's camera slots
+is masked.
 """
 
 from lorasp_jax.config import Config, DataConfig, EvaluationConfig, ModelConfig, OptimConfig

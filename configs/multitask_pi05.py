@@ -8,7 +8,7 @@ Downloads weights and tokenizer from public buckets unless you pass your own; we
 openpi's or LeRobot's layout. A folder that is named after a training config of openpi, such as
 pi05_libero, is adapted with its chunk and prompts; `--model.openpi-config NAME` names that of
 others. Joint targets are learned relative to the state: for recorded displacements, as LIBERO's,
-pass `--model.relative-actions False`. Needs a GPU with 32 GB; with 24 GB, `--optim.accumulate 2`.
+pass `--model.relative-actions False`. `--fit 24GB` fits the run to a GPU.
 """
 
 import dataclasses
