@@ -68,7 +68,7 @@ def _execute(command: "Command", console: Console, started: float) -> None:
     if command.fit:
         from lorasp_jax.training.cost import fit
 
-        config = fit.resumed(command.config, folder) if command.resume else None
+        config = fit.resumed(command.config, command.given, folder) if command.resume else None
         chosen = config or fit.fitted(command.config, command.fit, command.given, folder, console)
         command = dataclasses.replace(command, config=chosen)
     if command.dry_run:

@@ -28,7 +28,8 @@ def open_sources(
     if len(wheres) == 1:
         return open_source(wheres[0], keys, cameras)
     paths = [os.fspath(where) for where in wheres]
-    if twice := [path for path in paths if paths.count(path) > 1]:
+    real = [os.path.realpath(path) for path in paths]
+    if twice := [path for path, where in zip(paths, real, strict=True) if real.count(where) > 1]:
         raise ValueError(f"{twice[0]} is named twice")
     short = [_name(path) for path in paths]
     names = dict(zip(short if len({*short}) == len(short) else paths, paths, strict=True))

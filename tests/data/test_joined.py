@@ -131,7 +131,7 @@ def test_what_cannot_be_joined(changes, sentence, tmp_path):
 def test_names(folder, tmp_path):
     rlds.write(random_episodes("press", 0), tmp_path / "rlds")
     with pytest.raises(ValueError, match="named twice"):
-        open_sources([folder / "rlds", folder / "rlds"], KEYS)
+        open_sources([folder / "rlds", f"{folder}/../{folder.name}/rlds"], KEYS)
     changed = random_episodes("press", 0)
     rlds.write(dataclasses.replace(changed, robot="so101"), tmp_path / "b" / "rlds")
     found = open_sources([tmp_path / "rlds", tmp_path / "b" / "rlds"], KEYS)

@@ -107,8 +107,10 @@ def ranked(config: Config, given: Collection[str] = ()) -> Iterator[tuple[Config
         yield candidate, expected_peak(candidate, base.config)
 
 
-def resumed(config: Config, folder: Path) -> Config | None:
+def resumed(config: Config, given: Collection[str], folder: Path) -> Config | None:
     """Return the config with what was chosen when the run in `folder` started; None: there is none.
+
+    Settings that are given stay as they are.
 
     Raises:
         ValueError: the run's config is corrupt.
@@ -116,8 +118,8 @@ def resumed(config: Config, folder: Path) -> Config | None:
     if not (recorded := read_json(folder / CONFIG_FILE, records.CONFIG)):
         return None
     groups: dict[str, dict[str, Any]] = {}
-    for name, default in DEFAULTS.items():
-        group, field = name.split(".")
+    for name in DEFAULTS.keys() - given:
+        (group, field), default = name.split("."), DEFAULTS[name]
         groups.setdefault(group, {})[field] = recorded[group].get(field, default)
     parts: dict[str, Any] = {
         group: dataclasses.replace(getattr(config, group), **values)

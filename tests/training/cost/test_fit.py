@@ -119,13 +119,17 @@ def test_on_a_gpu_the_plan_of_the_compiler_decides(sizes, monkeypatch):
 
 
 def test_a_resumed_run_keeps_what_was_chosen(sizes, tmp_path):
-    assert fit.resumed(CONFIG, tmp_path) is None
+    assert fit.resumed(CONFIG, (), tmp_path) is None
     started = fit.fitted(CONFIG, f"{200 * MIB_GB:.4f}GB", (), tmp_path, Console(quiet=True))
     write_json(tmp_path / "config.json", to_json(started))
-    assert fit.resumed(CONFIG, tmp_path) == started
+    assert fit.resumed(CONFIG, (), tmp_path) == started
     unquantized = fit.fitted(CONFIG, "1GB", (), tmp_path, Console(quiet=True))
     write_json(tmp_path / "config.json", to_json(unquantized))
-    assert fit.resumed(started, tmp_path) == unquantized
+    assert fit.resumed(started, (), tmp_path) == unquantized
+    given = dataclasses.replace(CONFIG, optim=dataclasses.replace(CONFIG.optim, accumulate=4))
+    kept = fit.resumed(given, {"optim.accumulate"}, tmp_path)
+    assert kept and kept.optim.accumulate == 4
+    assert kept.model == unquantized.model
 
 
 @pytest.mark.parametrize(("text", "size"), [("16GB", 16e9), ("14.5 GiB", 14.5 * 2**30)])
