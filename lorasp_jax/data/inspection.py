@@ -22,7 +22,7 @@ from envs.rendering.video import side_by_side
 from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.config import AugmentConfig
 from lorasp_jax.data.augmentation import Augment, on_wrist, recipe
-from lorasp_jax.data.source import Source, describe_left_out, grippers
+from lorasp_jax.data.source import Source, describe_left_out, grippers, same_period
 from lorasp_jax.data.video import downscale
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.policies.offline_tokenizer import num_tokens
@@ -103,6 +103,8 @@ def report(source: Source, console: Console) -> None:
         f"median {np.median(summary.length):g}",
         "steps": f"{steps} at {hertz:g} Hz, {minutes:.1f} minutes",
     }
+    if not same_period(source.control_dt, 0.1):
+        lines["steps"] += f"; train with --control-dt {source.control_dt:.4g}, or see --every"
     if unused := describe_left_out(source):
         console.print(unused, style="yellow", soft_wrap=True, highlight=False, markup=False)
     for name, text in lines.items():

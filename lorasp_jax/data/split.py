@@ -10,15 +10,19 @@ SHARE, MINIMUM = 0.1, 10
 _EPISODE = re.compile(r"episode_(\d+)")
 
 
-def held_out(choice: Sequence[str], tasks: Sequence[str], *, recorded: bool) -> list[int]:
+def held_out(
+    choice: Sequence[str], tasks: Sequence[str], phrases: Sequence[str] = (), *, recorded: bool
+) -> list[int]:
     """Return the numbers of the episodes to hold out, in ascending order.
 
-    A share or a number of episodes is spread over the tasks, and within a task over the time in
-    which its episodes were recorded; every task keeps an episode to learn from.
+    A share or a number of episodes is spread over the tasks, within a task over its instructions,
+    and then over the time in which the episodes were recorded. Every task keeps an episode to learn
+    from, and every instruction does while others of its task have more.
 
     Args:
         choice: `DataConfig.validation`.
         tasks: the task of each episode.
+        phrases: the instruction of each episode; empty: one for each task.
         recorded: whether the episodes were recorded rather than simulated, see "auto".
 
     Raises:
@@ -38,7 +42,7 @@ def held_out(choice: Sequence[str], tasks: Sequence[str], *, recorded: bool) -> 
             f"data.validation must be a share below 1 or a number of episodes below {len(tasks)}, "
             f"which is how many there are, got {choice[0]}"
         )
-    chosen = _spread(count, tasks)
+    chosen = _spread(count, tasks, phrases or tasks)
     if count and not chosen:
         raise ValueError("data.validation can hold out nothing: every task has few episodes")
     return chosen
@@ -67,13 +71,25 @@ def _named(
     return numbers
 
 
-def _spread(count: int, tasks: Sequence[str]) -> list[int]:
-    """Choose `count` episodes, evenly over tasks and over the episodes of each."""
+def _spread(count: int, tasks: Sequence[str], phrases: Sequence[str]) -> list[int]:
+    """Choose `count` episodes, evenly over tasks, instructions and the episodes of each."""
     chosen: list[int] = []
     before = 0
     for task in dict.fromkeys(tasks):
         episodes = [number for number, name in enumerate(tasks) if name == task]
         first, before = round(count * before / len(tasks)), before + len(episodes)
         share = min(round(count * before / len(tasks)) - first, len(episodes) - 1)
-        chosen += [episodes[int((i + 0.5) * len(episodes) / share)] for i in range(share)]
+        candidates = _by_phrase(episodes, phrases, share)
+        chosen += [candidates[int((i + 0.5) * len(candidates) / share)] for i in range(share)]
     return sorted(chosen)
+
+
+def _by_phrase(episodes: list[int], phrases: Sequence[str], share: int) -> list[int]:
+    """Order the episodes of a task by instruction; leave one of each out if `share` remain."""
+    groups: dict[str, list[int]] = {}
+    for number in episodes:
+        groups.setdefault(phrases[number], []).append(number)
+    if len(groups) == 1:
+        return episodes
+    rest = [number for group in groups.values() for number in group[:-1]]
+    return rest if len(rest) >= share else [n for group in groups.values() for n in group]

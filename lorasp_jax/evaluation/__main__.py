@@ -84,7 +84,8 @@ def evaluate(options: argparse.Namespace, console: Console) -> None:
         soft_wrap=True,
         highlight=False,
     )
-    folder = options.out or options.run / f"evaluate_{Path(options.data).name}"
+    name = Path(options.data).name.removesuffix(".toml")
+    folder = options.out or options.run / f"evaluate_{name}"
     folder.mkdir(parents=True, exist_ok=True)
     steps = {"num_steps": options.denoise_steps}
     for path in held_out_figure.write(folder, policy, source, numbers, **steps):

@@ -61,19 +61,22 @@ class Windows:
 
     @property
     def units(self) -> Units:
-        """Degrees and mm for joint targets [rad, m]; otherwise the numbers as recorded."""
+        """Degrees and mm for joint targets [rad] and grippers [m]; otherwise as recorded."""
         actions = np.abs(np.asarray(self.raw.actions)).max((0, 1))
         is_gripper = np.isin(np.arange(len(actions)), self.grippers)
-        limits = np.where(is_gripper, 1.0, 2 * np.pi)
-        if not self.targets or (actions > limits).any():
+        in_radians = not (actions[~is_gripper] > 2 * np.pi).any()
+        in_metres = not (actions[is_gripper] > 1).any()
+        if not self.targets or not (in_radians or in_metres):
             titles = self._titles([f"action {i}" for i in range(1, len(actions) + 1)])
             return [(title, 1.0) for title in titles]
         joints = iter(f"joint {i}" for i in range(1, len(actions) + 1))
         titles = self._titles(["gripper" if gripper else next(joints) for gripper in is_gripper])
-        return [
-            (title + _MILLIMETRES, 1000.0) if gripper else (title + _DEGREES, 180 / np.pi)
-            for title, gripper in zip(titles, is_gripper, strict=True)
-        ]
+        joint, gripper = (
+            (_DEGREES, 180 / np.pi) if in_radians else ("", 1.0),
+            (_MILLIMETRES, 1000.0) if in_metres else ("", 1.0),
+        )
+        shown = [gripper if each else joint for each in is_gripper]
+        return [(title + unit, x) for title, (unit, x) in zip(titles, shown, strict=True)]
 
     def _titles(self, default: list[str]) -> list[str]:
         """Return unique names of the dimensions: the dataset's, or else the default ones."""

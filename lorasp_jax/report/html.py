@@ -186,7 +186,7 @@ def held_out_verdict(rows: figures.Rows) -> str:
     if last[name] > 1.05 * best[name]:
         rise = 100 * (last[name] / best[name] - 1)
         return f"{text}; it then rose by {rise:.0f} %, so that further steps only overfit."
-    return f"{text}."
+    return f"{text}, a policy that does nothing: {min(floors):.3f}."
 
 
 def _subtitle(config: dict[str, Any], results: dict[str, Any]) -> str:

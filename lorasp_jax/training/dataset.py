@@ -54,9 +54,12 @@ def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
             "keep every N-th step with python -m lorasp_jax.data convert --every N"
         )
     if len(source.cameras) > (most := len(model.cameras)):
+        alike = "name those that show the same alike in dataset files, or " * bool(
+            parts_of(source)[1:]
+        )
         raise ValueError(
             f"{path} has cameras {', '.join(source.cameras)}, but the backbone accepts at most "
-            f"{most}: choose with --data.cameras, such as --data.cameras "
+            f"{most}: {alike}choose with --data.cameras, such as --data.cameras "
             f"{' '.join([*source.cameras][:most])}"
         )
     first = source.episode(0, ())
@@ -126,7 +129,8 @@ def load(run: Run, source: Source, free_bytes: float) -> None:
     metadata = cache.metadata
     facts = (metadata[name] for name in ("tasks", "robot", "physics_dt"))
     run.recordings, run.simulated = cache, is_simulated(*facts)
-    run.held_out = held_out(data.validation, _tasks(cache, data), recorded=not run.simulated)
+    tasks, phrases = _labels(cache, data)
+    run.held_out = held_out(data.validation, tasks, phrases, recorded=not run.simulated)
     run.dataset = mixed(without(cache.steps, run.held_out), data)
     run.episodes = outline(cache, run.held_out)
     identity = {name: metadata[name] for name in ("crc32", "instructions")}
@@ -142,14 +146,19 @@ def load(run: Run, source: Source, free_bytes: float) -> None:
     _describe(run, cache, identity.get("datasets", []))
 
 
-def _tasks(cache: Cache, data: DataConfig) -> list[str]:
-    """Return the task of each episode that may be held out; equal names in datasets are two."""
+def _labels(cache: Cache, data: DataConfig) -> tuple[list[str], list[str]]:
+    """Return task and instruction of each episode that may be held out.
+
+    Tasks of different datasets are different ones.
+    """
     last = len(cache) - cache.parts[-1].episodes if data.replay else len(cache)
-    found = [cache.episode(number, ()).task for number in range(last)]
+    episodes = [cache.episode(number, ()) for number in range(last)]
+    phrases = [each.instructions[int(each.instruction[0])] for each in episodes]
+    tasks = [each.task for each in episodes]
     if cache.parts[1:]:
-        pairs = zip(found, cache.dataset, strict=False)
-        found = [f"{task} of {cache.parts[index].name}" for task, index in pairs]
-    return found
+        pairs = zip(tasks, cache.dataset, strict=False)
+        tasks = [f"{task} of {cache.parts[index].name}" for task, index in pairs]
+    return tasks, phrases
 
 
 def _describe(run: Run, cache: Cache, datasets: Sequence[Mapping[str, Any]]) -> None:

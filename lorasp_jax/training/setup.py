@@ -20,6 +20,7 @@ from lorasp_jax.adapters.compress import calibration
 from lorasp_jax.base import hub
 from lorasp_jax.base.bars import bars
 from lorasp_jax.config import Config
+from lorasp_jax.data.augmentation import on_wrist
 from lorasp_jax.data.batches import Batch, encode, sample_batch
 from lorasp_jax.data.source import Source, describe_left_out
 from lorasp_jax.data.stream import Stream
@@ -170,6 +171,14 @@ def _print_cameras(source: Source, inputs: Processor, console: Console) -> None:
     size = f"{inputs.image_size} x {inputs.image_size}"
     summary = f"cameras: {', '.join(cameras)}; resized to {size}"
     console.print(summary, markup=False, soft_wrap=True)
+    slots = [slot for slot, _ in inputs.cameras]
+    wrong = [n for slot, n in inputs.cameras if n and on_wrist(n) and not on_wrist(slot)]
+    if wrong and any(map(on_wrist, slots)):
+        text = (
+            f"warning: {wrong[0]} is named like a wrist camera, but takes another's place: choose "
+        )
+        text += "the order with --data.cameras"
+        console.print(text, style="yellow", highlight=False, soft_wrap=True)
 
 
 def _load_or_collect(

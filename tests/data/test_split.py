@@ -55,3 +55,19 @@ def test_impossible_choices(choice, named):
 def test_what_cannot_be_held_out_is_said():
     with pytest.raises(ValueError, match="every task"):
         held_out(["3"], [f"task {number}" for number in range(20)], recorded=True)
+
+
+def test_instructions_of_a_task_are_held_out_alike():
+    phrases = ["red", "blue"] * 25
+    for number in ("0.1", "8", "20"):
+        chosen = held_out((number,), ["desk"] * 50, phrases, recorded=True)
+        counts = [sum(phrases[n] == phrase for n in chosen) for phrase in ("red", "blue")]
+        assert abs(counts[0] - counts[1]) <= 1, chosen
+
+
+def test_an_instruction_keeps_an_episode_while_others_have_more():
+    phrases = ["red"] * 9 + ["blue"]
+    for count in range(1, 9):
+        assert 9 not in held_out((str(count),), ["desk"] * 10, phrases, recorded=True)
+    unique = [str(number) for number in range(10)]
+    assert len(held_out(("3",), ["desk"] * 10, unique, recorded=True)) == 3

@@ -147,9 +147,15 @@ def test_units(recorded):
     found = windows(LeRobot(golden("v3")), OUT, recorded.policy, every=10)
     assert found.units[0] == ("joint_1 [°]", pytest.approx(180 / np.pi))
     assert found.units[-1] == ("gripper [mm]", 1000)
-    for scale in (np.array([60.0] * 6 + [1]), np.array([1.0] * 6 + [500])):
-        raw = dataclasses.replace(found.raw, actions=found.raw.actions * scale)
-        assert dataclasses.replace(found, raw=raw).units[0] == ("joint_1", 1)
+    joint, gripper = found.units[0], found.units[-1]
+    for scale, shown in (
+        ([60.0] * 6 + [1], [("joint_1", 1), gripper]),
+        ([1.0] * 6 + [500], [joint, ("gripper", 1)]),
+        ([60.0] * 6 + [500], [("joint_1", 1), ("gripper", 1)]),
+    ):
+        raw = dataclasses.replace(found.raw, actions=found.raw.actions * np.array(scale))
+        units = dataclasses.replace(found, raw=raw).units
+        assert [units[0], units[-1]] == shown
     unnamed = dataclasses.replace(found, names=())
     raw = dataclasses.replace(found.raw, actions=found.raw.actions[..., 1:])
     shorter = dataclasses.replace(unnamed, raw=raw, targets=False, grippers=(5,))

@@ -51,6 +51,7 @@ def test_prepare(tmp_path, monkeypatch):
     slots = [slot for slot, _ in run.policy.processor.cameras]
     summary = f"cameras: side -> {slots[0]}, wrist -> {slots[1]}; resized to "
     assert summary in run.console.file.getvalue()
+    assert "named like a wrist camera" not in run.console.file.getvalue()
     expected = flatten([group])
     for name in ("state", "action", "end", "instruction"):
         np.testing.assert_array_equal(getattr(run.steps, name), getattr(expected, name))
@@ -62,6 +63,14 @@ def test_prepare(tmp_path, monkeypatch):
     (tmp_path / "dataset.json").unlink()
     assert prepare(tmp_path, monkeypatch, "removed, but cached", small // 64).streams
     assert prepare(tmp_path, monkeypatch, "removed, but cached", small).streams  # as at the start
+
+
+def test_a_wrist_camera_in_the_place_of_another_is_noticed(tmp_path, monkeypatch):
+    group = random_episodes("press", 0)
+    image = {"hand": group.image["wrist"], "top": group.image["side"]}
+    rlds.write(dataclasses.replace(group, image=image), tmp_path / "rlds")
+    run = prepare(tmp_path, monkeypatch, tmp_path / "rlds")
+    assert "hand is named like a wrist camera" in run.console.file.getvalue()
 
 
 def test_actions_of_a_recording_may_be_shorter_than_its_states(tmp_path, monkeypatch):
