@@ -1,7 +1,7 @@
 """Success of a policy as recorded, and in a scene that was shifted."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import envs
@@ -28,7 +28,7 @@ DISTRACTORS = 2
 """Unrelated objects on the table of the shifted scene."""
 
 
-def judge(run: Run) -> dict[str, Any]:
+def judge(run: Run, scenes: Iterable[str] = SCENES) -> dict[str, Any]:
     """Return the outcomes of the policy by scene and task, such as "shifted/pour".
 
     Both scenes have layouts that no demonstration has; policies of one seed share them.
@@ -45,7 +45,7 @@ def judge(run: Run) -> dict[str, Any]:
         result = evaluate(policy, env, key, settings.episodes, rollout=rollout)
         return "".join("01"[succeeded] for succeeded in result.outcomes)
 
-    cases = [(scene, task) for scene in SCENES for task in run.config.tasks]
+    cases = [(scene, task) for scene in scenes for task in run.config.tasks]
     # Warp is not thread-safe.
     run_all = map if physics.default_backend() == "warp" else map_threads
     found = run_all(one, cases)

@@ -93,6 +93,9 @@ _SMOKE = Scale(
 )
 
 
+_pilot = functools.partial(judge, scenes=("recorded",))
+
+
 def get_study(scale: str) -> Study:
     """Return the study; scale smoke only shows that all of it runs."""
     chosen = {"accelerator": _ACCELERATOR, "smoke": _SMOKE}[scale]
@@ -109,7 +112,7 @@ def _cells(scale: Scale, backbone: str) -> Iterator[Cell]:
             for name in _pilots(backbone, method):
                 rate = float(name.rpartition("/")[2])
                 config = make(method, scale.pilot_count, PILOT_SEED, rate=rate)
-                yield Cell(name, config, (), f"{backbone}/{method}", evaluate=judge, pool=pool)
+                yield Cell(name, config, (), f"{backbone}/{method}", evaluate=_pilot, pool=pool)
     kinds = [(m, a, scale.counts, {"augment": a}) for m in METHODS for a in page.AUGMENT]
     kinds += [(page.STEPPED, f"steps{n}", scale.stepped, {"steps": n}) for n in page.OTHER_STEPS]
     for seed in scale.seeds:
