@@ -84,7 +84,7 @@ def write_report(folder: Path) -> Path:
             ("phase", "seconds"), ((k, f"{v:.1f}") for k, v in phases(results["seconds"]).items())
         ),
         "<h2>Settings</h2>",
-        f"<pre>{html.escape(json.dumps(config, indent=2))}</pre>",
+        f"<pre>{html.escape(json.dumps(_used(config), indent=2))}</pre>",
     ]
     page = (
         "<!doctype html><html lang=en><meta charset=utf-8>"
@@ -170,6 +170,12 @@ def _held_out(folder: Path, rows: figures.Rows) -> Iterable[str]:
     for picture in sorted(folder.glob("held_out_*.png")):
         data = base64.b64encode(read_bytes(picture, folder)).decode()
         yield f'<img alt="recorded and predicted joints" src="data:image/png;base64,{data}">'
+
+
+def _used(config: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings without those that a dataset replaces."""
+    replaced = ("robot", "tasks") if config["data"]["source"] else ()
+    return {name: value for name, value in config.items() if name not in replaced}
 
 
 def held_out_verdict(rows: figures.Rows) -> str:

@@ -1,5 +1,6 @@
 """The report is self-contained and needs only the files of a run folder."""
 
+import dataclasses
 import json
 import re
 
@@ -77,6 +78,15 @@ def test_run_without_evaluation_of_the_base(folder):
     assert "before" not in page.partition("<h2>Settings")[0]
     assert "<tr><th>task</th><th>after</th></tr>" in page
     assert "75.0 % [63.2, 84.0] of 64" in page
+
+
+@pytest.mark.parametrize("source", ["", "recordings"])
+def test_settings_that_a_dataset_replaces_are_not_shown(folder, source):
+    data = dataclasses.replace(CONFIG.data, source=(source,))
+    write_json(folder / "config.json", to_json(dataclasses.replace(CONFIG, data=data)))
+    settings = write_report(folder).read_text().partition("<h2>Settings")[2]
+    for name in ("tasks", "robot"):
+        assert (f"&quot;{name}&quot;" in settings) == (not source)
 
 
 def test_stopped_run_shows_the_reason(folder):
