@@ -1,5 +1,6 @@
 """The tables of README.md, from the results of all policies alone."""
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -33,8 +34,13 @@ DRAWS = 2_000
 
 
 def cell(backbone: str, method: str, kind: str, count: int, seed: int) -> str:
-    """Return the name of a policy; `kind` is a preset of augmentation or the number of steps."""
+    """Return the name of a policy; see `kind`."""
     return f"{backbone}/{method}/{kind}/n{count}/s{seed}"
+
+
+def kind(augment: str, steps: int) -> str:
+    """Return the part of a name that says the augmentation and, unless usual, the steps."""
+    return augment if steps == STEPS else f"{augment}_{steps}"
 
 
 def success(result: Mapping[str, Any], scene: str = "recorded") -> float:
@@ -75,18 +81,18 @@ def _success_table(points: Mapping[Any, Any], backbone: str, scene: str) -> str:
 
 
 def _steps_table(results: Results, backbone: str) -> str:
-    """Return success and held-out error of `STEPPED` by number of steps."""
-    kinds = {OTHER_STEPS[0]: "", STEPS: "none", OTHER_STEPS[1]: ""}
+    """Return success and held-out error of `STEPPED` by augmentation and number of steps."""
+    lengths = sorted((STEPS, *OTHER_STEPS))
     rows = []
-    for n in STEPPED_COUNTS:
+    for augment, n in itertools.product(AUGMENT, STEPPED_COUNTS):
         cells = []
-        for steps, kind in kinds.items():
-            at = backbone, STEPPED, kind or f"steps{steps}", n
+        for steps in lengths:
+            at = backbone, STEPPED, kind(augment, steps), n
             errors = [results[cell(*at, seed)]["action_error"] for seed in SEEDS]
             shown = page.percent(_estimate(results, *at, "recorded"))
             cells.append(f"{shown}; {np.mean(errors):.3f}")
-        rows.append([f"{n}", *cells])
-    head = [f"{BACKBONES[backbone]}, N", *(f"{steps:,} steps" for steps in kinds)]
+        rows.append([AUGMENT[augment], f"{n}", *cells])
+    head = [f"{BACKBONES[backbone]}: augmentation", "N", *(f"{n:,} steps" for n in lengths)]
     return page.table(head, rows)
 
 

@@ -4,7 +4,7 @@
         --results studies.few/results.json --jobs 8
 
 Every policy learns four tasks from N demonstrations of each, which each seed draws from the same
-512. All train for as many steps, whatever N; one method also trains shorter and longer. Backbones
+512. All train for as many steps, whatever N; one method also trains for other numbers. Backbones
 and methods have the better of two learning rates, chosen at N = 50 with a seed that no table uses.
 """
 
@@ -114,7 +114,11 @@ def _cells(scale: Scale, backbone: str) -> Iterator[Cell]:
                 config = make(method, scale.pilot_count, PILOT_SEED, rate=rate)
                 yield Cell(name, config, (), f"{backbone}/{method}", evaluate=_pilot, pool=pool)
     kinds = [(m, a, scale.counts, {"augment": a}) for m in METHODS for a in page.AUGMENT]
-    kinds += [(page.STEPPED, f"steps{n}", scale.stepped, {"steps": n}) for n in page.OTHER_STEPS]
+    kinds += [
+        (page.STEPPED, page.kind(a, n), scale.stepped, {"augment": a, "steps": n})
+        for a in page.AUGMENT
+        for n in page.OTHER_STEPS
+    ]
     for seed in scale.seeds:
         for method, kind, counts, changes in kinds:
             pilots = _pilots(backbone, method)
