@@ -1,7 +1,7 @@
 """How many demonstrations, which method? Success as recorded and in a shifted scene.
 
-    lorasp-jax study --config studies.few/study.py \\
-        --results studies.few/results.json --jobs 8
+    lorasp-jax study --config studies/few/study.py \\
+        --results studies/few/results.json --jobs 8
 
 Every policy learns four tasks from N demonstrations of each, which each seed draws from the same
 512. All train for as many steps, whatever N; one method also trains for other numbers. Backbones
