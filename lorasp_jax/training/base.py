@@ -68,9 +68,9 @@ def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str
             raise ValueError(
                 f"--model.openpi-config is for checkpoints of openpi, and {options.source} is none"
             )
-        inputs = checkpoint.inputs or model_config.inputs
+        model_config = _as_recorded(options, model_config, checkpoint)
         with jax.default_device(_host()) if options.base_dtype else contextlib.nullcontext():
-            model = checkpoint.load(dataclasses.replace(model_config, inputs=inputs))
+            model = checkpoint.load(model_config)
         # Actions of recordings may mean anything, and a base can learn another period from them.
         if checkpoint.layout == "ours" and not config.data.source:
             _check_control_dt(checkpoint.folder, config.control_dt)
@@ -107,6 +107,20 @@ def _as_trained(
             file=sys.stderr,
         )
     return config
+
+
+def _as_recorded(
+    options: ModelConfig, config: BackboneConfig, checkpoint: loading.ModelFolder
+) -> BackboneConfig:
+    """Return the config with inputs and chunk of a LeRobot policy's files; print the chunk."""
+    chunk = checkpoint.chunk or config.chunk
+    if checkpoint.chunk and not options.chunk:
+        print(
+            f"{options.source} was trained with chunks of {chunk}, as its config.json says: "
+            "--model.chunk chooses another length",
+            file=sys.stderr,
+        )
+    return dataclasses.replace(config, inputs=checkpoint.inputs or config.inputs, chunk=chunk)
 
 
 def _host() -> Any:
