@@ -110,12 +110,7 @@ def _lower(run: Run, built: setup.RunSetup, batches: Any) -> Any:
     )
     shardings = meshes.shardings(state, mesh)
     frozen = program.Frozen(frozen, _blank_processor(config, built).shared())
-    frozen = jax.tree.map(_with_sharding, frozen, meshes.shardings(frozen, mesh))
-    state = jax.tree.map(_with_sharding, state, shardings)
+    frozen = jax.tree.map(meshes.with_sharding, frozen, meshes.shardings(frozen, mesh))
+    state = jax.tree.map(meshes.with_sharding, state, shardings)
     steps = program.jit_steps(run, graphdef, optimizer, shardings)
     return steps.lower(frozen, batches, state, jax.random.key(0))
-
-
-def _with_sharding(tree: Any, sharding: jax.sharding.Sharding) -> Any:
-    shape = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)  # noqa: E731
-    return jax.tree.map(shape, tree)
