@@ -75,10 +75,13 @@ def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str
         if checkpoint.layout == "ours" and not config.data.source:
             _check_control_dt(checkpoint.folder, config.control_dt)
     else:
-        key = RandomStream.BASE.key(config.seed)
-        make = functools.partial(model_config.create, nnx.Rngs(key))
+        make = functools.partial(_random, model_config, config.seed)
     model = on_host(make) if options.base_dtype else make()
     return model, models.weights_hash(model)
+
+
+def _random(config: BackboneConfig, seed: int) -> Backbone:
+    return config.create(nnx.Rngs(RandomStream.BASE.key(seed)))
 
 
 def _as_trained(
