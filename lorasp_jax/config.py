@@ -56,7 +56,7 @@ class ModelConfig:
     max_tokens: int = 0
     """Maximum instruction length [tokens]; 0: the default of the model size."""
     chunk: int = 0
-    """Actions per predicted chunk; 0: the default of the model size. No parameter depends on it."""
+    """Actions per predicted chunk; 0: as the checkpoint says, or the model size's default."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Compute dtype of matrix products."""
     param_dtype: Literal["float32", "bfloat16"] = "float32"

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 
 from lorasp_jax.adapters import paths
@@ -207,7 +208,11 @@ def attach(
         [p for p in paths.locate(nnx.List([layer]), AdapterParam) if p.name != "adapter"], nnx.Param
     )
     init = layer.adapter_init(method)
-    params, kernel = init_stack(key, init, layer.kernel_matrices(), statistics)
+    kernel: Any = layer.kernel_matrices()
+    if method.splits_kernel and isinstance(kernel, np.ndarray):
+        params, kernel = _split_on_host(key, init, kernel)
+    else:
+        params, kernel = init_stack(key, init, kernel, statistics)
     layer.method = method
     if method.splits_kernel:
         layer.set_kernel_matrices(kernel)
@@ -305,6 +310,22 @@ def init_stack(
     each = jax.vmap(lambda key, kernel, moment: init(key, kernel, statistics=moment))
     stacked = each(keys, kernel.reshape(-1, d_in, d_out), statistics)
     return jax.tree.map(lambda leaf: leaf.reshape(*leading, *leaf.shape[1:]), stacked)
+
+
+def _split_on_host(
+    key: jax.Array, init: Callable[..., Any], kernel: np.ndarray
+) -> tuple[Params, np.ndarray]:
+    """Like `init_stack`, but leave the residual kernel in host memory, where the kernel is.
+
+    The device, which may not hold the base unquantized, has one matrix at a time.
+    """
+    matrices = kernel.reshape(-1, *kernel.shape[-2:])
+    keys = jax.random.split(key, len(matrices))
+    pairs = zip(keys, matrices, strict=True)
+    results = [jax.device_get(init(k, matrix)) for k, matrix in pairs]
+    stack = lambda *x: np.stack(x).reshape(*kernel.shape[:-2], *x[0].shape)  # noqa: E731
+    params, residual = jax.tree.map(stack, *results)
+    return jax.tree.map(jnp.asarray, params), residual
 
 
 def over_stack(function: Callable[..., Any], kernel: jax.Array) -> Callable[..., Any]:

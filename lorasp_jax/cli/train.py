@@ -7,7 +7,7 @@ import shlex
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
@@ -64,24 +64,24 @@ def _execute(command: "Command", console: Console, started: float) -> None:
     from lorasp_jax.training.distributed import processes
     from lorasp_jax.training.run_folder import open_run
 
-    folder = RUNS / command.config.name
+    folder, budget = RUNS / command.config.name, None
     if command.fit:
         from lorasp_jax.training.cost import fit
 
         config = fit.resumed(command.config, command.given, folder) if command.resume else None
         chosen = config or fit.fitted(command.config, command.fit, command.given, folder, console)
-        command = dataclasses.replace(command, config=chosen)
+        command, budget = dataclasses.replace(command, config=chosen), fit.budget(command.fit)
     if command.dry_run:
         from lorasp_jax.training.cost.dry_run import dry_run
 
-        dry_run(command.config, folder, console)
+        dry_run(command.config, folder, console, budget)
         return
     with contextlib.ExitStack() as stack:
         with processes.together():
             if processes.is_first():
                 stack.enter_context(open_run(command.config, RUNS, resume=command.resume))
         if not (command.resume and (folder / "results.json").exists()):
-            run(command, folder, console, started)
+            run(command, folder, console, started, budget)
         elif processes.is_first():
             from lorasp_jax.report.html import write_report
 
@@ -96,8 +96,13 @@ def resume_command(arguments: Sequence[str], program: str) -> str:
     return f"{program} {shlex.join([*arguments, *mode])}"
 
 
-def run(command: "Command", folder: Path, console: Console, started: float) -> None:
-    """Evaluate, train, evaluate again, export the policy and write the report."""
+def run(
+    command: "Command", folder: Path, console: Console, started: float, budget: float | None = None
+) -> None:
+    """Evaluate, train, evaluate again, export the policy and write the report.
+
+    For `budget` see `setup.build`.
+    """
     import jax
 
     from lorasp_jax.evaluation.callback import Evaluation, NoEvaluation
@@ -117,7 +122,8 @@ def run(command: "Command", folder: Path, console: Console, started: float) -> N
         evaluation = Evaluation()
         several = jax.process_count() > 1  # they compile together, and one collects first
         meanwhile = () if several else (early.compile_training, evaluation.compile_early)
-        training_run = setup.prepare(command.config, folder, console, started, meanwhile=meanwhile)
+        options: Any = {"meanwhile": meanwhile, "budget": budget}
+        training_run = setup.prepare(command.config, folder, console, started, **options)
         judge = evaluation if training_run.simulated else NoEvaluation()
         callbacks = [Validation(), Export(), judge, Report(), *callbacks]
         first = processes.is_first()

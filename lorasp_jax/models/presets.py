@@ -51,7 +51,9 @@ RECIPES: dict[str, tuple[tuple[str, Method], ...]] = {
         ("vision", _FULL),
         ("projections", _FULL),
     ),
-    # The defaults of MolmoAct2 in LeRobot (policies/molmoact2).
+    # Rank, alpha and dropout of MolmoAct2 in LeRobot (policies/molmoact2/configuration_molmoact2.py
+    # at 7427f31), whose action expert trains in full and whose embeddings are frozen. There, A is
+    # from N(0, 1/R^2), and all learning rates are 5e-5.
     "vlm-lora+expert-full": (
         ("vision", _MOLMOACT),
         ("language", _MOLMOACT),

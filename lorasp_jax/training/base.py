@@ -1,9 +1,10 @@
 """The frozen base of a run: loaded from a checkpoint or randomly initialized."""
 
-import contextlib
 import dataclasses
+import functools
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -68,18 +69,19 @@ def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str
             raise ValueError(
                 f"--model.openpi-config is for checkpoints of openpi, and {options.source} is none"
             )
-        inputs = checkpoint.inputs or model_config.inputs
-        with jax.default_device(_host()) if options.base_dtype else contextlib.nullcontext():
-            model = checkpoint.load(dataclasses.replace(model_config, inputs=inputs))
+        model_config = _as_recorded(options, model_config, checkpoint)
+        make = functools.partial(checkpoint.load, model_config)
         # Actions of recordings may mean anything, and a base can learn another period from them.
         if checkpoint.layout == "ours" and not config.data.source:
             _check_control_dt(checkpoint.folder, config.control_dt)
     else:
-        model = model_config.create(nnx.Rngs(RandomStream.BASE.key(config.seed)))
-    if options.base_dtype:
-        graphdef, state = nnx.split(model)
-        model = nnx.merge(graphdef, jax.tree.map(np.asarray, state))
+        make = functools.partial(_random, model_config, config.seed)
+    model = on_host(make) if options.base_dtype else make()
     return model, models.weights_hash(model)
+
+
+def _random(config: BackboneConfig, seed: int) -> Backbone:
+    return config.create(nnx.Rngs(RandomStream.BASE.key(seed)))
 
 
 def _as_trained(
@@ -109,16 +111,37 @@ def _as_trained(
     return config
 
 
-def _host() -> Any:
-    """Return the CPU as a JAX device; raise ValueError if JAX_PLATFORMS leaves it out."""
+def _as_recorded(
+    options: ModelConfig, config: BackboneConfig, checkpoint: loading.ModelFolder
+) -> BackboneConfig:
+    """Return the config with inputs and chunk of a LeRobot policy's files; print the chunk."""
+    chunk = checkpoint.chunk or config.chunk
+    if checkpoint.chunk and not options.chunk:
+        print(
+            f"{options.source} was trained with chunks of {chunk}, as its config.json says: "
+            "--model.chunk chooses another length",
+            file=sys.stderr,
+        )
+    return dataclasses.replace(config, inputs=checkpoint.inputs or config.inputs, chunk=chunk)
+
+
+def on_host(make: Callable[[], Backbone]) -> Backbone:
+    """Return the model that `make` loads or creates, as NumPy arrays, for `quantized`.
+
+    Raises:
+        ValueError: JAX_PLATFORMS leaves out the CPU.
+    """
     try:
-        return jax.local_devices(backend="cpu")[0]
+        host = jax.local_devices(backend="cpu")[0]
     except RuntimeError as error:
         platforms = jax.config.jax_platforms  # type: ignore[attr-defined]
         raise ValueError(
-            f"model.base_dtype quantizes the base from host memory, which JAX_PLATFORMS={platforms}"
-            f" leaves out: set JAX_PLATFORMS={platforms},cpu"
+            f"the base is quantized from host memory, which JAX_PLATFORMS={platforms} leaves out: "
+            f"set JAX_PLATFORMS={platforms},cpu"
         ) from error
+    with jax.default_device(host):
+        graphdef, state = nnx.split(make())
+    return nnx.merge(graphdef, jax.tree.map(np.asarray, state))
 
 
 def sized(name: str, size: str) -> BackboneConfig:

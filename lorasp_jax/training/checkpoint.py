@@ -41,6 +41,11 @@ class Checkpoints:
         self._manager = ocp.CheckpointManager(self._folder, options=options)
         self._base_hash, self._console = base_hash, console
 
+    @property
+    def has_any(self) -> bool:
+        """Whether there is a complete checkpoint; it may be corrupt."""
+        return bool(self._manager.all_steps())
+
     def save(self, state: TrainState) -> None:
         """Save `state` asynchronously.
 
@@ -63,7 +68,7 @@ class Checkpoints:
         """Restore the newest intact checkpoint; return None if there are no checkpoints.
 
         Newer corrupt checkpoints are renamed and incomplete ones removed, with a warning for each.
-        `like` has the structure, dtypes and shardings of the result.
+        `like` has the structure, dtypes and shardings of the result; shapes will do.
 
         Raises:
             ValueError: all checkpoints are corrupt, or one belongs to a different base.

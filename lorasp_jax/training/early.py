@@ -52,7 +52,7 @@ def data_shapes(run: Run, built: setup.RunSetup) -> tuple[int, Any]:
     """Return the bytes of the dataset and the shapes of a call's batches.
 
     A streamed dataset has 0 bytes on the device. Without a dataset, all demonstrations are assumed
-    to have the maximum length.
+    to have the maximum length; with `data.fresh_every`, there are two generations of them.
     """
     config, source = run.config, built.source
     limits = sum(env.max_steps for env in built.environments)
@@ -65,7 +65,7 @@ def data_shapes(run: Run, built: setup.RunSetup) -> tuple[int, Any]:
     drawn = DrawnBatches(steps, mesh, size, built.base.config.chunk)
     if source is None or nbytes(steps) <= built.free_bytes:
         call_size = drawn.call_size(min(config.log_every, config.optim.steps))
-        return nbytes(steps), drawn.shapes(call_size)
+        return nbytes(steps) * (2 if config.data.fresh_every else 1), drawn.shapes(call_size)
     return 0, drawn.shapes(1)
 
 
@@ -110,12 +110,7 @@ def _lower(run: Run, built: setup.RunSetup, batches: Any) -> Any:
     )
     shardings = meshes.shardings(state, mesh)
     frozen = program.Frozen(frozen, _blank_processor(config, built).shared())
-    frozen = jax.tree.map(_with_sharding, frozen, meshes.shardings(frozen, mesh))
-    state = jax.tree.map(_with_sharding, state, shardings)
+    frozen = jax.tree.map(meshes.with_sharding, frozen, meshes.shardings(frozen, mesh))
+    state = jax.tree.map(meshes.with_sharding, state, shardings)
     steps = program.jit_steps(run, graphdef, optimizer, shardings)
     return steps.lower(frozen, batches, state, jax.random.key(0))
-
-
-def _with_sharding(tree: Any, sharding: jax.sharding.Sharding) -> Any:
-    shape = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)  # noqa: E731
-    return jax.tree.map(shape, tree)

@@ -1,6 +1,7 @@
 """Export the trained policy of a run, as adapters or as a full base, and load it again."""
 
 import dataclasses
+import functools
 import json
 import os
 from collections.abc import Mapping
@@ -9,6 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from flax import nnx
 
 from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
@@ -23,7 +25,7 @@ from lorasp_jax.policies.processor import Processor
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.statistics import Statistics
 from lorasp_jax.training import rules
-from lorasp_jax.training.base import TRAINING, quantized
+from lorasp_jax.training.base import TRAINING, on_host, quantized
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import read_json, write_json
 
@@ -126,7 +128,7 @@ def load_policy(
     any_base: bool = False,
     dataset: str = "",
 ) -> Policy:
-    """Load the policy of a finished run.
+    """Load the policy of a finished run, with a base quantized as in training.
 
     Args:
         folder: folder of the run.
@@ -157,13 +159,15 @@ def load_policy(
     if not source:
         raise ValueError(f"the base of {folder} was randomly initialized and not saved")
     try:
-        model = models.load(source, config)
+        load = functools.partial(models.load, source, config)
+        model = on_host(load) if metadata.get(QUANTIZED) else load()
     except ValueError as error:
         hint = "" if is_full else f"; pass base= if the base of {folder} has moved"
         raise ValueError(f"{error}{hint}") from error
     if not is_full:
         model = native.load_adapters(folder, model, any_base=any_base)
-    model = quantized(model, metadata.get(QUANTIZED))
+    graphdef, state = nnx.split(quantized(model, metadata.get(QUANTIZED)))
+    model = nnx.merge(graphdef, jax.tree.map(jnp.asarray, state))  # also adapters from the host
     try:
         if dataset:
             policy = policy | policy["datasets"][dataset]

@@ -1,6 +1,7 @@
 """The training loop: resume, train, log, save. Evaluation and reports are callbacks."""
 
 import contextlib
+import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -48,11 +49,13 @@ def train(
         RunError: too many consecutive steps were skipped, or an update was non-finite.
         KeyboardInterrupt: a signal stopped the run; without a second one, the state is saved first.
     """
-    state, policy, make_program = _split(run)
-    run.policy = policy(state)
+    shapes, initial, policy, make_program = _split(run)
     checkpoints = Checkpoints(run.folder, run.base_hash, run.console)
-    restored = checkpoints.restore(state) if resume else None
-    state = restored or state
+    if resume and checkpoints.has_any:
+        run.policy = policy(shapes)  # the device may not hold another state beside the restored one
+    restored = checkpoints.restore(shapes) if resume else None
+    state = restored or initial()
+    run.policy = policy(state)
     program = make_program(int(state.step), collect)
     if restored is None:
         program.compile(state, _log_interval(run.config, int(state.step)))  # in the background
@@ -72,23 +75,29 @@ def train(
 
 def _split(
     run: Run,
-) -> tuple[TrainState, Callable[[TrainState], Policy], Callable[[int, CollectGeneration], Program]]:
-    """Place the run on its devices.
+) -> tuple[TrainState, Callable[[], TrainState], Callable[..., Policy], Callable[..., Program]]:
+    """Place the frozen part of the run on its devices.
 
     Returns:
-        The initial state, a function that returns the policy of a state, and one that creates the
-        program that trains from a step on.
+        The shapes and shardings of its state, and functions: to the initial state, which has the
+        adapters of `run.policy`; from a state to its policy; and from a step to the program that
+        trains from there on.
     """
     graphdef, adapters, parameters = adaptation.split(run.policy.model)
     methods = adaptation.methods(run.policy.model).values()
     optimizer = make_optimizer(run.config.optim, methods)
-    state = init_state(adapters, optimizer, ema=run.config.optim.ema > 0)
+    init = functools.partial(init_state, optimizer=optimizer, ema=run.config.optim.ema > 0)
+    shapes = jax.eval_shape(init, adapters)
     mesh = meshes.make_mesh(run.config.fsdp, run.devices)
-    shardings = meshes.shardings(state, mesh)
-    state = processes.device_put(state, shardings)
+    shardings = meshes.shardings(shapes, mesh)
+    shapes = jax.tree.map(meshes.with_sharding, shapes, shardings)
     processor = run.policy.processor
     frozen = Frozen(parameters, processor.shared())
     frozen = processes.device_put(frozen, meshes.shardings(frozen, mesh))
+
+    def initial() -> TrainState:
+        adapters = adaptation.split(run.policy.model)[1]
+        return processes.device_put(init(adapters), shardings)
 
     def policy(state: TrainState) -> Policy:
         return Policy(nnx.merge(graphdef, state.eval_adapters, frozen.parameters), processor)
@@ -98,7 +107,7 @@ def _split(
         batches = make_batches(run, mesh, start, collect, speed)
         return Program(jit_steps(run, graphdef, optimizer, shardings), frozen, batches, speed)
 
-    return state, policy, make_program
+    return shapes, initial, policy, make_program
 
 
 def _call(callbacks: Sequence[Callback], run: Run, hook: str) -> None:

@@ -64,6 +64,7 @@ class RunSetup:
         source: the dataset; None if the expert collects demonstrations.
         memory: estimate for one step.
         available: device memory [bytes].
+        free_bytes: device memory that training and evaluating leave for the dataset [bytes].
     """
 
     base: Backbone
@@ -75,19 +76,18 @@ class RunSetup:
     source: Source | None
     memory: preflight.Memory
     available: float
-
-    @property
-    def free_bytes(self) -> float:
-        """Device memory that a training step leaves free [bytes]."""
-        return self.available - self.memory.peak
+    free_bytes: float
 
 
-def build(config: Config, folder: Path, *, abstract: bool = False) -> RunSetup:
+def build(
+    config: Config, folder: Path, *, abstract: bool = False, budget: float | None = None
+) -> RunSetup:
     """Load or create the base and attach the adapters, without writing to `folder`.
 
     This validates the config before any long-running work. With `abstract`, for a dry run, the
     adapted model has only shapes. A remote dataset is then still downloaded, but not a remote base
-    or tokenizer; the bundled tokenizer is used instead.
+    or tokenizer; the bundled tokenizer is used instead. `budget` is the memory that the run should
+    need at most, with its dataset [bytes]; None: that of the device.
 
     Raises:
         ValueError: an unknown task, robot, backbone or size, an incompatible base or tokenizer, a
@@ -113,14 +113,17 @@ def build(config: Config, folder: Path, *, abstract: bool = False) -> RunSetup:
     available = preflight.available_bytes()
     remat, memory = preflight.choose_remat(config, base.config, available)
     base = with_config(base, remat=remat)
+    free_bytes = available - memory.peak
+    if budget is not None:
+        evaluating = preflight.sampling_peak(config, base.config)
+        free_bytes = min(available, budget) - max(memory.peak, evaluating)
     model = (
         preflight.abstract_model(config, base.config)
         if abstract
         else _adapt(config, base, rules.rules(config, as_saved=True))
     )
-    return RunSetup(
-        base, base_hash, model, prompts, joints, environments, source, memory, available
-    )
+    found = (base, base_hash, model, prompts, joints, environments, source)
+    return RunSetup(*found, memory, available, free_bytes)
 
 
 def prepare(
@@ -131,6 +134,7 @@ def prepare(
     *,
     collect: Collect = demonstrations,
     meanwhile: Sequence[Meanwhile] = (),
+    budget: float | None = None,
 ) -> Run:
     """Build a run and load or collect its demonstrations.
 
@@ -138,11 +142,12 @@ def prepare(
         started: `time.perf_counter()` when this process started.
         meanwhile: functions that compile what the run needs next, in threads of their own until
             the demonstrations are there. Their errors are raised here.
+        budget: see `build`.
 
     Raises:
         ValueError: see `build`; also if the dataset cannot be read or the expert fails.
     """
-    built = build(config, folder)
+    built = build(config, folder, budget=budget)
     base, model = built.base, built.model
     processes.agree("base models", {"base": built.base_hash, "remat": base.config.remat})
     console.print(headline(config, model))

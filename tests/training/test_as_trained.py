@@ -93,6 +93,31 @@ def test_nothing_is_assumed_in_silence(tmp_path, capsys):
 
 
 @pytest.mark.usefixtures("weightless")
+@pytest.mark.parametrize(
+    ("fields", "backbone", "size"),
+    [
+        ({"type": "smolvla"}, "smolvla", "base"),
+        ({"type": "pi0"}, "pi0", "base"),
+        ({"type": "pi05"}, "pi0", "base_pi05"),
+    ],
+)
+def test_a_policy_of_lerobot_is_trained_with_its_chunk(fields, backbone, size, tmp_path, capsys):
+    def chunk(fields, *options):
+        (tmp_path / "config.json").write_text(json.dumps(fields))
+        return found(tmp_path, "--model.backbone", backbone, *options, size=size).chunk
+
+    (tmp_path / "model.safetensors").write_bytes(b"")
+    recorded = fields | {"chunk_size": 13, "n_action_steps": 7}
+    assert chunk(recorded) == 13
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1
+    assert all(text in line for text in (str(tmp_path), "chunks of 13", "--model.chunk"))
+    chunk(recorded, "--model.chunk", "6")  # `setup.build` takes what is given
+    assert chunk(fields) == 50
+    assert not capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("weightless")
 def test_configs_that_do_not_fit_are_refused(tmp_path):
     folder = folder_of_openpi(tmp_path / "pi05_libero")
     with pytest.raises(ValueError, match=r"of pi0\.5: .* base_pi05"):

@@ -194,7 +194,7 @@ def test_shapes_known_before_are_those_of_the_run(run, sources, tmp_path, monkey
         source = dataset.open_dataset(run.config, Pi0Config.dummy(), folder)
         built = setup.RunSetup(
             *(run.policy.model, "", run.policy.model, run.policy.processor.prompts, 6, (), source),
-            *(setup.preflight.Memory(*6 * [0.0]), 2.0**40),
+            *(setup.preflight.Memory(*6 * [0.0]), 2.0**40, 2.0**40),
         )
         blank = early._blank_processor(run.config, built)
         assert jax.tree.structure(blank) == jax.tree.structure(run.policy.processor)
@@ -345,6 +345,7 @@ def test_a_run_that_replays_tasks_of_its_base_is_compiled_to_fit(tmp_path, monke
     monkeypatch.setattr(fit, "ranked", lambda *_: iter([(REPLAY, 0.0)]))
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(fit, "planned_bytes", lambda _: {})
-    monkeypatch.setattr(fit, "compile_step", lambda config, *_: seen.append(config) or [None])
+    step = None, 0, lambda: None
+    monkeypatch.setattr(fit, "plan_step", lambda config, *_: seen.append(config) or step)
     assert fit.fitted(REPLAY, "8GB", (), tmp_path, Console(quiet=True)) is REPLAY
     assert replayed_tasks(seen[0]) == ()

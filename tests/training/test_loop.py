@@ -1,6 +1,7 @@
 """Runs: frozen stays frozen, resume is exact, a non-finite update stops the run."""
 
 import dataclasses
+import gc
 import os
 import signal
 
@@ -11,9 +12,9 @@ from rich.progress import Progress
 
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import AugmentConfig, DataConfig
-from lorasp_jax.data.batches import flatten
+from lorasp_jax.data.batches import flatten, nbytes
 from lorasp_jax.peft import LoRA
-from lorasp_jax.training import loop
+from lorasp_jax.training import checkpoint, loop
 from lorasp_jax.training.loop import RunError, train
 from lorasp_jax.training.run import Callback
 from lorasp_jax.training.run_folder import read_metrics
@@ -111,6 +112,29 @@ def test_resume_is_bit_exact_and_frozen_stays_frozen(streams, tmp_path):
     halved.base_hash = "hash of another base"
     with pytest.raises(ValueError, match="trained on a different base"):
         train(halved, resume=True)
+
+
+def test_resuming_takes_the_place_of_the_initial_state(tmp_path, monkeypatch):
+    """The device never holds two states: that is what a small GPU has no room for."""
+
+    def held():
+        gc.collect()
+        return sum(x.nbytes for x in jax.live_arrays())
+
+    train(quick_run(tmp_path / "run"))
+    run, found, compute = quick_run(tmp_path / "run"), [], checkpoint.digest
+    adapters = nbytes(adaptation.split(run.policy.model)[1])
+    before = held() - adapters
+
+    def digest(state, *arguments):
+        found.append((held() - before, nbytes(state)))
+        return compute(state, *arguments)
+
+    monkeypatch.setattr(checkpoint, "digest", digest)
+    train(run, resume=True)
+    ((restoring, state),) = found
+    assert state > 3 * adapters  # with moments and an average
+    assert restoring < state + 0.5 * adapters
 
 
 @pytest.mark.slow

@@ -1,6 +1,8 @@
 """Runs built from a config, including adapters initialized from the demonstrations."""
 
+import contextlib
 import dataclasses
+import gc
 import io
 import json
 import time
@@ -15,6 +17,7 @@ from rich.console import Console
 
 from lorasp_jax import models
 from lorasp_jax.adapters import adaptation, paths
+from lorasp_jax.adapters.compress import quantization
 from lorasp_jax.config import DataConfig, ModelConfig
 from lorasp_jax.data.batches import nbytes
 from lorasp_jax.data.opening import open_source
@@ -116,6 +119,71 @@ def test_a_base_to_be_quantized_stays_on_the_host(monkeypatch):
     monkeypatch.setattr(jax, "local_devices", lambda **_: jax.devices("unknown"))
     with pytest.raises(ValueError, match=r"set JAX_PLATFORMS=.*,cpu"):
         base.base_model(config)
+
+
+@contextlib.contextmanager
+def quantizing(monkeypatch, device):
+    """Yield a list of the bytes on the device, beyond those now, at each kernel and at the end."""
+
+    def held():
+        gc.collect()
+        return sum(x.nbytes for x in jax.live_arrays() if device in x.devices())
+
+    before, found, quantize = held(), [], quantization.quantize_kernel
+    recorded = lambda *arguments: (found.append(held() - before), quantize(*arguments))[1]  # noqa: E731
+    monkeypatch.setattr(quantization, "quantize_kernel", recorded)
+    with jax.default_device(device):
+        yield found
+    found.append(held() - before)
+
+
+@pytest.mark.parametrize("initialization", ["pissa", "olora"])
+def test_residuals_of_a_base_to_be_quantized_stay_on_the_host(initialization, monkeypatch):
+    """They are those of a base on the device, which never holds two kernels unquantized."""
+    original = random_backbone(Pi0Config.dummy())
+    model = ModelConfig(base_dtype="nf4")
+    config = dataclasses.replace(CONFIG, model=model, targets=("language/.*_proj",))
+    config = dataclasses.replace(config, peft=LoRA(rank=4, initialization=initialization))
+    pairs = rules.rules(config)
+    found = base.on_host(lambda: original)
+    with quantizing(monkeypatch, jax.devices()[1]) as held:
+        adapted = setup._adapt(config, found, pairs)
+    sizes = [x.nbytes for x in jax.tree.leaves(nnx.state(found))]
+    adapters = nbytes(adaptation.split(adapted)[1])
+    assert max(held[:-1]) <= 1.1 * (adapters + max(sizes)) < 0.5 * sum(sizes)
+    on_host, on_device = (
+        adaptation.adapt(each, pairs, rngs=nnx.Rngs(0)) for each in (found, original)
+    )
+    assert {type(x) for x in jax.tree.leaves(adaptation.split(on_host)[2])} == {np.ndarray}
+    expected = leaves(nnx.state(on_device, nnx.Param))
+    for name, value in leaves(nnx.state(on_host, nnx.Param)).items():
+        np.testing.assert_allclose(value, expected[name], atol=1e-5, err_msg=name)
+
+
+def test_a_policy_on_a_quantized_base_is_loaded_without_the_original(config, tmp_path, monkeypatch):
+    """Its device never holds more of the base unquantized than one kernel, and then nothing."""
+    folder = tmp_path / "base"
+    models.save(folder, random_backbone(Pi0Config.dummy()))
+    config = dataclasses.replace(
+        config,
+        peft=LoRA(rank=4),
+        model=ModelConfig(checkpoint=str(folder), base_dtype="nf4"),
+    )
+    (tmp_path / "run").mkdir()
+    unquantized = models.load(folder)
+    monkeypatch.setattr(setup, "base_model", lambda *_, **__: (unquantized, ""))
+    run = prepare(config, tmp_path / "run")
+    export.write(run)
+    device, size = jax.devices()[1], nbytes(nnx.state(run.policy.model))
+    with quantizing(monkeypatch, device) as held:
+        loaded = export.load_policy(run.folder)
+    state = jax.tree.leaves(nnx.state(loaded.model))
+    assert {x.devices().pop() for x in state} == {device}
+    assert nbytes(state) == size < nbytes(nnx.state(unquantized))
+    largest = max(x.nbytes for x in jax.tree.leaves(nnx.state(unquantized)))
+    adapters = nbytes(adaptation.split(loaded.model)[1])
+    assert max(held[:-1]) <= 1.1 * (2 * adapters + largest) < 0.5 * nbytes(nnx.state(unquantized))
+    assert held[-1] <= size + nbytes(loaded.processor)
 
 
 def test_lerobot_policies_are_preprocessed_as_their_config_says(config, tmp_path, monkeypatch):

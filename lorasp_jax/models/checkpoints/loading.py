@@ -102,6 +102,11 @@ class ModelFolder:
         """
         return self.config.inputs if self.layout == "lerobot" and "type" in self.fields else None
 
+    @property
+    def chunk(self) -> int | None:
+        """Actions per chunk in a LeRobot policy's config.json; None if it does not say."""
+        return self.config.chunk if self.inputs and "chunk_size" in self.fields else None
+
     def load(self, config: BackboneConfig | None = None) -> Any:
         """Load the model; see the function `load`."""
         if self.layout == "ours":

@@ -1,5 +1,7 @@
 """Dry run: parameter counts, memory and FLOPs of a run, from shapes alone."""
 
+import functools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +17,16 @@ from lorasp_jax.training.run import Run
 from lorasp_jax.training.setup import RunSetup
 
 
-def dry_run(config: Config, folder: Path, console: Console) -> None:
+def dry_run(config: Config, folder: Path, console: Console, budget: float | None = None) -> None:
     """Build the run, compile its training step and print the cost, without writing to `folder`.
 
-    A dataset cache in `folder` is used if present.
+    A dataset cache in `folder` is used if present. For `budget` see `setup.build`.
 
     Raises:
         ValueError: see `setup.build`.
     """
-    built, held, compiled = compile_step(config, folder, console)
+    built, held, compile_step = plan_step(config, folder, console, budget)
+    compiled = compile_step()
     remote = (config.model.source, config.model.tokenizer)
     if names := [name for name in remote if hub.is_remote(name)]:
         console.print(f"not downloaded for a dry run: {', '.join(names)}", soft_wrap=True)
@@ -45,23 +48,25 @@ def dry_run(config: Config, folder: Path, console: Console) -> None:
     console.print("dry run: nothing was collected, trained or written")
 
 
-def compile_step(config: Config, folder: Path, console: Console) -> tuple[RunSetup, int, Any]:
-    """Compile the training step of a run from shapes alone, without writing to `folder`.
+def plan_step(
+    config: Config, folder: Path, console: Console, budget: float | None = None
+) -> tuple[RunSetup, int, Callable[[], Any]]:
+    """Prepare the training step of a run from shapes alone, without writing to `folder`.
 
     Returns:
         The run's setup, the bytes of the dataset on every device, which is no argument of the
-        program, and the program.
+        program, and a function that compiles the program.
 
     Raises:
         ValueError: see `setup.build`.
     """
-    built = setup.build(config, folder, abstract=True)
+    built = setup.build(config, folder, abstract=True, budget=budget)
     run = Run(config, folder, console, built.base_hash)
     if built.source:
         first = built.source.episode(0, ())
         run.simulated = is_simulated([first.task], first.robot, first.physics_dt)
     held, batches = early.data_shapes(run, built)
-    return built, held, early.compile_steps(run, built, batches)
+    return built, held, functools.partial(early.compile_steps, run, built, batches)
 
 
 def planned_bytes(compiled: Any) -> dict[str, int]:

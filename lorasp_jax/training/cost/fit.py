@@ -3,7 +3,9 @@
 Candidates are tried in the order of their `cost`, the expected time of a step relative to the
 fastest; those that round the base cost more than the time they take. The first one whose estimated
 peak fits is chosen. On the GPU, its step is then compiled, which the run needs anyway; if XLA plans
-more memory than there is, the next candidate is tried.
+more memory than there is, the next candidate is tried. A dataset is held on the device if what is
+left has room for it, otherwise streamed, which costs less time than other settings. Demonstrations
+of the expert are always held.
 """
 
 import dataclasses
@@ -22,7 +24,7 @@ from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.training import records, rules
 from lorasp_jax.training.base import base_model
 from lorasp_jax.training.cost import preflight
-from lorasp_jax.training.cost.dry_run import compile_step, planned_bytes
+from lorasp_jax.training.cost.dry_run import plan_step, planned_bytes
 from lorasp_jax.training.cost.preflight import GIB, REMATS
 from lorasp_jax.training.run_folder import CONFIG_FILE, read_json
 
@@ -79,19 +81,22 @@ def fitted(
     Raises:
         ValueError: nothing fits, or see `setup.build`.
     """
-    available, least = budget(size), float("inf")
+    available, least, held = budget(size), float("inf"), 0
     for candidate, peak in ranked(config, given):
-        if peak <= available and jax.default_backend() != "cpu":
-            planned = planned_bytes(compile_step(_without_weights(candidate), folder, console)[-1])
-            peak = max(peak, sum(planned.values()))
         if peak <= available:
-            _describe(candidate, size, peak, console)
+            step = plan_step(_without_weights(candidate), folder, console, available)
+            held, compile_step = step[1:]
+            planned = planned_bytes(compile_step()) if jax.default_backend() != "cpu" else {}
+            peak = max(peak, sum(planned.values())) + held
+        if peak <= available:
+            _describe(candidate, size, peak, held, console)
             return candidate
         least = min(least, peak)
     need = (least / FILLED + CONTEXT) / UNITS["GB"] + 0.05
+    data = "" if held or config.data.source else ", and room for its demonstrations"
     raise ValueError(
         f"this run does not fit into {size}: its batch size and given settings need at least "
-        f"--fit {need:.1f}GB; see what else saves memory in docs/launch.md"
+        f"--fit {need:.1f}GB{data}; see what else saves memory in docs/launch.md"
     )
 
 
@@ -185,7 +190,7 @@ def _without_weights(config: Config) -> Config:
     )
 
 
-def _describe(config: Config, size: str, peak: float, console: Console) -> None:
+def _describe(config: Config, size: str, peak: float, held: float, console: Console) -> None:
     allocator, model, optim = read_size(size) - CONTEXT, config.model, config.optim
     chosen = {
         "--optim.accumulate": optim.accumulate,
@@ -195,6 +200,11 @@ def _describe(config: Config, size: str, peak: float, console: Console) -> None:
     }
     options = " ".join(f"{name} {value}" for name, value in chosen.items())
     text = (
-        f"--fit {size} chose {options}: {peak / GIB:.1f} of {allocator / GIB:.1f} GiB at the peak"
+        f"--fit {size} chose {options}: {peak / GIB:.1f} of {allocator / GIB:.1f} GiB at the peak, "
+    )
+    text += (
+        f"with {held / GIB:.1f} GiB of data that is held on the device"
+        if held
+        else "and a dataset that is streamed from disk, for which there is no room"
     )
     console.print(text, soft_wrap=True, markup=False)

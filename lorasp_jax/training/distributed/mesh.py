@@ -64,6 +64,12 @@ def shardings(tree: Any, mesh: Mesh, minimum: int = MINIMUM_SHARDED_BYTES) -> An
     return jax.tree.map(sharding, tree)
 
 
+def with_sharding(tree: Any, sharding: jax.sharding.Sharding) -> Any:
+    """Return the shapes of arrays, each with this sharding."""
+    shape = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)  # noqa: E731
+    return jax.tree.map(shape, tree)
+
+
 def bytes_on_device(tree: Any, fsdp: int) -> int:
     """Return the bytes per device of a tree sharded by `shardings`."""
     leaves = [leaf for leaf in jax.tree.leaves(tree) if hasattr(leaf, "dtype")]

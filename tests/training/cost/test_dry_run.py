@@ -122,8 +122,24 @@ def test_a_dataset_larger_than_the_free_memory_streams(config, tmp_path):
     run = Run(config, tmp_path, Console(), "")
     whole = nbytes(flatten([random_episodes("press", 0)]))
     for free, bytes_held, steps in ((1e12, whole, config.log_every), (1.0, 0, 1)):
-        device = dataclasses.replace(built, available=built.memory.peak + free)
+        device = dataclasses.replace(built, free_bytes=free)
         held, batches = early.data_shapes(run, device)
         assert held == bytes_held
         assert batches.state.shape == (steps, config.optim.batch_size, 7)
         assert batches.image["side"].shape == (steps, config.optim.batch_size, 32, 32, 3)
+
+
+def test_a_plan_and_its_run_hold_or_stream_the_dataset_alike(config, tmp_path):
+    """A budget is below what the device has, and is for evaluating, too."""
+    rlds.write(random_episodes("press", 0), tmp_path / "rlds")
+    config = dataclasses.replace(config, data=DataConfig(source=str(tmp_path / "rlds")))
+    console, whole = Console(quiet=True), nbytes(flatten([random_episodes("press", 0)]))
+    memory = setup.build(config, tmp_path).memory.peak
+    evaluating = preflight.sampling_peak(config, Pi0Config.dummy())
+    needed = max(memory, evaluating) + whole
+    for budget, held in ((needed + 1, whole), (needed - 1, 0)):
+        assert dry_run.plan_step(config, tmp_path / "plan", console, budget)[1] == held
+        folder = tmp_path / str(held)
+        folder.mkdir()
+        run = setup.prepare(config, folder, console, 0.0, budget=budget)
+        assert run.streams == (not held)

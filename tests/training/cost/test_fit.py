@@ -46,6 +46,7 @@ def sizes(monkeypatch):
         return preflight.MIB * (base + each * windows)
 
     monkeypatch.setattr(fit, "expected_peak", peak)
+    monkeypatch.setattr(fit, "plan_step", lambda *_: (None, 0, lambda: None))
 
 
 def chosen(mib, config=CONFIG, given=()):
@@ -113,9 +114,26 @@ def test_full_fine_tuning_keeps_its_base(sizes):
 def test_on_a_gpu_the_plan_of_the_compiler_decides(sizes, monkeypatch):
     monkeypatch.setattr(fit.jax, "default_backend", lambda: "gpu")
     plans = iter([700, 300])
-    monkeypatch.setattr(fit, "compile_step", lambda *_: (None,))
     monkeypatch.setattr(fit, "planned_bytes", lambda _: {"all": next(plans) * preflight.MIB})
     assert chosen(657) == ("none", 1, "bfloat16", "")
+
+
+def test_data_on_the_device_counts(sizes, monkeypatch, capsys):
+    """What can be streamed is not there, as the sentence says; demonstrations are."""
+    held = 1024 * preflight.MIB
+    monkeypatch.setattr(fit, "plan_step", lambda *_: (None, held, lambda: None))
+    assert chosen(1024 + 657) == ("none", 1, "float32", "")
+    assert chosen(1024 + 655) == ("none", 1, "bfloat16", "")
+    simulated = dataclasses.replace(CONFIG, data=DataConfig())
+    with pytest.raises(ValueError, match=r"need at least --fit 1\.\d+GB;"):
+        chosen(1024, simulated)
+    with pytest.raises(ValueError, match="room for its demonstrations"):
+        chosen(10, simulated)
+    fit.fitted(CONFIG, "2GB", (), NOWHERE, Console(width=300))
+    assert "1.0 GiB of data" in capsys.readouterr().out
+    monkeypatch.setattr(fit, "plan_step", lambda *_: (None, 0, lambda: None))
+    fit.fitted(CONFIG, "2GB", (), NOWHERE, Console(width=300))
+    assert "streamed from disk" in capsys.readouterr().out
 
 
 def test_a_resumed_run_keeps_what_was_chosen(sizes, tmp_path):
