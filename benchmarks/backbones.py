@@ -16,6 +16,7 @@ and gradients relative to the device's bf16 peak, without recomputation
 import argparse
 import dataclasses
 import functools
+import itertools
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -45,7 +46,6 @@ from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
 from lorasp_jax.training.step import init_state, train_step
 
 CAMERAS = {"pi05": 3, "pi0": 3, "smolvla": 2}
-STEPS = 10
 
 
 def of_size(name: str, size: str) -> BackboneConfig:
@@ -215,14 +215,17 @@ def sampling(name: str, label: str, run: Config | None, options: argparse.Namesp
     sampler = nnx.merge(*arrays(config, run)).sampler()
     observation = noise(abstract_batch(config, 1).observation)
 
-    @functools.partial(jax.jit, compiler_options=sampling_options())
-    def sample(sampler: Sampler, observation: Any) -> jax.Array:
-        return sampler.sample_actions(jax.random.key(0), observation, num_steps=STEPS)
+    settings = {"static_argnames": "steps", "compiler_options": sampling_options()}
 
-    for batch in options.sampled:
+    @functools.partial(jax.jit, **settings)
+    def sample(sampler: Sampler, observation: Any, steps: int) -> jax.Array:
+        return sampler.sample_actions(jax.random.key(0), observation, num_steps=steps)
+
+    for batch, steps in itertools.product(options.sampled, options.denoise_steps):
         repeated = jax.tree.map(functools.partial(jnp.repeat, repeats=batch, axis=0), observation)
-        seconds = best(functools.partial(sample, sampler, repeated), calls=1, repeats=10)
-        yield {"backbone": name, "adapters": label, "batch": batch, "ms": 1e3 * seconds}
+        call = functools.partial(sample, sampler, repeated, steps=steps)
+        row = {"backbone": name, "adapters": label, "batch": batch, "flow steps": steps}
+        yield row | {"ms": 1e3 * best(call, calls=1, repeats=10)}
 
 
 def rows(name: str, table: str, options: argparse.Namespace) -> Iterator[dict[str, Any]]:
@@ -261,6 +264,9 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=32)
     parser.add_argument(
         "--sampled", type=int, nargs="+", default=[1, 8], help="batch sizes for sampling"
+    )
+    parser.add_argument(
+        "--denoise-steps", type=int, nargs="+", default=[10], help="flow steps for sampling"
     )
     parser.add_argument(
         "--gib", type=float, default=24, help="memory [GiB] that the largest batch must fit in"

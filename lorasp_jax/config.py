@@ -30,11 +30,8 @@ def _require(holds: bool, rule: str, value: object) -> None:
 def _check_name(name: str) -> None:
     """Raise ValueError unless `name` is a single path component."""
     valid = name not in ("", ".", "..") and "/" not in name and name.isprintable()
-    if not valid or len(name.encode()) > MAX_NAME_BYTES:
-        raise ValueError(
-            f"name must be a printable folder name of at most {MAX_NAME_BYTES} bytes without "
-            f"'/', got {name!r}"
-        )
+    rule = f"name must be a printable folder name of at most {MAX_NAME_BYTES} bytes without '/'"
+    _require(valid and len(name.encode()) <= MAX_NAME_BYTES, rule, repr(name))
 
 
 @dataclass(frozen=True)
@@ -240,6 +237,8 @@ class OptimConfig:
     0.999; the average is then evaluated and exported. 0: no average."""
     state_noise: float = 0.02
     """Standard deviation of the noise added to normalized robot states during training."""
+    time_shape: float = 1.5
+    """a of the Beta(a, 1) distribution of flow times; larger values favor noise."""
     rtc_max_delay: int = 0
     """Train for execution under latency (training-time real-time chunking): the first d actions of
     each chunk are given, d uniform in 0, ..., this number of control steps. 0: none are."""
@@ -254,7 +253,8 @@ class OptimConfig:
         _at_least(1, self, "steps", "batch_size", "accumulate", "max_skipped")
         _at_least(0, self, "learning_rate", "final_learning_rate", "warmup_steps")
         _at_least(0, self, "weight_decay", "state_noise", "rtc_max_delay")
-        _require(self.clip_norm > 0, "clip_norm must be above 0", self.clip_norm)
+        for name in ("clip_norm", "time_shape"):
+            _require(getattr(self, name) > 0, f"{name} must be above 0", getattr(self, name))
         _require(0 <= self.b2 < 1, "b2 must lie in [0, 1)", self.b2)
         _require(not self.spike or self.spike > 1, "spike must be 0 or more than 1", self.spike)
         _require(0 <= self.ema < 1, "ema must lie in [0, 1)", self.ema)

@@ -30,10 +30,7 @@ _BASKET, _BASKET_RANGE = (0.36, 0.155), (0.035, 0.035)  # m
 _BASKET_GEOM = 'conaffinity="3" rgba=".85 .65 .30 1"'
 # The free joint's damping stops a rolling grape. For mass m and radius r, the time constant is
 # 1.4 m r² / damping = 0.38 s.
-_SCENE = f"""
-<body name="basket">
-  {open_box(_INSIDE, _WALL, _HEIGHT, floor=_BASKET_GEOM, walls=_BASKET_GEOM)}
-</body>
+GRAPE = f"""
 <body name="grape">
   <joint name="grape" type="free" damping="1e-5"/>
   <geom type="sphere" size="{_RADIUS}" mass=".012" contype="1" condim="4" friction="1 .02 .001"
@@ -42,26 +39,39 @@ _SCENE = f"""
 """
 
 
+def basket_scene(name: str) -> str:
+    """Return the MJCF of a basket."""
+    box = open_box(_INSIDE, _WALL, _HEIGHT, floor=_BASKET_GEOM, walls=_BASKET_GEOM)
+    return f'<body name="{name}">\n  {box}\n</body>'
+
+
+def grape_at(key: jax.Array, center: tuple[float, ...], spread: tuple[float, ...]) -> jax.Array:
+    """Sample a pose of the grape, with the arguments of `scatter`."""
+    return raised(scatter(key, center, spread), _RADIUS)
+
+
 def _place(key: jax.Array) -> Layout:
     grape_key, basket_key = jax.random.split(key)
     return {
-        "grape": raised(scatter(grape_key, _GRAPE, _GRAPE_RANGE), _RADIUS),
+        "grape": grape_at(grape_key, _GRAPE, _GRAPE_RANGE),
         "basket": scatter(basket_key, _BASKET, _BASKET_RANGE),
     }
 
 
-def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:
-    inside = view.inside("grape", "basket", _INSIDE, _HEIGHT)
+def check(view: View, basket: str = "basket") -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Check whether the grape lies in a basket."""
+    inside = view.inside("grape", basket, _INSIDE, _HEIGHT)
     at_rest = view.speed("grape") < 0.05
     released = view.released(view.position("grape"), 2 * _RADIUS)
-    return inside & at_rest & released, {"grape_to_basket": view.apart("grape", "basket")}
+    return inside & at_rest & released, {"grape_to_basket": view.apart("grape", basket)}
 
 
-def _stages(view: View) -> dict[str, jax.Array]:
+def stages(view: View, basket: str = "basket") -> dict[str, jax.Array]:
+    """Return the progress towards a basket."""
     grape = view.position("grape")
     height = grape[2] - _RADIUS * view.size
     grasped = view.grasping(grape, 2 * _RADIUS)
-    over = near(view.apart("grape", "basket"), within=0.03)
+    over = near(view.apart("grape", basket), within=0.03)
     low = gate(over >= 1, near(height, within=_HEIGHT, scale=0.05))
     return {
         "reach": view.reaching(grape),
@@ -73,7 +83,8 @@ def _stages(view: View) -> dict[str, jax.Array]:
     }
 
 
-def _waypoints(layout: Layout) -> Waypoints:
+def waypoints(layout: Layout) -> Waypoints:
+    """Return a way from the "grape" of the layout to its "basket"."""
     grape, basket = layout["grape"], layout["basket"]
     wide, closed = 0.052, 0.008  # m
     return route(
@@ -90,7 +101,7 @@ def _waypoints(layout: Layout) -> Waypoints:
 
 TASK = Task(
     name="pick_place",
-    scene=_SCENE,
+    scene=basket_scene("basket") + GRAPE,
     instructions=(
         "put the grape in the basket",
         "place the grape into the basket",
@@ -102,7 +113,7 @@ TASK = Task(
     expert_time=9.0,
     hold_steps=3,
     place=_place,
-    check=_check,
-    waypoints=_waypoints,
-    stages=_stages,
+    check=check,
+    waypoints=waypoints,
+    stages=stages,
 )

@@ -5,6 +5,7 @@ This is the convention of pi0's code and checkpoints. Time runs the other way in
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -14,15 +15,36 @@ Velocity = Callable[[jax.Array, jax.Array], tuple[jax.Array, Any]]
 """(x_t `[B, C, A]`, flow_time `[B]` or `[B, C]`) -> (v_t `[B, C, A]`, aux)."""
 
 
-def sample_time(key: jax.Array, batch: int) -> jax.Array:
-    """Sample flow times `[B]` from 0.999 Beta(1.5, 1) + 0.001, which favors noise and excludes 0.
+@dataclass(frozen=True)
+class Times:
+    """The flow times of training.
 
-    Beta(a, 1) has the CDF t^a, so U^(1/a) with uniform U is an exact sample. Do not reuse `key`.
+    Attributes:
+        shape: a of 0.999 Beta(a, 1) + 0.001, which excludes 0. Above 1 it favors noise; pi0 has
+            1.5. As a grows, a policy of one step tends to the mean of the demonstrated actions.
+        max_delay: D of training-time real-time chunking (arXiv 2512.05964). If above 0, the first
+            d actions of a chunk have time 0: they are given without noise, as actions that the
+            robot already executes while it waits for the rest. d is uniform in 0, ..., D.
     """
-    return 0.999 * jax.random.uniform(key, (batch,)) ** (1 / 1.5) + 0.001
+
+    shape: float = 1.5
+    max_delay: int = 0
 
 
-def draw(key: jax.Array, actions: jax.Array, max_delay: int = 0) -> tuple[jax.Array, jax.Array]:
+PI0_TIMES = Times()
+
+
+def sample_time(key: jax.Array, batch: int, shape: float = Times.shape) -> jax.Array:
+    """Sample flow times `[B]`; for `shape` see `Times`. Do not reuse `key`.
+
+    Beta(a, 1) has the CDF t^a, so U^(1/a) with uniform U is an exact sample.
+    """
+    return 0.999 * jax.random.uniform(key, (batch,)) ** (1 / shape) + 0.001
+
+
+def draw(
+    key: jax.Array, actions: jax.Array, times: Times = PI0_TIMES
+) -> tuple[jax.Array, jax.Array]:
     """Sample noise `[B, C, A]` f32 and flow times for actions `[B, C, A]`.
 
     Do not reuse `key`.
@@ -30,19 +52,17 @@ def draw(key: jax.Array, actions: jax.Array, max_delay: int = 0) -> tuple[jax.Ar
     Args:
         key: typed PRNG key.
         actions: only their shape matters.
-        max_delay: D of training-time real-time chunking (arXiv 2512.05964). If above 0, the first
-            d actions of a chunk have time 0: they are given without noise, as actions that the
-            robot already executes while it waits for the rest. d is uniform in 0, ..., D.
+        times: how flow times are sampled.
 
     Returns:
-        The noise, and times `[B]`, or `[B, C]` if `max_delay` is above 0.
+        The noise, and times `[B]`, or `[B, C]` if `times.max_delay` is above 0.
     """
     noise_key, time_key = jax.random.split(key)
     noise = jax.random.normal(noise_key, actions.shape)
-    time = sample_time(time_key, actions.shape[0])
-    if not max_delay:
+    time = sample_time(time_key, actions.shape[0], times.shape)
+    if not times.max_delay:
         return noise, time
-    delay = jax.random.randint(jax.random.fold_in(key, 2), time.shape, 0, max_delay + 1)
+    delay = jax.random.randint(jax.random.fold_in(key, 2), time.shape, 0, times.max_delay + 1)
     return noise, jnp.where(first(delay, actions.shape[1]), 0, time[:, None])
 
 

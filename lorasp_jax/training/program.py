@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from lorasp_jax.base import messages
 from lorasp_jax.data.augmentation import augment
 from lorasp_jax.data.batches import RawBatch, encode
+from lorasp_jax.models.flow_matching import Times
 from lorasp_jax.policies.processor import Processor
 from lorasp_jax.training import compilation
 from lorasp_jax.training.batches import Batches
@@ -53,7 +54,7 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
         parts=optim.accumulate,
         ema=optim.ema,
         spike=optim.spike,
-        max_delay=optim.rtc_max_delay,
+        times=Times(optim.time_shape, optim.rtc_max_delay),
     )
 
     def body(state: TrainState, raw: RawBatch, frozen: Frozen, key: jax.Array) -> Any:

@@ -25,7 +25,7 @@ from lorasp_jax.base.files import as_value_error, check_only_files, read_bytes
 from lorasp_jax.base.json_values import check
 from lorasp_jax.base.locks import acquire
 from lorasp_jax.base.writing import TEMPORARY_SUFFIX, write_text
-from lorasp_jax.config import AugmentConfig, Config
+from lorasp_jax.config import AugmentConfig, Config, OptimConfig
 from lorasp_jax.peft.settings import without_removed
 from lorasp_jax.training import records
 from lorasp_jax.training.distributed import processes
@@ -66,6 +66,8 @@ def to_json(config: Config) -> dict[str, Any]:
     augment, data = config.data.augment, fields["data"]
     if len(data["source"]) < 2:  # as in runs from before there could be several
         data["source"] = "".join(data["source"])
+    if config.optim.time_shape == OptimConfig.time_shape:
+        del fields["optim"]["time_shape"]
     if config.data.statistics == "shared":
         del data["statistics"]
     if augment == AugmentConfig("auto" if not config.data.source else "none"):

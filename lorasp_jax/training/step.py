@@ -12,6 +12,7 @@ from flax import nnx
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.data.batches import Batch
 from lorasp_jax.models import flow_matching
+from lorasp_jax.models.flow_matching import PI0_TIMES, Times
 from lorasp_jax.peft.auxiliary import Aux, auxiliary_losses, masked_mean
 from lorasp_jax.training import guard as guards
 from lorasp_jax.training.guard import Guard
@@ -89,7 +90,7 @@ def loss_fn(
     num_valid: jax.Array | None = None,
     noise: jax.Array | None = None,
     flow_time: jax.Array | None = None,
-    max_delay: int = 0,
+    times: Times = PI0_TIMES,
 ) -> tuple[jax.Array, Metrics]:
     """Return the flow-matching loss plus weighted auxiliary losses (arXiv 2603.07404, eq. 14).
 
@@ -101,8 +102,9 @@ def loss_fn(
     # with_dropout clones the model, so the merge needs no copy=True. Both uses of the key are safe:
     # with_dropout only folds layer paths into it, and flow_matching.draw splits it once.
     model = adaptation.with_dropout(nnx.merge(graphdef, adapters, frozen), key)
-    if max_delay and flow_time is None:
-        noise, flow_time = flow_matching.draw(key, batch.actions, max_delay)
+    if flow_time is None:
+        drawn, flow_time = flow_matching.draw(key, batch.actions, times)
+        noise = drawn if noise is None else noise
     mask = _scored(batch, flow_time)
     num_valid = jnp.sum(mask) if num_valid is None else num_valid
     per_element, aux = model.loss(
@@ -134,19 +136,19 @@ def gradients(
     key: jax.Array,
     weights: dict[str, jax.Array],
     parts: int = 1,
-    max_delay: int = 0,
+    times: Times = PI0_TIMES,
 ) -> tuple[Any, Metrics]:
     """Return the gradient and the metrics of `loss_fn`, accumulated over `parts` micro-batches.
 
     Up to rounding, the task loss is that of the whole batch. Auxiliary losses and active ranks are
-    means over the micro-batches. For `max_delay` see `flow_matching.draw`.
+    means over the micro-batches. For `times` see `flow_matching.draw`.
     """
     gradient = jax.grad(loss_fn, has_aux=True)
     if parts == 1:
-        return gradient(adapters, frozen, graphdef, batch, key, weights, max_delay=max_delay)
+        return gradient(adapters, frozen, graphdef, batch, key, weights, times=times)
     # Row i goes into micro-batch i % parts, so that no row moves to another device.
     split = lambda x: jnp.swapaxes(x.reshape(-1, parts, *x.shape[1:]), 0, 1)  # noqa: E731
-    drawn = flow_matching.draw(key, batch.actions, max_delay)
+    drawn = flow_matching.draw(key, batch.actions, times)
     num_valid = jnp.sum(_scored(batch, drawn[1])) / parts
 
     def add(total: Any, part: Any) -> tuple[Any, Metrics]:
@@ -174,15 +176,15 @@ def train_step(
     parts: int = 1,
     ema: float = 0.0,
     spike: float = 0.0,
-    max_delay: int = 0,
+    times: Times = PI0_TIMES,
 ) -> tuple[TrainState, Metrics]:
     """Take one step on the global batch, split into `parts` micro-batches; do not reuse `key`.
 
     `ema` is the decay factor of the moving average, if one is kept. A step that `guard.check_step`
-    rejects changes only the step count and the guard. For `max_delay` see `flow_matching.draw`.
+    rejects changes only the step count and the guard. For `times` see `flow_matching.draw`.
     """
     now = {name: jnp.asarray(schedule(state.step)) for name, schedule in weights.items()}
-    grads, metrics = gradients(state.adapters, frozen, graphdef, batch, key, now, parts, max_delay)
+    grads, metrics = gradients(state.adapters, frozen, graphdef, batch, key, now, parts, times)
     grad_norm = optax.tree.norm(grads)
     accept, guard = guards.check_step(state.guard, metrics["loss"], grad_norm, spike)
     updates, opt_state = optimizer.update(grads, state.opt_state, state.adapters)

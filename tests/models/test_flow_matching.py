@@ -1,6 +1,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from lorasp_jax.models import flow_matching
 
@@ -17,13 +18,14 @@ def test_time_one_is_noise_and_zero_is_data():
     np.testing.assert_array_equal(u_t, NOISE - DATA)
 
 
-def test_time_distribution():
-    """Beta(1.5, 1) has mean 0.6 and CDF t^1.5."""
-    time = flow_matching.sample_time(jax.random.key(2), 20_000)
+@pytest.mark.parametrize("shape", [1.5, 4.0])
+def test_time_distribution(shape):
+    """Beta(a, 1) has mean a / (a + 1) and CDF t^a."""
+    time = flow_matching.sample_time(jax.random.key(2), 20_000, shape)
     assert time.min() >= 0.001
     assert time.max() <= 1
-    np.testing.assert_allclose(time.mean(), 0.6 * 0.999 + 0.001, atol=0.01)
-    np.testing.assert_allclose((time < 0.5).mean(), 0.5**1.5, atol=0.015)
+    np.testing.assert_allclose(time.mean(), shape / (shape + 1) * 0.999 + 0.001, atol=0.01)
+    np.testing.assert_allclose((time < 0.5).mean(), 0.5**shape, atol=0.015)
 
 
 def test_loss_is_zero_only_for_the_true_velocity():

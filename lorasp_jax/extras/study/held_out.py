@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from envs.datasets.episodes import Episodes
 from lorasp_jax.base.locks import locked
 from lorasp_jax.config import Config, DataConfig
 from lorasp_jax.training.demonstrations import Demonstrations, Progress, demonstrations, map_threads
@@ -80,3 +81,22 @@ def _shared(root: Path, config: Config, progress: Progress = lambda *_: None) ->
             return demonstrations(single, folder, progress)[task]
 
     return dict(zip(config.tasks, map_threads(one, config.tasks), strict=True))
+
+
+class Source:
+    """Demonstrations as a dataset: the episodes of all tasks, numbered one after the other."""
+
+    def __init__(self, demonstrations: Demonstrations) -> None:
+        self._groups = [*demonstrations.values()]
+        self.control_dt = self._groups[0].control_dt
+
+    def __len__(self) -> int:
+        return sum(group.num_episodes for group in self._groups)
+
+    def episode(self, number: int, cameras: object = None) -> Episodes:  # noqa: ARG002
+        """Return one episode."""
+        for group in self._groups:
+            if number < group.num_episodes:
+                return group.select([number])
+            number -= group.num_episodes
+        raise IndexError(number)

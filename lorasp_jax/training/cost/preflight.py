@@ -21,6 +21,7 @@ from lorasp_jax.config import VALIDATION_WINDOWS, Config
 from lorasp_jax.data.batches import Batch, nbytes
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
+from lorasp_jax.models.flow_matching import Times
 from lorasp_jax.models.observation import abstract_observation
 from lorasp_jax.models.sampling import Sampler, suffix_model
 from lorasp_jax.training import rules
@@ -218,8 +219,9 @@ def abstract_step(
     weights: Any = dict.fromkeys(auxiliary_weights(config.auxiliary, 1), 0.0)
 
     def loss(adapters: Any, frozen: Any, batch: Batch) -> tuple[jax.Array, Metrics]:
-        key, delay = jax.random.key(0), config.optim.rtc_max_delay
-        return loss_fn(adapters, frozen, graphdef, batch, key, weights, max_delay=delay)
+        key, optim = jax.random.key(0), config.optim
+        times = Times(optim.time_shape, optim.rtc_max_delay)
+        return loss_fn(adapters, frozen, graphdef, batch, key, weights, times=times)
 
     return loss, (adapters, frozen, abstract_batch(backbone, batch_size))
 

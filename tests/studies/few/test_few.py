@@ -6,8 +6,9 @@ from scipy import stats
 
 from lorasp_jax.config import Config
 from lorasp_jax.extras.study import statistics
+from lorasp_jax.extras.study.held_out import Source
 from lorasp_jax.peft import FullFineTuning
-from studies.few import measure, page, study
+from studies.few import page, study
 from tests.runs import random_episodes
 
 STUDY = study.get_study("accelerator")
@@ -76,7 +77,7 @@ def test_correlation_is_spearmans():
 
 def test_demonstrations_are_measured_as_a_dataset():
     groups = {task: random_episodes(task, seed) for seed, task in enumerate(("press", "pour"))}
-    source = measure._Source(groups)
+    source = Source(groups)
     assert len(source) == 6
     for number, (group, row) in enumerate((g, r) for g in groups.values() for r in range(3)):
         episode = source.episode(number)

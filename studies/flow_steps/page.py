@@ -1,0 +1,133 @@
+"""The tables and the figure of README.md, from the results of all policies alone."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+
+from lorasp_jax.base.writing import atomic_file
+from lorasp_jax.evaluation.figure_style import STYLE
+from lorasp_jax.extras.study import Study, page, statistics
+from lorasp_jax.extras.study.statistics import Estimate
+from lorasp_jax.extras.study.study import Results
+
+BACKBONES = {"pi0": "π0", "smolvla": "SmolVLA"}
+POLICIES = {
+    "lora": "LoRA, r = 64",
+    "lora_sp": "LoRA-SP, R = 64",
+    "noisy": "LoRA-SP, times near noise",
+    "rtc": "LoRA-SP, 4 control steps late",
+}
+STEPS = (1, 2, 3, 5, 10)
+"""Euler steps."""
+TWO_WAYS = "two_baskets"
+TASKS = ("open_pot", "pour", "press", "pick_place", TWO_WAYS)
+SEEDS = (0, 1, 2)
+DELAY = 4
+"""Delay of the policies that are trained for one [control steps]."""
+COLORS = {"lora": "#4269d0", "lora_sp": "#ff725c", "noisy": "#3ca951", "rtc": "#9498a0"}
+
+
+def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
+    """Write the figure into `folder`; return the tables."""
+    _figure(results, folder / "success.svg")
+    made = {}
+    for backbone in BACKBONES:
+        made[f"{backbone} success"] = _table(results, backbone, _success)
+        made[f"{backbone} tasks"] = _task_table(results, backbone)
+        made[f"{backbone} jerk"] = _table(results, backbone, _jerk)
+        made[f"{backbone} spread"] = _table(results, backbone, _spread)
+    return made
+
+
+def outcomes(
+    results: Results, backbone: str, policy: str, steps: int, tasks: Sequence[str]
+) -> np.ndarray:
+    """Stack the episodes of a policy's seeds, bool `[S, T, N]`."""
+    found = [results[f"{backbone}/{policy}/s{seed}"]["outcomes"] for seed in SEEDS]
+    texts = [{task: each[f"{steps}/{task}"] for task in tasks} for each in found]
+    return statistics.outcomes([[{"outcomes": text}] for text in texts])
+
+
+def _estimate(results: Results, backbone: str, policy: str, steps: int, tasks: Any) -> Estimate:
+    return statistics.success(outcomes(results, backbone, policy, steps, tasks))
+
+
+def _success(*where: Any) -> str:
+    return page.percent(_estimate(*where))
+
+
+def _jerk(results: Results, *where: Any) -> str:
+    return f"{_mean(results, 'jerk', *where):.0f}"
+
+
+def _spread(results: Results, *where: Any) -> str:
+    return f"{_mean(results, 'spread', *where):.3f}"
+
+
+def _mean(
+    results: Results, name: str, backbone: str, policy: str, steps: int, tasks: Sequence[str]
+) -> float:
+    found = [results[f"{backbone}/{policy}/s{seed}"][name] for seed in SEEDS]
+    return float(np.mean([each[f"{steps}/{task}"] for each in found for task in tasks]))
+
+
+def _table(results: Results, backbone: str, show: Any) -> str:
+    """Return a table with a row per policy and kind of task, and a column per number of steps."""
+    rows = [
+        [label, title, *(show(results, backbone, policy, n, tasks) for n in STEPS)]
+        for title, tasks in (("four tasks", TASKS[:4]), ("two baskets", TASKS[4:]))
+        for policy, label in POLICIES.items()
+    ]
+    return page.table([BACKBONES[backbone], "tasks", *(f"n = {n}" for n in STEPS)], rows)
+
+
+def _task_table(results: Results, backbone: str) -> str:
+    """Return the difference to ten steps in success of LoRA-SP, by task, over paired episodes."""
+    rows = []
+    for task in TASKS:
+        most = outcomes(results, backbone, "lora_sp", STEPS[-1], [task])
+        cells = []
+        for n in STEPS[:-1]:
+            fewer = outcomes(results, backbone, "lora_sp", n, [task])
+            difference = statistics.bootstrap(lambda x, y: (x - y).mean(-1), fewer, most)
+            cells.append(page.points(difference))
+        rows.append([task, *cells, f"{100 * most.mean():.1f}"])
+    head = [f"{BACKBONES[backbone]}, LoRA-SP", *(f"n = {n}" for n in STEPS[:-1])]
+    return page.table([*head, f"success at n = {STEPS[-1]} [%]"], rows)
+
+
+@mpl.rc_context(STYLE | {"svg.hashsalt": "flow_steps"})
+def _figure(results: Results, path: Path) -> None:
+    """Draw success against the number of steps: a panel per backbone and kind of task."""
+    figure = Figure(figsize=(9.6, 2.9), layout="constrained")
+    axes = figure.subplots(1, 4, sharey=True)
+    panels = [
+        (backbone, title, tasks)
+        for backbone in BACKBONES
+        for title, tasks in (("four tasks", TASKS[:4]), ("two baskets", TASKS[4:]))
+    ]
+    for axis, (backbone, title, tasks) in zip(axes, panels, strict=True):
+        for policy, label in POLICIES.items():
+            estimates = [_estimate(results, backbone, policy, n, tasks) for n in STEPS]
+            value, low, high = (
+                [100 * x for x in column] for column in zip(*estimates, strict=True)
+            )
+            color = COLORS[policy]
+            axis.plot(STEPS, value, color=color, marker="o", ms=3, label=label)
+            axis.fill_between(STEPS, low, high, color=color, alpha=0.12, lw=0)
+        axis.set_title(f"{BACKBONES[backbone]}, {title}", loc="left")
+        axis.set_xscale("log")
+        axis.set_xticks(STEPS, [str(n) for n in STEPS], minor=False)
+        axis.minorticks_off()
+        axis.set_xlabel("flow steps")
+        axis.set_ylim(0, 100)
+    axes[0].set_ylabel("success [%]")
+    handles, labels = axes[0].get_legend_handles_labels()
+    options: Any = {"loc": "outside upper center", "ncols": len(labels), "frameon": False}
+    figure.legend(handles, labels, **options)
+    with atomic_file(path) as unfinished:
+        figure.savefig(unfinished, format="svg", metadata={"Date": None})
