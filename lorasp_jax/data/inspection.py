@@ -20,7 +20,7 @@ from rich.table import Table
 from envs.datasets.episodes import Episodes
 from envs.rendering.video import side_by_side
 from lorasp_jax.base.writing import atomic_file
-from lorasp_jax.config import AugmentConfig
+from lorasp_jax.config import AugmentConfig, Config
 from lorasp_jax.data.augmentation import Augment, on_wrist, recipe
 from lorasp_jax.data.source import Source, describe_left_out, grippers, same_period
 from lorasp_jax.data.video import downscale
@@ -103,7 +103,7 @@ def report(source: Source, console: Console) -> None:
         f"median {np.median(summary.length):g}",
         "steps": f"{steps} at {hertz:g} Hz, {minutes:.1f} minutes",
     }
-    if not same_period(source.control_dt, 0.1):
+    if not same_period(source.control_dt, Config.control_dt):
         lines["steps"] += f"; train with --control-dt {source.control_dt:.4g}, or see --every"
     if unused := describe_left_out(source):
         console.print(unused, style="yellow", soft_wrap=True, highlight=False, markup=False)

@@ -1,11 +1,14 @@
 """Summaries and contact sheets match the dataset."""
 
 import dataclasses
+import io
 
 import numpy as np
 import pytest
 from PIL import Image
+from rich.console import Console
 
+from lorasp_jax.config import Config
 from lorasp_jax.data import inspection
 from lorasp_jax.data.lerobot import Keys, LeRobot
 from tests.data.lerobots import GOLDEN, copied, edit_info, golden
@@ -27,6 +30,14 @@ def test_summary(source):
         "press the green button": 2,
     }
     assert not inspection.hints(found)
+
+
+def test_another_period_than_that_of_training_is_said(source, monkeypatch):
+    for period, is_said in ((source.control_dt, False), (0.05, True)):
+        monkeypatch.setattr(Config, "control_dt", period)
+        text = io.StringIO()
+        inspection.report(source, Console(file=text))
+        assert ("--control-dt 0.1" in text.getvalue()) == is_said
 
 
 def test_a_gripper_alone_has_no_joints(source):
