@@ -17,6 +17,8 @@ from lorasp_jax.adapters.io import native
 from lorasp_jax.base import hub
 from lorasp_jax.base.digest import digest
 from lorasp_jax.models import backbone
+from lorasp_jax.models.backbone import Backbone
+from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.policies import tokenizer
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor
@@ -105,7 +107,6 @@ def _metadata(run: Run) -> dict[str, Any]:
             "instructions": list(processor.prompts.instructions),
             "num_joints": len(processor.state_slots) - 1,
             "action_length": len(processor.action_slots),
-            "relative": list(processor.inputs.delta),
             **(robots[default] if default else _robot(processor)),
             **({"dataset": default, "datasets": robots} if robots else {}),
         },
@@ -150,26 +151,31 @@ def load_policy(
         raise ValueError(f"the policy of {folder} acts for {names}, not for {dataset!r}")
     try:
         policy = metadata["policy"]
-        config = backbone.find(policy["backbone"]).from_dict(policy["config"])
+        if dataset:
+            policy = policy | policy["datasets"][dataset]
+        config = _config(policy)
         source = folder / BASE if is_full else base or hub.resolve_portable(metadata["base"])
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} does not describe a policy") from error
-    if not source:
-        raise ValueError(f"the base of {folder} was randomly initialized and not saved")
-    try:
-        model = models.load(source, config)
-    except ValueError as error:
-        hint = "" if is_full else f"; pass base= if the base of {folder} has moved"
-        raise ValueError(f"{error}{hint}") from error
+    model = _base(folder, source, config, is_full=is_full)
     if not is_full:
         model = native.load_adapters(folder, model, any_base=any_base)
     model = quantized(model, metadata.get(QUANTIZED))
     try:
-        if dataset:
-            policy = policy | policy["datasets"][dataset]
         return Policy(model, _processor(policy, config, words))
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path} does not describe a policy") from error
+
+
+def _base(folder: Path, source: Any, config: BackboneConfig, *, is_full: bool) -> Backbone:
+    """Load the base of the run in `folder`; `is_full`: it is the trained one."""
+    if not source:
+        raise ValueError(f"the base of {folder} was randomly initialized and not saved")
+    try:
+        return models.load(source, config)
+    except ValueError as error:
+        hint = "" if is_full else f"; pass base= if the base of {folder} has moved"
+        raise ValueError(f"{error}{hint}") from error
 
 
 def describe(folder: str | os.PathLike[str]) -> dict[str, Any]:
@@ -203,7 +209,15 @@ def _read_metadata(folder: Path) -> tuple[dict[str, Any], Path, bool]:
     return metadata, path, is_full
 
 
-def _processor(policy: Mapping[str, Any], config: Any, words: str) -> Processor:
+def _config(policy: Mapping[str, Any]) -> BackboneConfig:
+    """Return the config of a policy's backbone."""
+    config = backbone.find(policy["backbone"]).from_dict(policy["config"])
+    # Older runs have the mask of relative actions beside the config, which may have the base's.
+    delta = tuple(policy.get("relative", config.inputs.delta))
+    return dataclasses.replace(config, inputs=dataclasses.replace(config.inputs, delta=delta))
+
+
+def _processor(policy: Mapping[str, Any], config: BackboneConfig, words: str) -> Processor:
     joints = policy["num_joints"]
     try:
         loaded = tokenizer.load_tokenizer(words or hub.resolve_portable(policy["tokenizer"]))
@@ -222,7 +236,6 @@ def _processor(policy: Mapping[str, Any], config: Any, words: str) -> Processor:
         num_joints=joints,
         action_length=policy.get("action_length"),  # older runs: as long as states
         cameras=policy["cameras"],
-        delta=policy["relative"],
     )
 
 
