@@ -55,7 +55,7 @@ def evaluate(options: argparse.Namespace, console: Console) -> None:
     from lorasp_jax.training import export
 
     cache.enable()
-    source = open_source(options.data, keys_of(options))
+    source = open_source(options.data, keys_of(options, options.data))
     described = export.describe(options.run)
     period = described["control_dt"]
     if not same_period(source.control_dt, period):
