@@ -14,7 +14,7 @@ from envs.datasets.episodes import Episodes
 from lorasp_jax.adapters.compress.quantization import is_quantized
 from lorasp_jax.config import VALIDATION_WINDOWS
 from lorasp_jax.data.batches import Batch, RawBatch, Steps, encode, flatten, gather
-from lorasp_jax.data.cache import Cache
+from lorasp_jax.data.joined import dataset_of, parts_of
 from lorasp_jax.data.source import Source, dimension_names, grippers
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.policies.policy import Policy
@@ -168,8 +168,8 @@ def windows(
     for number in chosen:
         episode = source.episode(number)
         steps = _steps(episode, policy)
-        if isinstance(source, Cache) and source.parts[1:]:
-            dataset = np.full_like(steps.end, source.dataset[number])
+        if parts_of(source)[1:]:
+            dataset = np.full_like(steps.end, dataset_of(source)[number])
             steps = dataclasses.replace(steps, dataset=dataset)
         all_starts = [*range(0, len(steps.end), every or 1)]
         starts = np.array(_evenly(all_starts, limit if every else share), np.int32)
@@ -199,10 +199,9 @@ def windows(
 
 def episodes_of(source: Source, dataset: str) -> list[int]:
     """Return the numbers of the episodes of one of the datasets in a cache, or of all episodes."""
-    if isinstance(source, Cache):
-        names = [part.name for part in source.parts]
-        if dataset in names:
-            return np.flatnonzero(source.dataset == names.index(dataset)).tolist()
+    names = [part.name for part in parts_of(source)]
+    if dataset in names:
+        return np.flatnonzero(dataset_of(source) == names.index(dataset)).tolist()
     return [*range(len(source))]
 
 
