@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -162,22 +163,12 @@ def windows(
         ValueError: the policy has no prompt for an instruction, an episode is damaged, or its
             actions are not what policies give.
     """
-    chunk, chosen = policy.model.config.chunk, _evenly([*episodes], limit)
-    share = limit // len(chosen)
-    parts, previous, where = [], [], []
-    for number in chosen:
-        episode = source.episode(number)
-        steps = _steps(episode, policy)
-        if parts_of(source)[1:]:
-            dataset = np.full_like(steps.end, dataset_of(source)[number])
-            steps = dataclasses.replace(steps, dataset=dataset)
-        all_starts = [*range(0, len(steps.end), every or 1)]
-        starts = np.array(_evenly(all_starts, limit if every else share), np.int32)
-        parts.append(gather(steps, starts, chunk))
-        previous.append(steps.action[starts - 1])
-        phrase = episode.instructions[int(episode.instruction[0])]
-        where += [(episode.task, phrase, number, int(start)) for start in starts]
+    chosen = _evenly([*episodes], limit)
+    share = limit if every else limit // len(chosen)
+    read = [_read(source, number, policy, every or 1, share) for number in chosen]
+    parts, previous, lists = zip(*read, strict=True)
     raw = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    where = itertools.chain(*lists)
     task, phrases, number, start = zip(*where, strict=True)
     targets = _are_targets(raw.state, raw.actions[:, 0])
     still = raw.state if targets else 0 * raw.actions[:, 0]
@@ -203,6 +194,25 @@ def episodes_of(source: Source, dataset: str) -> list[int]:
     if dataset in names:
         return np.flatnonzero(dataset_of(source) == names.index(dataset)).tolist()
     return [*range(len(source))]
+
+
+def _read(
+    source: Source, number: int, policy: Policy, every: int, limit: int
+) -> tuple[RawBatch, np.ndarray, list[tuple[str, str, int, int]]]:
+    """Return windows of an episode, the actions before them, and where they are.
+
+    That is task, instruction, number of the episode and step.
+    """
+    episode = source.episode(number)
+    steps = _steps(episode, policy)
+    if parts_of(source)[1:]:
+        dataset = np.full_like(steps.end, dataset_of(source)[number])
+        steps = dataclasses.replace(steps, dataset=dataset)
+    starts = np.array(_evenly(range(0, len(steps.end), every), limit), np.int32)
+    phrase = episode.instructions[int(episode.instruction[0])]
+    where = [(episode.task, phrase, number, int(start)) for start in starts]
+    raw = gather(steps, starts, policy.model.config.chunk)
+    return raw, np.asarray(steps.action[starts - 1]), where
 
 
 def _steps(episode: Episodes, policy: Policy) -> Steps:
