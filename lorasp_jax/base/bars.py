@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable
+from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -18,12 +19,15 @@ from rich.text import Text
 
 Report = Callable[[int, int], None]
 """Called with the number of items done and the total."""
+_QUIET = 30.0  # s
 _PERIOD = 600.0
 """Time over which the rate is averaged [s]; no rate is shown until two updates fall within it."""
 
 
 def bars(console: Console, unit: str, *, per_step: int = 1, shown: bool = True) -> Progress:
     """Make progress bars with counts, a rate and the remaining time.
+
+    Where no bars can be drawn, as in a file or a pipe, a line is printed now and then.
 
     Args:
         console: console to draw on.
@@ -38,7 +42,7 @@ def bars(console: Console, unit: str, *, per_step: int = 1, shown: bool = True) 
         TimeRemainingColumn(),
         _Rate(unit, per_step),
     )
-    return Progress(*columns, console=console, disable=not shown, speed_estimate_period=_PERIOD)
+    return _Bars(*columns, console=console, disable=not shown, speed_estimate_period=_PERIOD)
 
 
 def collecting(progress: Progress, title: str, stop: threading.Event) -> Report:
@@ -59,6 +63,26 @@ def collecting(progress: Progress, title: str, stop: threading.Event) -> Report:
             progress.update(bar, completed=done, description=f"{title}: collecting")
 
     return report
+
+
+class _Bars(Progress):
+    """Bars, or else a line at most every `_QUIET` seconds."""
+
+    def __init__(self, *columns: ProgressColumn, **options: Any) -> None:
+        super().__init__(*columns, **options)
+        self._texts = [column for column in columns if not isinstance(column, BarColumn)]
+        self._said = self.get_time()
+
+    def update(self, task_id: TaskID, **changes: Any) -> None:
+        super().update(task_id, **changes)
+        console, now = self.console, self.get_time()
+        if self.disable or console.is_interactive or console.is_jupyter:
+            return
+        if now - self._said >= _QUIET:
+            self._said = now
+            texts = [str(column(self._tasks[task_id])) for column in self._texts]
+            line = " ".join(filter(None, texts))
+            console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
 class _Rate(ProgressColumn):

@@ -1,6 +1,8 @@
 """Locks that let one process at a time write a file or folder."""
 
 import contextlib
+import os
+import platform
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -17,8 +19,8 @@ _RETRY = 0.2  # s, long enough for a second attempt if the last holder deletes t
 def locked(path: Path, waiting: Callable[[], None] | None = None) -> Iterator[None]:
     """Keep other processes and threads from writing the same file or folder.
 
-    The lock is a file next to the path, deleted at the end. If the block raises, empty folders
-    created for it are deleted, too.
+    The lock is a file next to the path, which names its holder and is deleted at the end. If the
+    block raises, empty folders created for it are deleted, too.
 
     Args:
         path: the file or folder.
@@ -36,11 +38,13 @@ def locked(path: Path, waiting: Callable[[], None] | None = None) -> Iterator[No
             lock = acquire(file)
         except filelock.Timeout as error:
             if waiting is None:
-                raise ValueError(f"another process is writing {path}") from error
+                remedy = "wait for it, stop it or choose another name"
+                raise ValueError(f"{path} is in use by {_holder(file)}: {remedy}") from error
             waiting()
             lock = acquire(file, wait=True)
         with lock:
             try:
+                file.write_text(f"process {os.getpid()} on {platform.node()}\n")
                 yield
             finally:
                 file.unlink(missing_ok=True)
@@ -49,6 +53,14 @@ def locked(path: Path, waiting: Callable[[], None] | None = None) -> Iterator[No
             with contextlib.suppress(OSError):  # not empty, or never created
                 folder.rmdir()
         raise
+
+
+def _holder(file: Path) -> str:
+    """Return the process that holds a lock, whose file it may be deleting."""
+    text = ""
+    with contextlib.suppress(FileNotFoundError):
+        text = file.read_text().strip()
+    return text or "another process"
 
 
 def acquire(file: Path, *, wait: bool = False) -> AbstractContextManager[Any]:

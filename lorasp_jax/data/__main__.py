@@ -7,13 +7,14 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
 from lorasp_jax.base.bars import bars
 from lorasp_jax.base.errors import run_command
 from lorasp_jax.base.files import check_local
+from lorasp_jax.data import dataset_file
 from lorasp_jax.data.keys import Keys
 
 if TYPE_CHECKING:
@@ -33,10 +34,10 @@ def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.data") -
 
 def inspect(options: argparse.Namespace, console: Console) -> None:
     """Print a summary of a dataset, write a contact sheet of its images, and save the options."""
-    from lorasp_jax.data import dataset_file, inspection
+    from lorasp_jax.data import inspection
     from lorasp_jax.data.opening import open_source
 
-    keys = keys_of(options)
+    keys = keys_of(options, options.path)
     source = open_source(options.path, keys)
     for name, file in (("out", options.out), ("save", options.save)):
         if file:
@@ -63,7 +64,7 @@ def convert(options: argparse.Namespace, console: Console) -> None:
     count = len(options.paths)
     if options.to != "cache" and count > 1:
         raise ValueError(f"--to {options.to} converts exactly one dataset, got {count}")
-    source = open_sources(options.paths, keys_of(options))
+    source = open_sources(options.paths, keys_of(options, *options.paths))
     if unused := describe_left_out(source):
         console.print(unused, soft_wrap=True, highlight=False, markup=False)
     if options.to != "cache":
@@ -119,40 +120,49 @@ def parser(program: str) -> argparse.ArgumentParser:
 
 
 def add_keys(parser: argparse.ArgumentParser) -> None:
-    """Add one option per field of `Keys`."""
-    add = parser.add_argument_group("LeRobot datasets").add_argument
-    default = "(default: %(default)s)"
-    add("--state", default=Keys.state, help=f"feature with measured joints and gripper {default}")
-    text = f"feature with commanded joints and gripper {default}"
-    add("--action", default=Keys.action, help=text)
+    """Add one option per field of `Keys`; those that are not given are missing in the result."""
+    group = parser.add_argument_group("LeRobot datasets")
+    add = functools.partial(group.add_argument, default=argparse.SUPPRESS)
+    text = f"feature with measured joints and gripper (default: {Keys.state})"
+    add("--state", help=text)
+    text = f"feature with commanded joints and gripper (default: {Keys.action})"
+    add("--action", help=text)
     text = "dimensions to use, by name or index: joints first, gripper last (default: all)"
-    add("--state-numbers", nargs="+", default=(), metavar="NAME", help=text)
-    add("--action-numbers", nargs="+", default=(), metavar="NAME", help=text)
+    add("--state-numbers", nargs="+", metavar="NAME", help=text)
+    add("--action-numbers", nargs="+", metavar="NAME", help=text)
     text = "gripper openings among the dimensions in use (default: those so named, or the last)"
-    add("--grippers", nargs="+", default=(), metavar="NAME", help=text)
+    add("--grippers", nargs="+", metavar="NAME", help=text)
     text = "cameras to use, also by the last part of their names, and names of your choice for "
     text += "them, in datasets of any format (default: all)"
-    add("--cameras", nargs="+", default=(), metavar="[NAME=]FEATURE", type=_camera, help=text)
-    text = f"unit of the joints {default}"
-    add("--angles", choices=("radians", "degrees"), default=Keys.angles, help=text)
-    text = f"unit of the gripper opening {default}"
-    add("--gripper", choices=("metres", "millimetres"), default=Keys.gripper, help=text)
-    add("--every", type=int, default=1, help=f"keep every N-th frame {default}")
-    text = f"downscale images whose longer side exceeds this length [px]; 0: never {default}"
-    add("--image-size", type=int, default=224, help=text)
+    add("--cameras", nargs="+", metavar="[NAME=]FEATURE", type=_camera, help=text)
+    text = f"unit of the joints (default: {Keys.angles})"
+    add("--angles", choices=("radians", "degrees"), help=text)
+    text = f"unit of the gripper opening (default: {Keys.gripper})"
+    add("--gripper", choices=("metres", "millimetres"), help=text)
+    add("--every", type=int, help=f"keep every N-th frame (default: {Keys.every})")
+    text = "downscale images whose longer side exceeds this length [px]; 0: never "
+    group.add_argument("--image-size", type=int, default=224, help=f"{text}(default: %(default)s)")
 
 
-def keys_of(options: argparse.Namespace) -> Keys:
-    """Return the values of the options of `add_keys`."""
-    values: dict[str, Any] = {
-        field.name: getattr(options, field.name) for field in dataclasses.fields(Keys)
-    }
-    for name in ("state_numbers", "action_numbers", "grippers"):
-        values[name] = tuple(values[name])
-    values["cameras"] = dict(options.cameras)
-    if len(values["cameras"]) < len(options.cameras):
-        raise ValueError(f"--cameras must have unique names, got {options.cameras}")
-    return Keys(**values)
+def keys_of(options: argparse.Namespace, *paths: str) -> Keys:
+    """Return the values of the options of `add_keys` for these datasets.
+
+    Raises:
+        ValueError: an option is given beside a dataset file, or two cameras have one name.
+    """
+    names = (field.name for field in dataclasses.fields(Keys))
+    given = {name: getattr(options, name) for name in names if hasattr(options, name)}
+    file = next(filter(dataset_file.is_file, paths), None)
+    if file and (option := next((name for name in given if name != "image_size"), None)):
+        raise ValueError(
+            f"--{option.replace('_', '-')} is one of the dataset's options, which {file} has: "
+            "change it there"
+        )
+    cameras = given.get("cameras", ())
+    if len(dict(cameras)) < len(cameras):
+        raise ValueError(f"--cameras must have unique names, got {cameras}")
+    lists = {name: tuple(value) for name, value in given.items() if isinstance(value, list)}
+    return Keys(**{**given, **lists, "cameras": dict(cameras)})
 
 
 def _camera(text: str) -> tuple[str, str]:

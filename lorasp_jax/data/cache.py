@@ -32,7 +32,7 @@ from lorasp_jax.base.locks import locked
 from lorasp_jax.base.writing import atomic_folder
 from lorasp_jax.data.batches import Steps
 from lorasp_jax.data.cache_writer import Column, map_column
-from lorasp_jax.data.joined import Joined, Part, Renamed, parts_of
+from lorasp_jax.data.joined import Joined, Part, Renamed, dataset_of, parts_of
 from lorasp_jax.data.source import Progress, Source, dimension_names, grippers
 
 FORMAT = "lorasp-cache-2"
@@ -259,9 +259,7 @@ class Cache:
     @property
     def dataset(self) -> np.ndarray:
         """Index of each episode's dataset among `parts`, `[E]` int32."""
-        counts = [part.episodes for part in self.parts]
-        index = np.arange(len(counts), dtype=np.int32)
-        return np.repeat(index, counts) if counts[1:] else np.zeros(len(self), np.int32)
+        return dataset_of(self)
 
     def part_of(self, task: str) -> Part:
         """Return the first dataset with a task."""

@@ -20,7 +20,7 @@ from rich.table import Table
 from envs.datasets.episodes import Episodes
 from envs.rendering.video import side_by_side
 from lorasp_jax.base.writing import atomic_file
-from lorasp_jax.config import AugmentConfig
+from lorasp_jax.config import AugmentConfig, Config
 from lorasp_jax.data.augmentation import Augment, on_wrist, recipe
 from lorasp_jax.data.source import Source, describe_left_out, grippers, same_period
 from lorasp_jax.data.video import downscale
@@ -28,7 +28,7 @@ from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.policies.offline_tokenizer import num_tokens
 
 EPISODES, FRAMES, TILE, LINE = 6, 5, 128, 14
-"""Contact sheet: episodes, time steps per episode, longer image side [px], caption height [px]."""
+"""Contact sheet: episodes, time steps per episode, longer image side, height of a line [px]."""
 _MAX_INSTRUCTIONS = 10  # in the report
 _END_EFFECTOR = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")  # action dimensions
 
@@ -103,7 +103,7 @@ def report(source: Source, console: Console) -> None:
         f"median {np.median(summary.length):g}",
         "steps": f"{steps} at {hertz:g} Hz, {minutes:.1f} minutes",
     }
-    if not same_period(source.control_dt, 0.1):
+    if not same_period(source.control_dt, Config.control_dt):
         lines["steps"] += f"; train with --control-dt {source.control_dt:.4g}, or see --every"
     if unused := describe_left_out(source):
         console.print(unused, style="yellow", soft_wrap=True, highlight=False, markup=False)
@@ -167,12 +167,13 @@ def contact_sheet(source: Source, preset: str = "none") -> np.ndarray:
     """Draw up to `EPISODES` episodes, one per row: frames over time, cameras side by side.
 
     With the preset of an `AugmentConfig`, a row shows one frame instead, followed by what training
-    may make of it.
+    may make of it. The first row names the cameras and says which is which.
 
     Returns:
         uint8 `[H, W, 3]`.
     """
-    rows = [_row(source, number, preset) for number in _spread(len(source), EPISODES)]
+    numbers = _spread(len(source), EPISODES)
+    rows = [_row(source, number, preset, titles=number == numbers[0]) for number in numbers]
     width = max(row.shape[1] for row in rows)
     padded = [np.pad(row, [(0, 0), (0, width - row.shape[1]), (0, 0)]) for row in rows]
     return np.concatenate(padded)
@@ -198,8 +199,8 @@ def write_contact_sheet(source: Source, path: Path, preset: str = "none") -> Non
         sheet.save(temporary, format="png")
 
 
-def _row(source: Source, number: int, preset: str) -> np.ndarray:
-    """Draw frames of one episode, with its instruction as caption."""
+def _row(source: Source, number: int, preset: str, *, titles: bool) -> np.ndarray:
+    """Draw frames of one episode, with its instruction as caption; `titles` are those of images."""
     episode = source.episode(number)
     frames = []
     steps = _spread(episode.num_steps, FRAMES)
@@ -212,14 +213,25 @@ def _row(source: Source, number: int, preset: str) -> np.ndarray:
             name: np.pad(tile, [(0, height - tile.shape[0]), (0, 0), (0, 0)])
             for name, tile in tiles.items()
         }
+        if titles:
+            kind = "" if preset == "none" else f"draw {column}, " if column else "original, "
+            padded = {
+                name: np.concatenate([_text(f"{kind}{name}", tile.shape[1]), tile])
+                for name, tile in padded.items()
+            }
         frames.append(np.pad(side_by_side(padded), [(0, 2), (0, 2), (0, 0)]))
     images = np.concatenate(frames, axis=1)
-    caption = Image.new("RGB", (images.shape[1], LINE))
     phrase = episode.instructions[int(episode.instruction[0])]
     text = f"{number}: {phrase} ({episode.num_steps} steps)"
+    return np.concatenate([_text(text, images.shape[1]), images])
+
+
+def _text(text: str, width: int) -> np.ndarray:
+    """Draw a line of text, cut at `width` pixels."""
+    line = Image.new("RGB", (width, LINE))
     printable = text.encode("latin-1", "replace").decode("latin-1")  # the font has no others
-    ImageDraw.Draw(caption).text((2, 1), printable, fill="white")
-    return np.concatenate([np.asarray(caption), images])
+    ImageDraw.Draw(line).text((2, 1), printable, fill="white")
+    return np.asarray(line)
 
 
 def changed(image: np.ndarray, camera: str, preset: str, seed: int) -> np.ndarray:

@@ -36,6 +36,13 @@ def parts_of(source: Source) -> Sequence[Part]:
     return getattr(source, "parts", ())
 
 
+def dataset_of(source: Source) -> np.ndarray:
+    """Return the index of each episode's dataset among `parts_of`, `[E]` int32."""
+    counts = [part.episodes for part in parts_of(source)]
+    index = np.arange(len(counts), dtype=np.int32)
+    return np.repeat(index, counts) if counts[1:] else np.zeros(len(source), np.int32)
+
+
 class Renamed:
     """A dataset under other names of its cameras, which is otherwise as it was."""
 

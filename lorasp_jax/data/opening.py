@@ -28,9 +28,9 @@ def open_sources(
     if len(wheres) == 1:
         return open_source(wheres[0], keys, cameras)
     paths = [os.fspath(where) for where in wheres]
-    real = [os.path.realpath(path) for path in paths]
+    real = [_real(path) for path in paths]
     if twice := [path for path, where in zip(paths, real, strict=True) if real.count(where) > 1]:
-        raise ValueError(f"{twice[0]} is named twice")
+        raise ValueError(f"{twice[0]} is named twice, also as {twice[1]}")
     short = [_name(path) for path in paths]
     names = dict(zip(short if len({*short}) == len(short) else paths, paths, strict=True))
     return Joined({name: open_source(path, keys) for name, path in names.items()}, cameras, fit)
@@ -72,6 +72,12 @@ def open_source(
         f"{where} is not a dataset: expected a folder with meta/info.json (LeRobot), "
         f"{rlds.METADATA} (RLDS, from python -m envs collect) or {HEADER} (cache)"
     )
+
+
+def _real(where: str) -> str:
+    """Return where the dataset is; two files may name one."""
+    path = dataset_file.read(where, 0)[0] if dataset_file.is_file(where) else where
+    return path if hub.is_remote(path) else os.path.realpath(path)
 
 
 def _name(where: str | os.PathLike[str]) -> str:

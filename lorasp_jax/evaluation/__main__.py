@@ -50,21 +50,13 @@ def evaluate(options: argparse.Namespace, console: Console) -> None:
     """
     from lorasp_jax.base import compilation_cache as cache
     from lorasp_jax.data.opening import open_source
-    from lorasp_jax.data.source import same_period
     from lorasp_jax.evaluation import held_out, held_out_figure
     from lorasp_jax.training import export
 
     cache.enable()
-    source = open_source(options.data, keys_of(options))
+    source = open_source(options.data, keys_of(options, options.data))
     described = export.describe(options.run)
-    period = described["control_dt"]
-    if not same_period(source.control_dt, period):
-        shorter = source.control_dt < period
-        remedy = "pass --every N to keep every N-th frame" if shorter else "record more often"
-        raise ValueError(
-            f"{options.data} has a control period of {source.control_dt:.4g} s, but {options.run} "
-            f"was trained with {period:.4g} s: {remedy}"
-        )
+    _check_period(options, source.control_dt, described["control_dt"])
     acts_for = options.dataset or described.get("policy", {}).get("dataset", "")
     numbers = options.episodes or held_out.episodes_of(source, acts_for)
     if wrong := [number for number in numbers if not 0 <= number < len(source)]:
@@ -90,6 +82,18 @@ def evaluate(options: argparse.Namespace, console: Console) -> None:
     steps = {"num_steps": options.denoise_steps}
     for path in held_out_figure.write(folder, policy, source, numbers, **steps):
         console.print(f"picture: {path}", soft_wrap=True, highlight=False, markup=False)
+
+
+def _check_period(options: argparse.Namespace, recorded: float, trained: float) -> None:
+    """Raise ValueError unless the dataset has the period [s] of the run."""
+    from lorasp_jax.data.source import same_period
+
+    if not same_period(recorded, trained):
+        remedy = "pass --every N to keep every N-th frame"
+        raise ValueError(
+            f"{options.data} has a control period of {recorded:.4g} s, but {options.run} was "
+            f"trained with {trained:.4g} s: {remedy if recorded < trained else 'record more often'}"
+        )
 
 
 def _table(

@@ -2,7 +2,8 @@
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,12 +14,12 @@ import numpy as np
 from envs.datasets.episodes import Episodes
 from lorasp_jax.adapters.compress.quantization import is_quantized
 from lorasp_jax.config import VALIDATION_WINDOWS
-from lorasp_jax.data.batches import Batch, RawBatch, Steps, encode, flatten, gather
-from lorasp_jax.data.cache import Cache
+from lorasp_jax.data.batches import RawBatch, Steps, encode, flatten, gather
+from lorasp_jax.data.joined import dataset_of, parts_of
 from lorasp_jax.data.source import Source, dimension_names, grippers
-from lorasp_jax.models.observation import Observation
+from lorasp_jax.models import flow_matching
+from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.policies.policy import Policy
-from lorasp_jax.policies.processor import Processor
 
 MAX_WINDOWS, FEW_WINDOWS = 256, 64
 """Largest number of windows that are measured, over all tasks; the second while a CPU trains."""
@@ -162,22 +163,12 @@ def windows(
         ValueError: the policy has no prompt for an instruction, an episode is damaged, or its
             actions are not what policies give.
     """
-    chunk, chosen = policy.model.config.chunk, _evenly([*episodes], limit)
-    share = limit // len(chosen)
-    parts, previous, where = [], [], []
-    for number in chosen:
-        episode = source.episode(number)
-        steps = _steps(episode, policy)
-        if isinstance(source, Cache) and source.parts[1:]:
-            dataset = np.full_like(steps.end, source.dataset[number])
-            steps = dataclasses.replace(steps, dataset=dataset)
-        all_starts = [*range(0, len(steps.end), every or 1)]
-        starts = np.array(_evenly(all_starts, limit if every else share), np.int32)
-        parts.append(gather(steps, starts, chunk))
-        previous.append(steps.action[starts - 1])
-        phrase = episode.instructions[int(episode.instruction[0])]
-        where += [(episode.task, phrase, number, int(start)) for start in starts]
+    chosen = _evenly([*episodes], limit)
+    share = limit if every else limit // len(chosen)
+    read = [_read(source, number, policy, every or 1, share) for number in chosen]
+    parts, previous, lists = zip(*read, strict=True)
     raw = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    where = itertools.chain(*lists)
     task, phrases, number, start = zip(*where, strict=True)
     targets = _are_targets(raw.state, raw.actions[:, 0])
     still = raw.state if targets else 0 * raw.actions[:, 0]
@@ -199,11 +190,29 @@ def windows(
 
 def episodes_of(source: Source, dataset: str) -> list[int]:
     """Return the numbers of the episodes of one of the datasets in a cache, or of all episodes."""
-    if isinstance(source, Cache):
-        names = [part.name for part in source.parts]
-        if dataset in names:
-            return np.flatnonzero(source.dataset == names.index(dataset)).tolist()
+    names = [part.name for part in parts_of(source)]
+    if dataset in names:
+        return np.flatnonzero(dataset_of(source) == names.index(dataset)).tolist()
     return [*range(len(source))]
+
+
+def _read(
+    source: Source, number: int, policy: Policy, every: int, limit: int
+) -> tuple[RawBatch, np.ndarray, list[tuple[str, str, int, int]]]:
+    """Return windows of an episode, the actions before them, and where they are.
+
+    That is task, instruction, number of the episode and step.
+    """
+    episode = source.episode(number)
+    steps = _steps(episode, policy)
+    if parts_of(source)[1:]:
+        dataset = np.full_like(steps.end, dataset_of(source)[number])
+        steps = dataclasses.replace(steps, dataset=dataset)
+    starts = np.array(_evenly(range(0, len(steps.end), every), limit), np.int32)
+    phrase = episode.instructions[int(episode.instruction[0])]
+    where = [(episode.task, phrase, number, int(start)) for start in starts]
+    raw = gather(steps, starts, policy.model.config.chunk)
+    return raw, np.asarray(steps.action[starts - 1]), where
 
 
 def _steps(episode: Episodes, policy: Policy) -> Steps:
@@ -235,13 +244,11 @@ def measure(policy: Policy, found: Windows, *, num_steps: int = 10) -> HeldOut:
         found: from `windows`.
         num_steps: Euler steps of the flow-matching sampler.
     """
-    sums = [_loss(policy.model, b, fresh, keys[0]) for b, _, fresh, keys in _batches(policy, found)]
-    loss, valid = np.array(jax.device_get(sums), np.float64).T.sum(axis=1).tolist()
-    actions = sample(policy, found, num_steps=num_steps)
+    actions, loss = _run(policy, found, num_steps)
     compared = actions, found.still[:, None], found.previous[:, None]
     errors = (_errors(values, found.raw) for values in compared)
     return HeldOut(
-        loss / valid,
+        loss,
         *errors,
         actions=actions,
         units=found.units,
@@ -250,66 +257,53 @@ def measure(policy: Policy, found: Windows, *, num_steps: int = 10) -> HeldOut:
 
 
 def sample(policy: Policy, found: Windows, *, num_steps: int = 10) -> np.ndarray:
-    """Return the chunks `[N, C, J+1]` that `measure` compares; same arguments.
+    """Return the chunks `[N, C, J+1]` that `measure` compares; same arguments."""
+    return _run(policy, found, num_steps)[0]
+
+
+def _run(policy: Policy, found: Windows, num_steps: int) -> tuple[np.ndarray, float]:
+    """Return the chunks `[N, C, J+1]` and the mean loss.
 
     A policy that is quantized to save memory is not copied into a sampler, which would be faster.
     """
-    sampling = policy if is_quantized(policy.model) else policy.with_sampler()
-    chunks = [
-        np.asarray(
-            _actions(sampling, b.observation, raw.state, raw.dataset, keys[1], num_steps=num_steps)
-        )[fresh]
-        for b, raw, fresh, keys in _batches(policy, found)
-    ]
-    return np.concatenate(chunks)
-
-
-def _batches(
-    policy: Policy, found: Windows
-) -> Iterator[tuple[Batch, RawBatch, np.ndarray, jax.Array]]:
-    """Yield encoded batches of windows, the raw ones, which rows are new, and two keys."""
+    policy = policy if is_quantized(policy.model) else policy.with_sampler()
     count, key = len(found.task), jax.random.key(0)
+    chunks, sums = [], []
     for first in range(0, count, VALIDATION_WINDOWS):
         rows = np.arange(first, first + VALIDATION_WINDOWS)
         raw = jax.tree.map(lambda x, rows=rows: x[rows % count], found.raw)  # the last wraps around
-        keys = jax.random.split(jax.random.fold_in(key, first), 2)
-        yield _encode(policy.processor, raw), raw, rows < count, keys
-
-
-@jax.jit
-def _encode(processor: Processor, raw: RawBatch) -> Batch:
-    return encode(jax.random.key(0), raw, processor, state_noise=0.0)
-
-
-@jax.jit
-def _loss(
-    model: Any, batch: Batch, fresh: jax.Array, key: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Return the sum of the flow-matching loss over valid elements, and their number."""
-    mask = batch.action_mask & jnp.asarray(fresh)[:, None, None]
-
-    def one(key: jax.Array) -> jax.Array:
-        observed, actions = batch.observation, batch.actions
-        loss, _ = model.loss(key, observed, actions, action_mask=batch.action_mask)
-        return jnp.sum(loss * mask)
-
-    return jax.lax.map(one, jax.random.split(key, _NOISES)).sum(), _NOISES * mask.sum()
+        fresh, keys = rows < count, jax.random.split(jax.random.fold_in(key, first), 2)
+        chunk, *loss = jax.device_get(_program(policy, raw, fresh, keys, num_steps=num_steps))
+        chunks.append(chunk[fresh])
+        sums.append(loss)
+    loss, valid = np.array(sums, np.float64).sum(axis=0).tolist()
+    return np.concatenate(chunks), loss / valid
 
 
 @functools.partial(jax.jit, static_argnames="num_steps")
-def _actions(
-    policy: Policy,
-    observation: Observation,
-    state: jax.Array,
-    dataset: Any,
-    key: jax.Array,
-    *,
-    num_steps: int,
-) -> jax.Array:
-    processor = policy.processor.of_rows(dataset)
-    slots = processor.flow_slots
-    chunk = policy.model.sample_actions(key, observation, num_steps=num_steps, slots=slots)
-    return processor.decode(chunk, jnp.asarray(state))
+def _program(
+    policy: Policy, raw: RawBatch, fresh: jax.Array, keys: jax.Array, *, num_steps: int
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return chunks, the sum of the flow-matching loss over valid elements, and their number.
+
+    Both see the same encoded observations. Rows that are not `fresh` do not count in the loss.
+    """
+    batch, model = encode(keys[0], raw, policy.processor, state_noise=0.0), policy.model
+    sampler = model if isinstance(model, Sampler) else Sampler.from_model(model, once=True)
+    velocity, _ = sampler.encode(batch.observation)
+    mask = batch.action_mask & jnp.asarray(fresh)[:, None, None]
+
+    def loss(key: jax.Array) -> jax.Array:
+        used = batch.action_mask.any(axis=1, keepdims=True)
+        return jnp.sum(mask * flow_matching.loss(velocity, key, batch.actions, slots=used)[0])
+
+    losses = jax.lax.map(loss, jax.random.split(keys[0], _NOISES))
+    noise = jax.random.normal(keys[1], batch.actions.shape)
+    slots = jnp.asarray(policy.processor.flow_slots)
+    chunk, _ = flow_matching.sample(velocity, noise, num_steps=num_steps, slots=slots)
+    dataset: Any = raw.dataset
+    actions = policy.processor.of_rows(dataset).decode(chunk, jnp.asarray(raw.state))
+    return actions, losses.sum(), _NOISES * mask.sum()
 
 
 def _errors(actions: np.ndarray, raw: RawBatch) -> Errors:

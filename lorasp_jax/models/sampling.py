@@ -102,15 +102,19 @@ class Sampler:
         if noise is None:
             shape = (obs.state.shape[0], self.config.chunk, self.config.action_dim)
             noise = jax.random.normal(key, shape)
-        prefix_model, suffix_model = self._models()
-        encoded, aux = prefix_model.run_prefix(obs)
-        encoded, sample = encoded.by_layer(), flow_matching.sample
+        velocity, aux = self.encode(obs)
+        sample = flow_matching.sample
         if prefix is not None:
             condition = {"prefix": prefix, "length": prefix_length, "guidance": guidance}
             sample = functools.partial(real_time_chunking.sample, overlap=overlap, **condition)
-        velocity = lambda x_t, t: suffix_model.run_suffix(encoded, obs, x_t, t)  # noqa: E731
         actions, action_aux = sample(velocity, noise, num_steps=num_steps, slots=slots)
         return (actions, _with_steps(aux, action_aux, num_steps)) if return_aux else actions
+
+    def encode(self, obs: Observation) -> tuple[flow_matching.Velocity, ModelAux]:
+        """Return the velocity given an observation, which is encoded once, and the aux of that."""
+        prefix_model, suffix_model = self._models()
+        prefix, aux = prefix_model.run_prefix(obs)
+        return functools.partial(suffix_model.run_suffix, prefix.by_layer(), obs), aux
 
     def _models(self) -> Iterator["Backbone"]:
         """Rebuild the modules of the prefix and of the flow steps."""

@@ -81,7 +81,11 @@ class Offline:
         rows = [_tokenizer().encode(text).ids for text in texts]
         for text, row in zip(texts, rows, strict=True):
             if not 0 < len(row) <= max_tokens:
-                raise ValueError(f"{text!r} must have 1 to {max_tokens} tokens, got {len(row)}")
+                longest = max(map(len, rows))
+                raise ValueError(
+                    f"{text!r} must have 1 to {max_tokens} tokens, got {len(row)}"
+                    f"{f': shorten it, or train with --model.max-tokens {longest}' * bool(row)}"
+                )
             if VOCABULARY["[UNK]"] in row:
                 raise ValueError(f"cannot encode {text!r}: only ASCII words up to 100 characters")
         return pad(texts, rows, max_tokens, pad=0)

@@ -158,20 +158,18 @@ class Processor:
         num_joints: int,
         action_length: int | None = None,
         cameras: Mapping[str, str] | None = None,
-        delta: Sequence[bool] | None = None,
     ) -> "Processor":
         """Create the processor for a backbone's config.
 
         Args:
-            config: the backbone's sizes and input conventions.
+            config: the backbone's sizes and input conventions. With `inputs.delta`, the statistics
+                of actions must be those of relative ones.
             statistics: the robot's statistics, in the order of its joints or already in slots.
             prompts: tokenized prompts of the instructions.
             num_joints: J, such that states have J+1 numbers.
             action_length: length of the actions; None: J+1, too.
             cameras: backbone camera -> robot camera, see `camera_slots`; None if the names are
                 equal.
-            delta: mask of relative action dimensions, see `to_delta`. The action statistics must be
-                those of the relative actions. None selects the mask in the config.
 
         Raises:
             ValueError: joints, statistics or cameras do not fit the backbone, or the delta mask is
@@ -184,8 +182,6 @@ class Processor:
             statistics = statistics.to_slots(slots, config.action_dim, action_slots)
         pairs = () if cameras is None else camera_slots(config.cameras, cameras)
         inputs = config.inputs
-        if delta is not None:
-            inputs = dataclasses.replace(inputs, delta=tuple(delta))
         check_delta(inputs.delta, len(slots), len(action_slots))
         if inputs.aloha and {len(slots), len(action_slots)} != {aloha.NUMBERS}:
             raise ValueError(

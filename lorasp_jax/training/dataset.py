@@ -27,9 +27,7 @@ from lorasp_jax.policies.images import resize_with_pad, to_unit
 from lorasp_jax.policies.processor import robot_slots
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.run import Run
-from lorasp_jax.training.run_folder import record_dataset
-
-CACHE = Path("cache", "steps")
+from lorasp_jax.training.run_folder import CACHE, record_dataset
 
 
 def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:

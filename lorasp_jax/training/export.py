@@ -19,6 +19,8 @@ from lorasp_jax.adapters.io import native
 from lorasp_jax.base import hub
 from lorasp_jax.base.digest import digest
 from lorasp_jax.models import backbone
+from lorasp_jax.models.backbone import Backbone
+from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.policies import tokenizer
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor
@@ -107,7 +109,6 @@ def _metadata(run: Run) -> dict[str, Any]:
             "instructions": list(processor.prompts.instructions),
             "num_joints": len(processor.state_slots) - 1,
             "action_length": len(processor.action_slots),
-            "relative": list(processor.inputs.delta),
             **(robots[default] if default else _robot(processor)),
             **({"dataset": default, "datasets": robots} if robots else {}),
         },
@@ -152,28 +153,36 @@ def load_policy(
         raise ValueError(f"the policy of {folder} acts for {names}, not for {dataset!r}")
     try:
         policy = metadata["policy"]
-        config = backbone.find(policy["backbone"]).from_dict(policy["config"])
+        if dataset:
+            policy = policy | policy["datasets"][dataset]
+        config = _config(policy)
         source = folder / BASE if is_full else base or hub.resolve_portable(metadata["base"])
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} does not describe a policy") from error
+    kind = metadata.get(QUANTIZED)
+    model = _base(folder, source, config, is_full=is_full, to_host=bool(kind))
+    if not is_full:
+        model = native.load_adapters(folder, model, any_base=any_base)
+    graphdef, state = nnx.split(quantized(model, kind))
+    model = nnx.merge(graphdef, jax.tree.map(jnp.asarray, state))  # also adapters from the host
+    try:
+        return Policy(model, _processor(policy, config, words))
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path} does not describe a policy") from error
+
+
+def _base(
+    folder: Path, source: Any, config: BackboneConfig, *, is_full: bool, to_host: bool
+) -> Backbone:
+    """Load the base of the run in `folder`; `is_full`: it is the trained one."""
     if not source:
         raise ValueError(f"the base of {folder} was randomly initialized and not saved")
     try:
         load = functools.partial(models.load, source, config)
-        model = on_host(load) if metadata.get(QUANTIZED) else load()
+        return on_host(load) if to_host else load()
     except ValueError as error:
         hint = "" if is_full else f"; pass base= if the base of {folder} has moved"
         raise ValueError(f"{error}{hint}") from error
-    if not is_full:
-        model = native.load_adapters(folder, model, any_base=any_base)
-    graphdef, state = nnx.split(quantized(model, metadata.get(QUANTIZED)))
-    model = nnx.merge(graphdef, jax.tree.map(jnp.asarray, state))  # also adapters from the host
-    try:
-        if dataset:
-            policy = policy | policy["datasets"][dataset]
-        return Policy(model, _processor(policy, config, words))
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"{path} does not describe a policy") from error
 
 
 def describe(folder: str | os.PathLike[str]) -> dict[str, Any]:
@@ -207,7 +216,15 @@ def _read_metadata(folder: Path) -> tuple[dict[str, Any], Path, bool]:
     return metadata, path, is_full
 
 
-def _processor(policy: Mapping[str, Any], config: Any, words: str) -> Processor:
+def _config(policy: Mapping[str, Any]) -> BackboneConfig:
+    """Return the config of a policy's backbone."""
+    config = backbone.find(policy["backbone"]).from_dict(policy["config"])
+    # Older runs have the mask of relative actions beside the config, which may have the base's.
+    delta = tuple(policy.get("relative", config.inputs.delta))
+    return dataclasses.replace(config, inputs=dataclasses.replace(config.inputs, delta=delta))
+
+
+def _processor(policy: Mapping[str, Any], config: BackboneConfig, words: str) -> Processor:
     joints = policy["num_joints"]
     try:
         loaded = tokenizer.load_tokenizer(words or hub.resolve_portable(policy["tokenizer"]))
@@ -226,7 +243,6 @@ def _processor(policy: Mapping[str, Any], config: Any, words: str) -> Processor:
         num_joints=joints,
         action_length=policy.get("action_length"),  # older runs: as long as states
         cameras=policy["cameras"],
-        delta=policy["relative"],
     )
 
 

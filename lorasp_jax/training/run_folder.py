@@ -4,15 +4,13 @@ import contextlib
 import dataclasses
 import json
 import math
-import os
-import platform
+import shutil
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
 
-import filelock
 import numpy as np
 from tensorboardX import summary
 from tensorboardX.event_file_writer import EventsWriter
@@ -23,7 +21,7 @@ from envs.scene.ranges import Randomization
 from lorasp_jax.base.digest import verify_digest, with_digest
 from lorasp_jax.base.files import as_value_error, check_only_files, read_bytes
 from lorasp_jax.base.json_values import check
-from lorasp_jax.base.locks import acquire
+from lorasp_jax.base.locks import locked
 from lorasp_jax.base.writing import TEMPORARY_SUFFIX, write_text
 from lorasp_jax.config import AugmentConfig, Config, OptimConfig
 from lorasp_jax.peft.settings import without_removed
@@ -36,6 +34,8 @@ WILDCARDS = frozenset("*?[\\")
 """Not allowed in a run's path: Orbax treats paths as glob patterns and would find no checkpoint."""
 VALIDATION = "validation.json"
 """File with the final measurements on held-out episodes."""
+CACHE = Path("cache", "steps")
+"""The dataset of a run, converted."""
 STOPPED = "stopped.json"
 """File with the reason why training stopped; removed when training continues."""
 
@@ -122,7 +122,8 @@ def open_run(config: Config, root: Path, *, resume: bool | Literal["auto"]) -> I
     """Open the run's folder under an exclusive lock.
 
     Without `resume`, the folder is created in `root`; with True, it must contain a run with the
-    same config; "auto" resumes the run if it exists and creates it otherwise.
+    same config; "auto" resumes the run if it exists and creates it otherwise. A new run that is
+    refused before it has results leaves nothing.
 
     Raises:
         ValueError: the path contains a wildcard, or another process uses the folder. For a new
@@ -135,8 +136,11 @@ def open_run(config: Config, root: Path, *, resume: bool | Literal["auto"]) -> I
             f"checkpoints cannot be restored from {folder.absolute()} because its path contains "
             f"{' '.join(sorted(wildcards))}: choose another --name or working directory"
         )
-    with _locked(folder):
-        if (folder / CONFIG_FILE).exists() if resume == "auto" else resume:
+    with locked(folder):
+        is_new = not ((folder / CONFIG_FILE).exists() if resume == "auto" else resume)
+        if is_new:
+            _begin(config, folder)
+        else:
             check_only_files(folder, folder)
             recorded = _recorded(folder)
             if changed := changed_settings(recorded, to_json(config)):
@@ -146,25 +150,36 @@ def open_run(config: Config, root: Path, *, resume: bool | Literal["auto"]) -> I
                     f"{folder} contains a run with different settings ({', '.join(changed)}): "
                     "resume with the original settings or use another --name"
                 )
-        else:
-            _begin(config, folder)
-        yield folder
+        try:
+            yield folder
+        except (ValueError, ModuleNotFoundError):
+            if is_new and not _results(folder) - {*(folder / CACHE).rglob("*")}:
+                shutil.rmtree(folder, ignore_errors=True)  # a link to a folder stays
+            raise
 
 
 def _begin(config: Config, folder: Path) -> None:
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file: remove it or use another --name")
-    left = [path for path in folder.rglob("*") if not path.is_dir()]
-    names = {CONFIG_FILE, TIMES_FILE, DATASET_FILE}
-    unfinished = {*folder.glob(f".*{TEMPORARY_SUFFIX}")}  # left by a killed process
-    if {*left} - unfinished - {folder / name for name in names}:
+    if _results(folder):
         raise ValueError(
             f"{folder} already contains a run: add --resume to continue it or use another --name"
         )
     folder.mkdir(exist_ok=True)
-    for path in left:
+    for path in _files(folder):
         path.unlink()
     write_json(folder / CONFIG_FILE, to_json(config))
+
+
+def _files(folder: Path) -> set[Path]:
+    return {path for path in folder.rglob("*") if not path.is_dir()}
+
+
+def _results(folder: Path) -> set[Path]:
+    """Return the files of a run that are more than its beginning."""
+    unfinished = {*folder.glob(f".*{TEMPORARY_SUFFIX}")}  # left by a killed process
+    begun = {folder / name for name in (CONFIG_FILE, TIMES_FILE, DATASET_FILE)}
+    return _files(folder) - unfinished - begun
 
 
 def record_dataset(folder: Path, facts: Mapping[str, Any], *, streams: bool) -> bool:
@@ -187,22 +202,6 @@ def record_dataset(folder: Path, facts: Mapping[str, Any], *, streams: bool) -> 
             "use another --name"
         )
     return streams or recorded["streams"]
-
-
-@contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Lock the folder through a file beside it, which names the process that holds the lock."""
-    file = folder.parent / f".{folder.name}.lock"
-    try:
-        lock = acquire(file)
-    except filelock.Timeout as error:
-        holder = file.read_text().strip() or "another process"
-        raise ValueError(
-            f"{folder} is in use by {holder}: wait for that run, stop it or use another --name"
-        ) from error
-    with lock:
-        file.write_text(f"process {os.getpid()} on {platform.node()}\n")
-        yield
 
 
 def _recorded(folder: Path) -> dict[str, Any]:

@@ -9,11 +9,11 @@ import numpy as np
 from scipy import stats
 
 from lorasp_jax.extras.study import Study, page, statistics
+from lorasp_jax.extras.study.page import BACKBONES
 from lorasp_jax.extras.study.statistics import Estimate
 from lorasp_jax.extras.study.study import Results
 from studies.few import figure
 
-BACKBONES = {"pi0": "π0", "smolvla": "SmolVLA"}
 LABELS = {
     "lora_r16": "LoRA, r = 16",
     "lora_r64": "LoRA, r = 64",

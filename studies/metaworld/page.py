@@ -6,11 +6,10 @@ from typing import Any
 import numpy as np
 
 from lorasp_jax.extras.study import page, statistics
-from lorasp_jax.extras.study.page import NONE
+from lorasp_jax.extras.study.page import BACKBONES, NONE
 from lorasp_jax.extras.study.study import Results
 from studies.metaworld.tasks import GROUPS, HELD_OUT
 
-BACKBONES = {"pi0": "π0", "smolvla": "SmolVLA"}
 LABELS = {
     "lora_sp": "LoRA-SP, R = 64",
     "lora_r64": "LoRA, r = 64",

@@ -9,7 +9,6 @@ import numpy as np
 from studies.paper import naming
 from studies.paper.naming import Seeds
 
-BACKBONES = {"pi0": "π0", "smolvla": "SmolVLA"}
 TASKS = {
     "open_pot": "open the pot",
     "pour": "pour",

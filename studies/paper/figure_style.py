@@ -10,7 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lorasp_jax.evaluation.figure_style import STYLE
-from studies.paper.book import BACKBONES, Book
+from lorasp_jax.extras.study.page import BACKBONES
+from studies.paper.book import Book
 
 INKS = {"light": "#1f2328", "dark": "#e6edf3"}
 """Color of text and lines by color scheme of the page; the background is transparent."""

@@ -9,10 +9,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from lorasp_jax.extras.study import statistics
+from lorasp_jax.extras.study.page import BACKBONES
 from lorasp_jax.extras.study.statistics import Estimate
 from lorasp_jax.report.figures import COLORS
 from studies.paper import estimates, naming, published
-from studies.paper.book import BACKBONES, Book
+from studies.paper.book import Book
 from studies.paper.figure_style import FULL, LORA, LORA_SP, SINGLE, legend, panels, rows
 from studies.paper.naming import TOWERS
 from studies.paper.tables import RANK

@@ -5,10 +5,10 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from lorasp_jax.extras.study import page, statistics
-from lorasp_jax.extras.study.page import NONE
+from lorasp_jax.extras.study.page import BACKBONES, NONE
 from lorasp_jax.peft import LoRASP
 from studies.paper import naming, published
-from studies.paper.book import BACKBONES, TASKS, Book
+from studies.paper.book import TASKS, Book
 from studies.paper.naming import TOWERS
 
 Column = tuple[str, Callable[[str], str]]

@@ -7,9 +7,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from lorasp_jax.extras.study.page import BACKBONES
 from lorasp_jax.report.figures import COLORS
 from studies.paper import naming
-from studies.paper.book import BACKBONES, TASKS, Book
+from studies.paper.book import TASKS, Book
 from studies.paper.figure_style import FULL, LORA_SP, legend, panels, rows
 from studies.paper.naming import TOWERS
 from studies.paper.tables import RANK

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from typing import get_args
 
 from lorasp_jax.extras.study import page
-from lorasp_jax.extras.study.page import NONE
-from studies.paper.book import BACKBONES
+from lorasp_jax.extras.study.page import BACKBONES, NONE
 from studies.paper.criteria import Claim, Criterion, Judged, Outcome, Verdict, is_weak
 from studies.paper.criteria import verdict as verdict_of
 

@@ -37,6 +37,20 @@ def test_slow_steps_have_a_rate_too():
     assert progress.tasks[bar].time_remaining == pytest.approx(46 / (4 / 120), rel=0.5)
 
 
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_file_gets_a_line_now_and_then(terminal):
+    text, now = io.StringIO(), [0.0]
+    progress = bars(Console(file=text, force_terminal=terminal, width=80), "samples")
+    progress.get_time = lambda: now[0]
+    bar, progress._said = progress.add_task("training", total=100), 0.0
+    for now[0], done in ((1.0, 1), (31.0, 20), (32.0, 21), (62.0, 40)):
+        progress.update(bar, completed=done, rate=5.0)
+    lines = text.getvalue().splitlines()
+    assert [line.split()[1] for line in lines] == ([] if terminal else ["20/100", "40/100"])
+    assert "\r" not in text.getvalue()
+    assert terminal or (lines[1].startswith("training") and lines[1].endswith("5 samples/s"))
+
+
 @pytest.mark.parametrize("kept", [0, 8])
 def test_compiling_is_not_in_the_rate(kept):
     """Compilation ends with the first episodes, also in a resumed collection."""

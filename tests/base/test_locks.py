@@ -90,7 +90,10 @@ def test_a_lock_on_a_deleted_file_does_not_count(path, monkeypatch, anew):
     monkeypatch.setattr(fcntl, "flock", late)
     with locks.locked(path):
         assert len(calls) == 2
-        with pytest.raises(ValueError, match="another process"), locks.locked(path):
+        with (
+            pytest.raises(ValueError, match=f"press is in use by process {os.getpid()} on"),
+            locks.locked(path),
+        ):
             pass
 
 

@@ -1,11 +1,14 @@
 """Summaries and contact sheets match the dataset."""
 
 import dataclasses
+import io
 
 import numpy as np
 import pytest
 from PIL import Image
+from rich.console import Console
 
+from lorasp_jax.config import Config
 from lorasp_jax.data import inspection
 from lorasp_jax.data.lerobot import Keys, LeRobot
 from tests.data.lerobots import GOLDEN, copied, edit_info, golden
@@ -27,6 +30,14 @@ def test_summary(source):
         "press the green button": 2,
     }
     assert not inspection.hints(found)
+
+
+def test_another_period_than_that_of_training_is_said(source, monkeypatch):
+    for period, is_said in ((source.control_dt, False), (0.05, True)):
+        monkeypatch.setattr(Config, "control_dt", period)
+        text = io.StringIO()
+        inspection.report(source, Console(file=text))
+        assert ("--control-dt 0.1" in text.getvalue()) == is_said
 
 
 def test_a_gripper_alone_has_no_joints(source):
@@ -69,8 +80,13 @@ def test_contact_sheet(source, tmp_path):
     inspection.write_contact_sheet(source, path)
     with Image.open(path) as picture:
         sheet = np.asarray(picture).astype(int)
+    title, sheet = np.split(sheet, [2 * inspection.LINE])
+    names = [title[inspection.LINE :, x : x + 128] for x in range(0, len(title[0]), 128)]
+    sheet = np.concatenate([title[: inspection.LINE], sheet])
     row = inspection.LINE + 96 + 2
     assert sheet.shape == (4 * row, inspection.FRAMES * (2 * 128 + 2), 3)
+    assert [(name > 200).any() for name in names[:4]] == 4 * [True]
+    assert (names[0] != names[1]).any()
     red = (sheet[..., 0] > 180) & (sheet[..., 1] < 80)
     widths = [red[(number + 1) * row - 6, :128].sum() for number in range(4)]
     assert np.allclose(np.diff(widths), widths[0], atol=2)
@@ -87,7 +103,8 @@ def test_images_of_any_shape_are_downscaled(tmp_path):
     tasks.write_text(tasks.read_text().replace("green button", "绿色按钮"))
     edit_info(folder, lambda info: info["features"].pop("observation.images.wrist"))
     sheet = inspection.contact_sheet(LeRobot(folder, Keys(image_size=32)))
-    assert sheet.shape == (4 * (inspection.LINE + 24 + 2), inspection.FRAMES * 34, 3)
+    height = inspection.LINE + 4 * (inspection.LINE + 24 + 2)
+    assert sheet.shape == (height, inspection.FRAMES * 34, 3)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 6, 7, 100])

@@ -132,6 +132,8 @@ def test_names(folder, tmp_path):
     rlds.write(random_episodes("press", 0), tmp_path / "rlds")
     with pytest.raises(ValueError, match="named twice"):
         open_sources([folder / "rlds", f"{folder}/../{folder.name}/rlds"], KEYS)
+    with pytest.raises(ValueError, match=r"renamed\.toml is named twice, also as .*rlds"):
+        open_sources([folder / "renamed.toml", golden("v3"), folder / "rlds"], KEYS)
     changed = random_episodes("press", 0)
     rlds.write(dataclasses.replace(changed, robot="so101"), tmp_path / "b" / "rlds")
     found = open_sources([tmp_path / "rlds", tmp_path / "b" / "rlds"], KEYS)
@@ -161,8 +163,12 @@ def test_inspect_saves_what_other_commands_read(tmp_path, monkeypatch, capsys):
     out = ["--out", str(tmp_path / "cache")]
     assert main(["convert", str(tmp_path / "my.toml"), *out]) == 0
     assert list(Cache(tmp_path / "cache").cameras) == ["top"]
-    assert main(["inspect", str(tmp_path / "my.toml"), "--angles", "degrees"]) == 2
-    assert "change them there" in capsys.readouterr().err
+    for option in (["--angles", "degrees"], ["--angles", "radians"], ["--every", "1"]):
+        assert main(["inspect", str(tmp_path / "my.toml"), *option]) == 2  # defaults, too
+        message = capsys.readouterr().err
+        assert f"{option[0]} is one of the dataset's options, which {tmp_path}/my.toml" in message
+    with pytest.raises(ValueError, match="change them there"):
+        open_source(tmp_path / "my.toml", Keys(every=3))
     assert main(["inspect", str(golden("v3")), "--save", str(tmp_path / "my.toml")]) == 2
 
 

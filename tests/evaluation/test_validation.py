@@ -4,13 +4,14 @@ import dataclasses
 import re
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import DataConfig
 from lorasp_jax.data import cache
-from lorasp_jax.data.batches import RawBatch, draw
+from lorasp_jax.data.batches import RawBatch, draw, encode
 from lorasp_jax.data.lerobot import LeRobot
 from lorasp_jax.evaluation import held_out, validation
 from lorasp_jax.evaluation.__main__ import main
@@ -254,6 +255,23 @@ def test_the_same_policy_gives_the_same_values(recorded):
     first, again = (measure(recorded.policy, found, num_steps=2) for _ in range(2))
     assert first.scalars == again.scalars
     assert first.actions.shape == (8, recorded.policy.model.config.chunk, 7)
+
+
+def test_the_loss_is_that_of_training(recorded):
+    """Of the model that trains, although the sampler's weights give it."""
+    policy = recorded.policy
+    found = windows(LeRobot(golden("v3")), OUT, policy, every=10)
+    batch = encode(jax.random.key(0), found.raw, policy.processor, state_noise=0.0)
+    wrapped = jax.tree.map(lambda x: jnp.concatenate([x, x]), batch)  # to the size of a batch
+    key = jax.random.split(jax.random.fold_in(jax.random.key(0), 0))[0]
+    losses = jax.vmap(
+        lambda key: policy.model.loss(
+            key, wrapped.observation, wrapped.actions, action_mask=wrapped.action_mask
+        )[0]
+    )(jax.random.split(key, held_out._NOISES))
+    valid = np.broadcast_to(batch.action_mask, (held_out._NOISES, *batch.action_mask.shape))
+    expected = np.asarray(losses)[:, :8][valid].mean()
+    assert measure(policy, found, num_steps=1).loss == pytest.approx(expected, rel=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -187,11 +187,9 @@ def test_delta_actions():
     np.testing.assert_allclose(to_absolute(delta, state, (True, True, False)), actions, atol=1e-6)
 
 
-@pytest.mark.parametrize("set_by", ["caller", "backbone"])
-def test_delta_actions_are_decoded_as_absolute(set_by):
+def test_delta_actions_are_decoded_as_absolute():
     mask = (*[True] * 6, False)
-    proc = published(delta=mask) if set_by == "caller" else published(relative=mask)
-    absolute = published(relative=mask, delta=())
+    proc, absolute = published(relative=mask), published()
     proc = dataclasses.replace(proc, statistics=absolute.statistics)
     state = RNG.normal(size=(2, 7)).astype(np.float32)
     actions = RNG.normal(size=(2, 4, 7)).astype(np.float32)
@@ -282,8 +280,9 @@ def test_policy_encodes_and_decodes():
 
 def test_actions_may_be_shorter_than_states():
     """LIBERO has eight numbers of state and seven of action; six are relative."""
-    config = dataclasses.replace(
-        Pi0Config.base(), image_size=28, inputs=dataclasses.replace(OPENPI, delta=(True,) * 6)
+    six, eight = (
+        dataclasses.replace(Pi0Config.base(), inputs=dataclasses.replace(OPENPI, delta=n * (True,)))
+        for n in (6, 8)
     )
     state, action = RNG.normal(size=(20, 8)), RNG.normal(2.0, 3.0, (20, 7))
     measured = Statistics.measure(
@@ -291,7 +290,7 @@ def test_actions_may_be_shorter_than_states():
     )
     ids = jnp.array([[3, 4, 0]])
     prompts = PromptTable(Ids(ids, ids > 0))
-    proc = Processor.of(config, measured, prompts, num_joints=7, action_length=7)
+    proc = Processor.of(six, measured, prompts, num_joints=7, action_length=7)
     assert (len(proc.state_slots), len(proc.action_slots)) == (8, 7)
     zeros = np.zeros((1, 2, 32), np.float32)
     decoded = np.asarray(decode(proc, zeros, state[:1].astype(np.float32)))[0, 1]
@@ -300,4 +299,4 @@ def test_actions_may_be_shorter_than_states():
     back = normalize(proc, decoded[None, None], state[:1].astype(np.float32))
     np.testing.assert_allclose(back, zeros[:, :1], atol=1e-5)
     with pytest.raises(ValueError, match="delta mask has 8"):
-        Processor.of(config, measured, prompts, num_joints=7, action_length=7, delta=(True,) * 8)
+        Processor.of(eight, measured, prompts, num_joints=7, action_length=7)

@@ -18,6 +18,7 @@ from lorasp_jax.data import cache
 from lorasp_jax.data.batches import draw, encode
 from lorasp_jax.data.opening import open_source
 from lorasp_jax.evaluation.held_out import episodes_of, measure, sample, windows
+from lorasp_jax.extras.serving.loading import load_run
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.report.html import write_report
 from lorasp_jax.training import dataset, early, export, setup
@@ -119,7 +120,7 @@ def test_windows_are_drawn_by_weight_and_normalized_by_their_dataset(run):
     assert (np.asarray(batch.observation.images[slots["wrist"]])[which == 1] == -1).all()
 
 
-def test_held_out_windows_act_by_their_dataset(run):
+def test_held_out_windows_act_by_their_dataset(run, tmp_path):
     found = windows(run.recordings, run.held_out, run.policy, every=5)
     which = np.asarray(found.raw.dataset)
     np.testing.assert_array_equal(which, found.episode // 3)
@@ -132,8 +133,13 @@ def test_held_out_windows_act_by_their_dataset(run):
         np.testing.assert_allclose(chunks[rows], expected[rows], rtol=1e-4, atol=1e-5)
         assert np.abs(expected[~rows] - chunks[~rows]).max() > 0.1
     assert 0.1 < measure(run.policy, found, num_steps=2).hold.mean < 10  # by each one's spread
-    for name, numbers in (("near", [0, 1, 2]), ("far", [3, 4, 5]), ("", [*range(6)])):
-        assert episodes_of(run.recordings, name) == numbers
+    file = tmp_path / "renamed.toml"  # which stands for the cache
+    file.write_text(f'path = "{run.recordings.path}"\n[cameras]\nside = "side"\nwrist = "wrist"\n')
+    for source in (run.recordings, open_source(file)):
+        for name, numbers in (("near", [0, 1, 2]), ("far", [3, 4, 5]), ("", [*range(6)])):
+            assert episodes_of(source, name) == numbers
+        again = windows(source, run.held_out, run.policy, every=5)
+        np.testing.assert_array_equal(again.raw.dataset, which)
 
 
 def test_the_run_says_what_it_learns_from(run, tmp_path):
@@ -202,7 +208,7 @@ def test_shapes_known_before_are_those_of_the_run(run, sources, tmp_path, monkey
         assert shapes.dataset.shape == (2, 8)
 
 
-def test_an_exported_policy_acts_for_the_dataset_that_is_named(run, tmp_path):
+def test_an_exported_policy_acts_for_the_dataset_that_is_named(run, tmp_path, capsys):
     models.save(tmp_path / "weights", random_backbone(Pi0Config.dummy()))
     model = dataclasses.replace(run.config.model, checkpoint=str(tmp_path / "weights"))
     one = dataclasses.replace(
@@ -212,7 +218,8 @@ def test_an_exported_policy_acts_for_the_dataset_that_is_named(run, tmp_path):
     export.write(one)
     assert export.datasets(export.describe(tmp_path)) == ["near", "far"]
     for name, wanted in (("", "near"), ("far", "far")):
-        found = export.load_policy(tmp_path, dataset=name).processor
+        found = load_run(str(tmp_path), dataset=name).policy.processor
+        assert f"acts for {wanted}; --dataset chooses" in capsys.readouterr().err
         expected = run.policy.processor.of_dataset(wanted).statistics
         jax.tree.map(np.testing.assert_array_equal, found.statistics, expected)
         assert found.datasets is None

@@ -105,6 +105,23 @@ def test_the_error_for_a_missing_base_suggests_a_remedy(tmp_path, monkeypatch):
     assert export.load_policy("run", base="moved", any_base=True).model
 
 
+@pytest.mark.parametrize("beside", [False, True])
+def test_relative_actions_are_recorded_in_the_config_or_by_older_runs_beside_it(tmp_path, beside):
+    run = run_on_a_base(tmp_path)
+    export.write(run)
+    facts = json.loads((run.folder / "adapter.json").read_text())
+    policy, mask = facts["metadata"]["policy"], [*[True] * 6, False]
+    assert "relative" not in policy
+    if beside:
+        policy["relative"] = mask
+    else:
+        policy["config"]["inputs"]["delta"] = mask
+    del facts["digest"]
+    (run.folder / "adapter.json").write_text(json.dumps(with_digest(facts)))
+    loaded = export.load_policy(run.folder)
+    assert [*loaded.processor.inputs.delta] == [*loaded.model.config.inputs.delta] == mask
+
+
 def test_another_tokenizer_is_rejected(tmp_path, monkeypatch):
     run = run_on_a_base(tmp_path)
     export.write(run)

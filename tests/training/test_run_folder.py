@@ -220,6 +220,24 @@ def test_a_name_is_free_after_a_run_that_failed_without_results(tmp_path):
     assert json.loads((folder / "config.json").read_text())["data"]["action_noise"] == 0.005
 
 
+@pytest.mark.parametrize("left", ["cache/steps/cache.json", "cache/press.npz"])
+def test_a_refused_run_leaves_nothing_but_results(tmp_path, left):
+    """What the expert has collected is a result, a converted dataset is not."""
+    file = tmp_path / "runs" / CONFIG.name / left
+
+    def refuse():
+        file.parent.mkdir(parents=True)
+        file.write_text("{}")
+        raise ValueError("refused")
+
+    with (
+        pytest.raises(ValueError, match="refused"),
+        run_folder.open_run(CONFIG, tmp_path / "runs", resume="auto"),
+    ):
+        refuse()
+    assert (tmp_path / "runs").exists() == file.exists() == (left == "cache/press.npz")
+
+
 def test_a_run_keeps_its_dataset_and_whether_it_streams(tmp_path):
     facts = {"crc32": {"state": 1}, "instructions": ["press"]}
     assert not record_dataset(tmp_path, facts, streams=False)

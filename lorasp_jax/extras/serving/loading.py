@@ -47,11 +47,11 @@ def load_run(folder: str, *, base: str = "", words: str = "", dataset: str = "")
     Says for which dataset's robot the policy acts if there is a choice.
     """
     described = export.describe(folder)
-    if (known := export.datasets(described)) and not dataset:
-        default = described["policy"]["dataset"] or "all its datasets"
-        others = f"--dataset chooses one of {', '.join(known)}"
-        print(f"{folder} acts for {default}; {others}", file=sys.stderr)
     policy = export.load_policy(folder, base=base, words=words, dataset=dataset)
+    if known := export.datasets(described):
+        chosen = dataset or described["policy"]["dataset"] or "all its datasets"
+        others = f"--dataset chooses one of {', '.join(known)}"
+        print(f"{folder} acts for {chosen}; {others}", file=sys.stderr)
     recorded = hub.resolve_portable(described["policy"]["tokenizer"])
     config = read_json(Path(folder) / CONFIG_FILE, {"optim": {}})
     return Loaded(

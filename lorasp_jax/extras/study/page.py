@@ -8,6 +8,8 @@ from lorasp_jax.base.writing import write_text
 from lorasp_jax.extras.study.statistics import Estimate
 
 NONE = "–"
+BACKBONES = {"pi0": "π0", "smolvla": "SmolVLA"}
+"""Backbone -> its name in tables and figures."""
 _BLOCK = re.compile(r"(<!-- begin: ([\w ]+) -->\n).*?(<!-- end -->\n)", re.DOTALL)
 _UNBREAKABLE = re.compile(r"(?<=\d,) (?=[+−\d][\d.]+\])|(?<==) | (?==)|(?<=\d) (?=[%M\[])")
 """Spaces within intervals, equations and quantities."""

@@ -101,8 +101,8 @@ def load_native(folder: Folder, config: Any = None) -> Any:
 
     Args:
         folder: folder with config.json and safetensors.
-        config: sets the `RUNTIME_FIELDS` and the `LENGTHS`; its other fields must match the stored
-            model. None uses the stored config, in fp32.
+        config: sets the `RUNTIME_FIELDS`, the `LENGTHS` and which actions are relative; its other
+            fields must match the stored model. None uses the stored config, in fp32.
 
     Raises:
         ValueError: files are missing, damaged or in another format, or do not match `config`.
@@ -210,8 +210,13 @@ def _saved_fields(config: Any) -> dict[str, Any]:
 
 
 def _sizes(config: Any) -> dict[str, Any]:
-    """The saved fields that must match for weights to fit and to mean the same."""
-    return {name: value for name, value in _saved_fields(config).items() if name not in LENGTHS}
+    """The saved fields that must match for weights to fit and to mean the same.
+
+    Which actions are relative is a matter of the robot, not of the weights.
+    """
+    fields = _saved_fields(config)
+    del fields["inputs"]["delta"]
+    return {name: value for name, value in fields.items() if name not in LENGTHS}
 
 
 def _difference(stored: Any, config: Any) -> str:

@@ -117,7 +117,7 @@ def sampling_peak(config: Config, backbone: BackboneConfig) -> float:
     """Estimate the peak memory of evaluating the policy during training.
 
     In simulation, a `Sampler` has weights of its own. On recordings, a quantized policy copies only
-    those of the flow steps, see `held_out.sample`.
+    those of the flow steps, see `held_out`.
     """
     return _sampling_peak(_of_one_window(config), dataclasses.replace(backbone, remat="none"))
 
