@@ -13,7 +13,7 @@ from lorasp_jax.evaluation import held_out
 from lorasp_jax.evaluation.programs import compiled_rollout
 from lorasp_jax.extras.latency.curve import measure_point
 from lorasp_jax.extras.latency.execution import Execution, delayed_rollout
-from lorasp_jax.extras.study.held_out import Source
+from lorasp_jax.extras.study.held_out import AllTasks
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training.demonstrations import Demonstrations, map_threads
 from lorasp_jax.training.random_streams import RandomStream
@@ -53,7 +53,7 @@ def measure(run: Run, episodes: Demonstrations, _: Policy | None) -> dict[str, A
     """
     policy, found = run.policy.with_sampler(), {}
     for task, group in episodes.items():
-        source: Any = Source({task: group})
+        source: Any = AllTasks({task: group})
         raw = held_out.windows(source, range(len(source)), run.policy, limit=_WINDOWS).raw
         scale = np.asarray(raw.actions[:, :_EXECUTED]).std((0, 1))
         for steps in STEPS:

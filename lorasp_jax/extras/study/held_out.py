@@ -83,7 +83,7 @@ def _shared(root: Path, config: Config, progress: Progress = lambda *_: None) ->
     return dict(zip(config.tasks, map_threads(one, config.tasks), strict=True))
 
 
-class Source:
+class AllTasks:
     """Demonstrations as a dataset: the episodes of all tasks, numbered one after the other."""
 
     def __init__(self, demonstrations: Demonstrations) -> None:

@@ -6,7 +6,7 @@ from scipy import stats
 
 from lorasp_jax.config import Config
 from lorasp_jax.extras.study import statistics
-from lorasp_jax.extras.study.held_out import Source
+from lorasp_jax.extras.study.held_out import AllTasks
 from lorasp_jax.peft import FullFineTuning
 from studies.few import page, study
 from tests.runs import random_episodes
@@ -77,7 +77,7 @@ def test_correlation_is_spearmans():
 
 def test_demonstrations_are_measured_as_a_dataset():
     groups = {task: random_episodes(task, seed) for seed, task in enumerate(("press", "pour"))}
-    source = Source(groups)
+    source = AllTasks(groups)
     assert len(source) == 6
     for number, (group, row) in enumerate((g, r) for g in groups.values() for r in range(3)):
         episode = source.episode(number)
