@@ -19,7 +19,8 @@ from lorasp_jax.extras.piper.cameras import open_cameras
 from lorasp_jax.extras.piper.clock import RealClock
 from lorasp_jax.extras.piper.recording import Recording
 from lorasp_jax.extras.piper.safety import Unsafe
-from lorasp_jax.extras.piper.session import Session, Settings
+from lorasp_jax.extras.piper.session import Session
+from lorasp_jax.extras.piper.settings import Settings
 from lorasp_jax.extras.piper.teaching import Lesson
 
 HELD = 3

@@ -18,13 +18,14 @@ from lorasp_jax.extras.piper.asking import Observation
 from lorasp_jax.extras.piper.log import Log
 from lorasp_jax.extras.piper.recording import Recording
 from lorasp_jax.extras.piper.safety import Limits
-from lorasp_jax.extras.piper.session import Session, Settings
+from lorasp_jax.extras.piper.session import Session
+from lorasp_jax.extras.piper.settings import Settings
 from lorasp_jax.extras.piper.teaching import Lesson
 from lorasp_jax.extras.serving.client import PolicyClient, PolicyError, ServerGone
 from lorasp_jax.extras.serving.pictures import to_square
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Those that end a program, and so must stop the arm."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
+"""Those that end or suspend a program, and so must stop the arm."""
 _CONTINUATION = ("executed", "delay")  # keys for servers whose chunks continue the previous one
 _WAIT = 300.0  # s to wait for a server that is still compiling
 
@@ -181,10 +182,12 @@ class Server:
             self.ended = self.ended or str(error)
             raise
         if "actions" not in reply:
-            raise PolicyError(
-                f"the server's reply has no actions, only {', '.join(map(str, reply))}"
-            )
-        return reply["actions"]
+            keys = ", ".join(map(str, reply))[:200] or "nothing"
+            raise PolicyError(f"the server's reply has no actions, only {keys}")
+        try:
+            return np.asarray(reply["actions"])
+        except ValueError as error:
+            raise PolicyError("the server's actions are lists of different lengths") from error
 
 
 @contextlib.contextmanager

@@ -4,7 +4,8 @@ import numpy as np
 
 from lorasp_jax.extras.piper.asking import InTurn
 from lorasp_jax.extras.piper.safety import Limits
-from lorasp_jax.extras.piper.session import PERIOD, Session, Settings
+from lorasp_jax.extras.piper.session import PERIOD, Session
+from lorasp_jax.extras.piper.settings import Settings
 
 LIMITS = Limits.of()
 ARM_STEP = np.array([0.03, 0, 0, 0, 0, 0, 0])  # rad per action

@@ -11,7 +11,8 @@ from lorasp_jax.extras.piper.fake import frames
 from lorasp_jax.extras.piper.fake.demonstrator import Demonstrator
 from lorasp_jax.extras.piper.recording import Recording
 from lorasp_jax.extras.piper.safety import Limits, Unsafe
-from lorasp_jax.extras.piper.session import Session, Settings
+from lorasp_jax.extras.piper.session import Session
+from lorasp_jax.extras.piper.settings import Settings
 from lorasp_jax.extras.piper.teaching import Lesson
 
 LIMITS = Limits.of()

@@ -14,8 +14,9 @@ from lorasp_jax.extras.piper import log as logs
 from lorasp_jax.extras.piper import session as sessions
 from lorasp_jax.extras.piper.asking import InThread
 from lorasp_jax.extras.piper.log import Log
-from lorasp_jax.extras.piper.options import stop_on_signals
-from lorasp_jax.extras.piper.session import PERIOD, Settings
+from lorasp_jax.extras.piper.options import SIGNALS, stop_on_signals
+from lorasp_jax.extras.piper.session import PERIOD
+from lorasp_jax.extras.piper.settings import Settings
 from lorasp_jax.extras.serving.client import PolicyError, ServerGone
 from lorasp_jax.extras.serving.wire import FrameError
 from tests.cases import mostly_slow
@@ -137,9 +138,6 @@ def test_a_first_target_out_of_reach(bench, monkeypatch):
     run = Run(bench, ask)
     assert "the first action is out of reach" in run(60.0)
     assert_safe(run)
-
-
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @pytest.mark.parametrize("number", mostly_slow(SIGNALS, [signal.SIGTERM]))

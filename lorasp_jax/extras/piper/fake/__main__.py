@@ -1,6 +1,7 @@
 """Run a policy on the fake PiPER: `python -m lorasp_jax.extras.piper.fake --task press`."""
 
 import argparse
+import functools
 import itertools
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -162,7 +163,8 @@ def _session(
     log, recorder, _ = records
     if recorder:
         recorder.say(settings.prompt)
-    more = {"log": log, "recorder": recorder, "say": console.print}
+    say = functools.partial(console.print, markup=False, highlight=False, soft_wrap=True)
+    more = {"log": log, "recorder": recorder, "say": say}
     session = Session(bench.arm, world.images, asker, limits, settings, clock, **more)
     shared.stop_on_signals(session)
     return session
