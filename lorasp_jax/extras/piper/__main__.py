@@ -13,6 +13,7 @@ from rich.console import Console
 from lorasp_jax.base.arguments import pair
 from lorasp_jax.base.errors import run_command
 from lorasp_jax.extras.piper import options as shared
+from lorasp_jax.extras.piper import remote
 from lorasp_jax.extras.piper.arm import PiperArm
 from lorasp_jax.extras.piper.asking import InThread
 from lorasp_jax.extras.piper.cameras import open_cameras
@@ -72,7 +73,7 @@ def _run(options: argparse.Namespace) -> int:
     settings = shared.settings(options, prompt, dry_run=options.dry_run)
     seconds = options.seconds or (task.time_limit if task else 60.0)
     with contextlib.ExitStack() as stack:
-        server = None if options.teach else stack.enter_context(shared.policy(options))
+        server = None if options.teach else stack.enter_context(remote.policy(options))
         look = open_cameras(_sources(options, server), stack)
         if server:
             server.warn([prompt])
@@ -110,7 +111,7 @@ def _execute(
 def _teach(options: argparse.Namespace, parts: tuple, seconds: float) -> str | None:
     """Record a person; return the problem in a sentence, if there is one."""
     arm, look, recorder = parts
-    way = {"way": options.teach, "control_dt": options.control_dt}
+    way = {"way": options.teach, "control_dt": shared.period(options)}
     lesson = Lesson(arm, look, recorder, shared.limits(options), RealClock(), **way)
     shared.stop_on_signals(lesson)
     print("show the task, then press Ctrl-C")
@@ -148,7 +149,7 @@ def _end_prompt(number: int, _: Any) -> None:
     raise EOFError(signal.Signals(number).name)  # the terminal may be gone
 
 
-def _sources(options: argparse.Namespace, server: shared.Server | None) -> dict[str, str]:
+def _sources(options: argparse.Namespace, server: remote.Server | None) -> dict[str, str]:
     """Return the cameras' sources after checking that there are those that the policy needs."""
     sources = dict(options.camera)
     needed = server.metadata.get("cameras", []) if server else list(sources)[:1] or ["side"]

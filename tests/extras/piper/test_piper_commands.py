@@ -13,7 +13,7 @@ from envs.rendering.video import write_video
 from envs.tasks import press
 from lorasp_jax.data.opening import open_source
 from lorasp_jax.extras.piper import __main__ as command
-from lorasp_jax.extras.piper import options, safety
+from lorasp_jax.extras.piper import options, remote, safety
 from lorasp_jax.extras.piper.__main__ import HELD
 from lorasp_jax.extras.piper.__main__ import main as real
 from lorasp_jax.extras.piper.arm import PiperArm
@@ -61,7 +61,7 @@ def limit(monkeypatch):
 
 @pytest.fixture
 def server(monkeypatch):
-    monkeypatch.setattr(options, "_WAIT", 0.0)
+    monkeypatch.setattr(remote, "_WAIT", 0.0)
     policy = Still()
     with serving(policy) as server:
         server.policy = policy
@@ -162,12 +162,38 @@ def test_a_policy_of_another_task_is_warned_of(known, warned, limit, tmp_path, c
     assert (expected in before) == ("warning" in before) == warned
 
 
+@pytest.mark.parametrize(
+    ("metadata", "words", "code", "message"),
+    [
+        ({"robot": "so100"}, [], 2, "of the robot so100, not of piper: pass --robot so100"),
+        ({"robot": "so100"}, ["--robot", "so100"], 0, ""),
+        ({"action_dim": 8}, [], 2, "have 8 numbers, but a PiPER takes 7"),
+        ({"control_dt": 0.05}, [], 0, ""),
+        ({"control_dt": 0.05}, ["--control-dt", "0.1"], 0, "acts every 0.05 s, not every 0.1 s"),
+        ({"cameras": 5}, [], 2, "are malformed: cameras must be a list"),
+    ],
+)
+def test_the_policys_robot_and_period_are_kept(
+    metadata, words, code, message, tmp_path, limit, capsys
+):
+    limit(0.15)
+    policy = Still(metadata=metadata)
+    with serving(policy) as server:
+        words = ["--server", server.address, "--log", str(tmp_path), "--execute", "2", *words]
+        assert fake(words) == code
+    printed = capsys.readouterr()
+    assert message in " ".join((printed.out + printed.err).split())
+    assert ("warning" in printed.out) == (code == 0 and bool(message))
+    told = {"control_dt": 0.05}.items() <= metadata.items() and not message
+    assert len(policy.batches) == (0 if code else 2 if told else 1)
+
+
 @pytest.mark.parametrize("adapter", ["", "pour", "press"])
 def test_an_adapter_of_another_task_is_warned_of(adapter, capsys):
     policy = Still(adapters=("pour", "press"))
     policy.instructions = {"pour": ("pour it", "tip it"), "press": ("press it",)}
     with serving(policy) as server, PolicyClient(server.address) as client:
-        options.Server(client, adapter).warn(["tip it", "press it"])
+        remote.Server(client, adapter).warn(["tip it", "press it"])
     new, known = ("tip it", "press it") if adapter == "press" else ("press it", "pour it")
     assert f"not trained for {new!r}, but for requests such as {known!r}" in capsys.readouterr().out
 
@@ -177,10 +203,10 @@ def test_an_adapter_of_the_server_can_be_chosen():
     state, picture = np.zeros(7, np.float32), np.zeros((48, 64, 3), np.uint8)
     question = {"image": {"side": picture, "wrist": picture}, "state": state, "prompt": "go"}
     with serving(policy) as server, PolicyClient(server.address) as client:
-        options.Server(client)(question)
-        options.Server(client, "b")(question)
+        remote.Server(client)(question)
+        remote.Server(client, "b")(question)
         with pytest.raises(ValueError, match="the server has no adapter 'c', but a, b"):
-            options.Server(client, "c")
+            remote.Server(client, "c")
     assert [name for name, _ in policy.batches] == ["a", "b"]
 
 
@@ -188,7 +214,7 @@ def test_an_adapter_of_the_server_can_be_chosen():
 def test_only_servers_that_continue_chunks_are_told_how_far_the_arm_is(execution):
     policy = Still(dataclasses.replace(SPEC, execution=execution))
     with serving(policy) as server, PolicyClient(server.address) as client:
-        ask = options.Server(client)
+        ask = remote.Server(client)
         state, large = np.zeros(7, np.float32), np.zeros((48, 64, 3), np.uint8)
         question = {"image": {"side": large, "wrist": large}, "state": state, "prompt": "go"}
         assert ask(question).shape == (10, 7)
@@ -213,7 +239,7 @@ def test_the_fake_arm_refuses_wrong_options(words, message, tmp_path, capsys):
 
 
 def test_no_server(monkeypatch, capsys):
-    monkeypatch.setattr(options, "_WAIT", 0.0)
+    monkeypatch.setattr(remote, "_WAIT", 0.0)
     assert fake(["--server", "ws://127.0.0.1:9"]) == 2
     assert "no policy server at ws://127.0.0.1:9" in capsys.readouterr().err
 

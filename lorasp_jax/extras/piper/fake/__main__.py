@@ -18,6 +18,7 @@ from lorasp_jax.base.arguments import positive
 from lorasp_jax.base.errors import run_command
 from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.extras.piper import options as shared
+from lorasp_jax.extras.piper import remote
 from lorasp_jax.extras.piper.arm import PiperArm
 from lorasp_jax.extras.piper.asking import InThread, InTurn
 from lorasp_jax.extras.piper.fake.demonstrator import Demonstrator
@@ -78,7 +79,7 @@ def _run(options: argparse.Namespace, console: Console) -> None:
     shared.limits(options)
     shared.settings(options, "")
     cache.enable()
-    source = nullcontext() if options.expert else shared.policy(options)
+    source = nullcontext() if options.expert else remote.policy(options)
     with source as server, closing(shared.open_log(options)) as log:
         size = (server and server.metadata.get("image_size")) or options.image_size
         world = World(options.task, image_size=size)
