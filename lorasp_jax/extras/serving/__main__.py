@@ -17,6 +17,9 @@ from rich.console import Console
 from lorasp_jax.base.arguments import indices, pair, positive
 from lorasp_jax.base.errors import run_command
 
+GRACE = 5.0
+"""Time that the policy has for its last answer [s]; a container is killed 10 s after SIGTERM."""
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 UNSAID = ("openpi_config", "size", "chunk", "relative", "prompt_state", "joints", "action_length")
 """Options that say what the files of a published checkpoint do not; see `checkpoint.Unsaid`."""
 CHECKPOINT_OPTIONS = ("statistics", "dataset", "dtype", "camera", "adapter", *UNSAID)
@@ -24,7 +27,10 @@ CHECKPOINT_OPTIONS = ("statistics", "dataset", "dtype", "camera", "adapter", *UN
 
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.serving") -> int:
-    """Serve until SIGINT or SIGTERM; return the exit code, one of `lorasp_jax.base.errors`."""
+    """Serve until SIGINT or SIGTERM; return the exit code, one of `lorasp_jax.base.errors`.
+
+    Exit with 1 if the policy hangs then.
+    """
     options = parser(program).parse_args(arguments)
     console = Console(stderr=True)
     return run_command(lambda: _serve(options, Console()), console)
@@ -97,21 +103,32 @@ def _serve(options: argparse.Namespace, console: Console) -> None:
     with server.bind(options.host, options.port, token=token) as port:  # before what takes long
         policy = _load(options, console)
         policy_server = server.PolicyServer(policy, token=token)
-        asyncio.run(_run(policy_server, port, console))
+        answers = asyncio.run(_run(policy_server, port, console))
+    if not answers:
+        from lorasp_jax.training.distributed import processes
+
+        _say(console, f"the policy has not answered within {GRACE:g} s: ended without it")
+        processes.exit_all(1)  # a thread that hangs cannot be stopped
 
 
-async def _run(policy_server: Any, port: socket.socket, console: Console) -> None:
-    """Serve until SIGINT or SIGTERM."""
-    stop = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+async def _run(policy_server: Any, port: socket.socket, console: Console) -> bool:
+    """Serve until SIGINT or SIGTERM; return whether the policy then still answered.
+
+    A second signal ends the process by the system, whatever hangs.
+    """
+    stop, loop = asyncio.Event(), asyncio.get_running_loop()
+    for number in _SIGNALS:
+        loop.add_signal_handler(number, stop.set)
     async with policy_server.listen(port):
         host, number = port.getsockname()[:2]
         host = f"[{host}]" if ":" in host else host
         _say(console, f"listening on ws://{host}:{number}")
         await stop.wait()
+        for number in _SIGNALS:
+            loop.remove_signal_handler(number)
+            signal.signal(number, signal.SIG_DFL)
         _say(console, "closing connections")
-    policy_server.close()
+        return await asyncio.to_thread(policy_server.close, GRACE)
 
 
 def _load(options: argparse.Namespace, console: Console) -> Any:

@@ -21,6 +21,8 @@ import numpy as np
 from lorasp_jax.extras.serving.exported import PolicyInterface
 from lorasp_jax.extras.serving.pictures import to_square
 
+MAX_VALUES = 4096
+"""Maximum number of values in a request, see `wire.unpack`; reading one then takes few ms."""
 MAX_PROMPT = 1000
 """Maximum length of an instruction [characters]."""
 

@@ -31,7 +31,7 @@ from websockets.http11 import Response
 import lorasp_jax
 from lorasp_jax.extras.serving import wire
 from lorasp_jax.extras.serving.batching import Batcher, PolicyFailure
-from lorasp_jax.extras.serving.requests import Request, parse
+from lorasp_jax.extras.serving.requests import MAX_VALUES, Request, parse
 
 if TYPE_CHECKING:  # which imports JAX
     from lorasp_jax.extras.serving.served import ServedPolicies
@@ -108,17 +108,23 @@ class PolicyServer:
         ) as server:
             yield server
 
-    def close(self) -> None:
-        """Stop the policy's thread."""
-        self._batcher.close()
+    def close(self, timeout: float | None = None) -> bool:
+        """Stop the policy's thread; return False if it does not answer in time [s]."""
+        return self._batcher.close(timeout)
 
     def _process_request(
         self, connection: ServerConnection, request: HttpRequest
     ) -> Response | None:
         """Answer pages, and refuse connections without the token or beyond the limit."""
         if request.path == "/healthz":
+            if problem := self._batcher.problem():
+                return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, f"{problem}\n")
             return connection.respond(http.HTTPStatus.OK, "OK\n")
-        given = request.headers.get("Authorization", "").removeprefix("Api-Key ")
+        headers = request.headers.get_all("Authorization")
+        if len(headers) > 1:
+            text = "there must be one header Authorization\n"
+            return connection.respond(http.HTTPStatus.BAD_REQUEST, text)
+        given = "".join(headers).removeprefix("Api-Key ")
         if self._token and not hmac.compare_digest(given.encode(), self._token.encode()):
             text = "this server requires a token: Authorization: Api-Key TOKEN\n"
             return connection.respond(http.HTTPStatus.UNAUTHORIZED, text)
@@ -171,7 +177,7 @@ class PolicyServer:
 
     def _read(self, client: ClientState, frame: bytes) -> tuple[str, Any, int | None]:
         """Return the adapter's name, the row and the number of action dimensions."""
-        request = parse(wire.unpack(frame), self._policy.spec)
+        request = parse(wire.unpack(frame, max_values=MAX_VALUES), self._policy.spec)
         adapters = list(self._policy.instructions)
         adapter = request.adapter or adapters[0]
         if adapter not in adapters:

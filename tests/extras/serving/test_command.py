@@ -1,10 +1,14 @@
 """Test the command line and what it loads."""
 
+import contextlib
 import os
 import re
 import signal
 import socket
+import subprocess
+import sys
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -17,7 +21,7 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io import native
 from lorasp_jax.extras.serving import __main__ as command
 from lorasp_jax.extras.serving import loading
-from lorasp_jax.extras.serving.client import PolicyClient
+from lorasp_jax.extras.serving.client import PolicyClient, PolicyError, ServerGone
 from lorasp_jax.peft import LoRA
 from tests import ROOT
 from tests.cases import mostly_slow
@@ -163,3 +167,40 @@ def test_serving_a_run_until_an_interrupt(run, capsys, monkeypatch, policy):
         assert found["shape"] == (4, 7)
         assert [line.split()[0] for line in lines[:-2]] == ["loading", "compiling", "ready"]
         assert re.fullmatch(rf"loading {run} with --seed \d+", lines[0])
+
+
+HUNG = """
+import sys, threading
+from lorasp_jax.extras.serving import __main__ as command
+from tests.extras.serving.stand_in import StandIn
+policy = StandIn()
+policy.gate.clear()
+command.GRACE, command._load = float(sys.argv[1]), lambda *_: policy
+sys.exit(command.main(["x", "--port", "0"]))
+"""
+
+
+@pytest.mark.parametrize(("grace", "signals"), [(0.2, 1), (600, 2)])
+def test_a_hung_policy_does_not_keep_the_server_alive(grace, signals):
+    """The first signal gives it some time, the second ends the process at once."""
+    words = [sys.executable, "-c", HUNG, str(grace)]
+    pipes = {"stdout": subprocess.PIPE, "cwd": ROOT, "text": True}
+    with subprocess.Popen(words, **pipes) as process, contextlib.ExitStack() as stack:
+        stack.callback(process.kill)
+        address = process.stdout.readline().split()[-1]
+        client = stack.enter_context(PolicyClient(address, timeout=60))
+
+        def ask():
+            with contextlib.suppress(PolicyError, ServerGone):
+                client.infer(observation())
+
+        thread = threading.Thread(target=ask)
+        thread.start()
+        time.sleep(0.2)  # until the policy has the request
+        for number in range(signals):
+            process.send_signal(signal.SIGTERM)
+            if number == 0:
+                assert process.stdout.readline() == "closing connections\n"
+        assert process.wait(30) == (1 if signals == 1 else -signal.SIGTERM)
+        assert ("has not answered within" in process.stdout.read()) == (signals == 1)
+        thread.join()

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import socket
 import threading
 import time
 import urllib.error
@@ -12,8 +13,8 @@ import pytest
 from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import connect as raw_connect
 
+from lorasp_jax.extras.serving import batching, wire
 from lorasp_jax.extras.serving import server as server_module
-from lorasp_jax.extras.serving import wire
 from lorasp_jax.extras.serving.client import PolicyError, ServerGone
 from lorasp_jax.extras.serving.server import bind
 from tests.extras.serving.stand_in import SPEC, StandIn, connect, observation, serving
@@ -133,6 +134,82 @@ def test_health_and_status_during_inference():
         policy.gate.set()  # only now, so inference has not ended before
         thread.join()
         assert json.loads(page(server, "/status"))["batched_requests"] == 1
+
+
+def health(server):
+    """Return status and text of the page."""
+    try:
+        return 200, page(server, "/healthz")
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read().decode()
+
+
+def test_health_means_that_the_policy_answers(monkeypatch):
+    monkeypatch.setattr(batching, "HUNG", 0.05)
+    policy = StandIn()
+    with serving(policy) as server, connect(server) as client:
+        assert health(server) == (200, "OK\n")
+        policy.gate.clear()
+        thread = threading.Thread(target=client.infer, args=[observation()])
+        thread.start()
+        end = time.monotonic() + 60
+        while (status := health(server))[0] == 200 and time.monotonic() < end:
+            time.sleep(0.01)
+        assert status[0] == 503
+        assert "has not answered for" in status[1]
+        policy.gate.set()
+        thread.join()
+        assert health(server) == (200, "OK\n")
+        policy.failure = RuntimeError("out of memory")
+        with pytest.raises(PolicyError):
+            client.infer(observation())
+        assert health(server) == (503, "the policy failed when it was last asked\n")
+        policy.failure = None
+        with connect(server) as another:
+            another.infer(observation())
+        assert health(server) == (200, "OK\n")
+
+
+def test_closing_does_not_wait_for_a_hung_policy():
+    policy = StandIn()
+    policy.gate.clear()
+    with serving(policy) as server, connect(server) as client, connect(server) as late:
+        refusals = []
+
+        def ask():
+            with pytest.raises(PolicyError) as refusal:
+                client.infer(observation())
+            refusals.append(str(refusal.value))
+
+        thread = threading.Thread(target=ask)
+        thread.start()
+        while not policy.batches:
+            time.sleep(0.001)
+        assert not server.close(0.01)
+        thread.join()
+        assert refusals == ["the policy does not answer"]
+        with pytest.raises(PolicyError, match="the server is closing"):
+            late.infer(observation())
+
+
+ODD = (
+    "Authorization: Api-Key secret\r\nAuthorization: Api-Key secret", "Authorization: \xff",
+    "Authorization: \x01", "X: " + "a" * 9000, "Content-Length: x", "NoColon", ": empty",
+    "Sec-WebSocket-Extensions: ;;;", "Sec-WebSocket-Key: x", "Connection: close",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("lines", ODD)
+def test_odd_headers_are_refused_without_a_traceback(lines, caplog):
+    with serving(StandIn(), token="secret") as server:
+        with socket.create_connection(("127.0.0.1", server.port), timeout=60) as raw:
+            raw.sendall(f"GET / HTTP/1.1\r\nHost: x\r\n{lines}\r\n\r\n".encode("latin1"))
+            status = raw.recv(100).partition(b"\r\n")[0]  # empty: it was not HTTP
+        assert status == b"" or status.startswith(b"HTTP/1.1 4")
+        if "secret" in lines:
+            assert b" 400 " in status
+    assert not [record for record in caplog.records if record.exc_info]
 
 
 def test_a_token_is_required():
