@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import functools
 import threading
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -98,8 +99,8 @@ def policy(options: argparse.Namespace) -> Iterator[Server]:
             one given.
     """
     token = options.token_file.read_text().strip() if options.token_file else ""
-    print(f"connecting to {options.server}, for up to {_WAIT:g} s", flush=True)
-    with PolicyClient(options.server, token=token, wait=_WAIT) as client:
+    say = functools.partial(print, flush=True)
+    with PolicyClient(options.server, token=token, wait=_WAIT, say=say) as client:
         try:
             json_values.check(client.metadata, _SCHEMA, nulls=True)
         except ValueError as error:
