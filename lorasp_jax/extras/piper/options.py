@@ -104,7 +104,7 @@ def recording(
     if not options.record:
         yield None
         return
-    name, instructions = (task.name, task.instructions) if task else ("task", ())
+    name, instructions = (task.name, task.instructions) if task else ("", ())
     with locked(options.record):
         yield Recording(
             options.record,

@@ -28,6 +28,7 @@ CAN_CONTROL = 1
 _NEAR = np.deg2rad(5.0)  # rad; a target this close to the measured pose needs no slow approach
 _APPROACH = 0.2  # share of the speed limit for slow approaches
 _IMPLAUSIBLE = np.deg2rad(10.0)  # rad beyond the joint limits at which feedback is not believed
+_ABSURD = np.append(np.full(6, _IMPLAUSIBLE), 0.02)  # beyond the limits [rad, m]; our choice
 _CTRL_MODES = {0: "standby", 2: "teaching", 3: "ethernet", 4: "wifi", 5: "remote control"}
 _CTRL_MODES |= {6: "leader of another arm", 7: "offline trajectory"}
 _ARM_STATUS = {
@@ -140,6 +141,20 @@ def check_chunk(actions: Any) -> np.ndarray:
         step = int(np.argwhere(~np.isfinite(chunk))[0, 0])
         raise Unsafe(f"actions must be finite, got {chunk[step]} at step {step}")
     return chunk.astype(float)
+
+
+def clamped(chunk: np.ndarray, limits: Limits) -> str | None:
+    """Say in a sentence that a chunk [C, 7] is clamped as a whole, by far; None: it is not."""
+    beyond = np.maximum(limits.lower - chunk, chunk - limits.upper).min(axis=0)
+    number = int((beyond - _ABSURD).argmax())
+    if beyond[number] <= _ABSURD[number]:
+        return None
+    name = f"joint {number + 1}" if number < 6 else "the gripper"
+    unit = "radians" if number < 6 else "meters"
+    return (
+        f"warning: all actions of {name} are far beyond its limits, such as "
+        f"{chunk[0, number]:.4g}, and clamped: are they in {unit}?"
+    )
 
 
 def fault(reading: Reading, limits: Limits) -> str | None:

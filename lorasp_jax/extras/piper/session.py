@@ -29,6 +29,7 @@ from lorasp_jax.extras.piper.safety import (
     Reading,
     Unsafe,
     check_chunk,
+    clamped,
     fault,
 )
 from lorasp_jax.extras.piper.settings import Settings
@@ -75,7 +76,8 @@ class Session:
         self.problem: str | None = None
         self.chunks = 0
         self._final, self._since, self.stopped, self._next = False, 0.0, False, 0.0
-        self._untold = ""
+        self._untold: list[str] = []
+        self._warned = False
         self._forget()
 
     def stop(self) -> None:
@@ -141,8 +143,8 @@ class Session:
             self._final |= not isinstance(error, NoPicture)
         if self.problem:
             self._send(self._governor.brake(), reading)
-            if not self._governor.velocity.any():
-                self._tell()
+        if not self._governor.velocity.any():
+            self._tell()
         self._wait()
 
     def _drive(self, reading: Reading, now: float) -> None:
@@ -201,6 +203,9 @@ class Session:
             return
         settings, chunk = self._settings, check_chunk(actions)
         self._check_length(chunk)
+        if not self._warned and (warning := clamped(chunk, self._limits)):
+            self._warned = True
+            self._untold.append(warning)
         own = chunk[: settings.execute + settings.ahead]
         if self._path is None:
             self._path = Path(self._governor.pose.copy(), own, settings.control_dt)
@@ -256,15 +261,14 @@ class Session:
         """Begin to hold, unless the arm holds already."""
         if self.problem:
             return
-        self.problem, self._untold = problem, f"holding: {problem}"
-        self._since = self._clock.now()
+        self.problem, self._since = problem, self._clock.now()
+        self._untold.append(f"holding: {problem}")
         self._write(self._since, problem=problem)
 
     def _tell(self) -> None:
-        """Say why the arm holds, once."""
-        if sentence := self._untold:
-            self._untold = ""
-            self._say(sentence)
+        """Say what is to be said, now that the arm stands still."""
+        while self._untold:
+            self._say(self._untold.pop(0))
 
     def _rest(self) -> None:
         """Move slowly to the rest pose, unless the arm itself reports a fault."""
@@ -272,7 +276,7 @@ class Session:
             return
         self._say("moving slowly to the rest pose")
         if not self._go(REST):
-            self._untold = "holding: the rest pose is out of reach"
+            self._untold.append("holding: the rest pose is out of reach")
 
     def _go(self, pose: np.ndarray) -> bool:
         """Move slowly to a pose [7] and return True, or False where something prevents it."""

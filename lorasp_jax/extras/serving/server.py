@@ -17,7 +17,7 @@ import logging
 import socket
 import time
 from collections import Counter
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +38,7 @@ if TYPE_CHECKING:  # which imports JAX
 
 MAX_CLIENTS = 64
 """Maximum number of connections."""
+_MOST_WARNINGS = 20  # keys come from outside
 _log = logging.getLogger(__name__)
 
 
@@ -91,7 +92,7 @@ class PolicyServer:
         self._policy, self._token = policy, token
         self._batcher = Batcher(policy, self.counts)
         self._metadata = wire.pack(describe(policy))
-        self._clients = itertools.count()
+        self._clients, self._warned = itertools.count(), set[str]()
 
     @contextlib.asynccontextmanager
     async def listen(self, port: socket.socket) -> AsyncIterator[Server]:
@@ -178,12 +179,20 @@ class PolicyServer:
     def _read(self, client: ClientState, frame: bytes) -> tuple[str, Any, int | None]:
         """Return the adapter's name, the row and the number of action dimensions."""
         request = parse(wire.unpack(frame, max_values=MAX_VALUES), self._policy.spec)
+        self._warn(request.unknown)
         adapters = list(self._policy.instructions)
         adapter = request.adapter or adapters[0]
         if adapter not in adapters:
             raise ValueError(f"adapter must be one of {', '.join(adapters)}, got {adapter!r}")
         row = self._policy.prepare(*client.advance(request))
         return adapter, row, request.actions
+
+    def _warn(self, keys: Iterable[str]) -> None:
+        """Tell the log once of a key that has no meaning, such as a misspelt one."""
+        for key in keys:
+            if key not in self._warned and len(self._warned) < _MOST_WARNINGS:
+                self._warned.add(key)
+                _log.warning("requests have the key %.40r, which has no meaning", key)
 
     async def _refuse(self, connection: ServerConnection, sentence: str) -> None:
         """Send the client one sentence and close the connection."""

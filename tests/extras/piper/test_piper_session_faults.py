@@ -252,6 +252,25 @@ def test_the_arm_stands_still_before_anything_is_said(bench):
     assert_braked(run)
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (np.rad2deg, "joint 2 are far beyond its limits, such as 87"),
+        (lambda actions: actions + 0.9 * np.eye(7)[6], "the gripper are far beyond its limits"),
+        (lambda actions: actions + 0.01 * np.eye(7)[6], None),
+        (lambda actions: np.where(np.arange(10)[:, None] % 2, actions, 9.0), None),  # not all
+    ],
+)
+def test_wholly_clamped_chunks_are_warned_of_once(bench, change, words):
+    run = Run(bench, ask := Turning())
+    ask.change = change
+    run(1.2)
+    warnings = [text for text in run.said if text.startswith("warning")]
+    assert len(warnings) == (words is not None)
+    assert not words or words in warnings[0]
+    assert_safe(run)
+
+
 @pytest.mark.parametrize("number", mostly_slow(SIGNALS, [signal.SIGHUP]))
 def test_a_signal_brakes_also_if_the_terminal_has_gone(bench, number):
     def say(sentence):

@@ -212,6 +212,15 @@ def test_odd_headers_are_refused_without_a_traceback(lines, caplog):
     assert not [record for record in caplog.records if record.exc_info]
 
 
+def test_keys_without_a_meaning_are_logged_once(caplog):
+    with serving(StandIn()) as server:
+        for _ in range(2):
+            with connect(server) as client:
+                client.infer(observation(promt="press it"))
+                client.infer(observation(promt="press it", adaptor="a"))
+    assert [record.args[0] for record in caplog.records] == ["promt", "adaptor"]
+
+
 def test_a_token_is_required():
     with serving(StandIn(), token="secret") as server:
         for wrong in ({}, {"token": "wrong"}):
