@@ -2,7 +2,10 @@
 
 import argparse
 import asyncio
+import contextlib
 import functools
+import logging
+import os
 import secrets
 import signal
 import socket
@@ -41,7 +44,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=program,
         description="Serve a policy over websockets, in openpi's protocol.",
-        epilog="Pages on the same port: /healthz and /status. See docs/serving.md.",
+        epilog="Pages on the same port: /healthz, /status and /metrics. See docs/serving.md.",
     )
     add = parser.add_argument
     add(
@@ -56,7 +59,10 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--host", default="127.0.0.1", help="address to listen on; others than the default need a "
         "token (default: %(default)s)")  # fmt: skip
     add("--port", type=int, default=8000, help="default: %(default)s")
-    add("--token-file", type=Path, metavar="FILE", help="file with the token of the clients")
+    add("--token-file", type=Path, metavar="FILE", help="file with the token of the clients; "
+        "written with a fresh one if there is none, and made readable only by you")  # fmt: skip
+    add("--max-clients", type=positive, default=64, help="maximum number of connections (default: "
+        "%(default)s)")  # fmt: skip
     add("--prompt", default="", help="instruction of requests that have none")
     add("--max-batch", type=int, help="largest batch (default: 8)")
     add("--num-steps", type=int, help="flow steps (default: 10)")
@@ -99,10 +105,12 @@ def _add_checkpoint_options(group: Any) -> None:
 def _serve(options: argparse.Namespace, console: Console) -> None:
     from lorasp_jax.extras.serving import server
 
-    token = _read_token(options.token_file)
+    logging.basicConfig(format="%(asctime)s %(message)s")
+    logging.getLogger("lorasp_jax.extras.serving").setLevel(logging.INFO)
+    token = _read_token(options.token_file, console)
     with server.bind(options.host, options.port, token=token) as port:  # before what takes long
         policy = _load(options, console)
-        policy_server = server.PolicyServer(policy, token=token)
+        policy_server = server.PolicyServer(policy, token=token, max_clients=options.max_clients)
         answers = asyncio.run(_run(policy_server, port, console))
     if not answers:
         from lorasp_jax.training.distributed import processes
@@ -211,14 +219,27 @@ def _named(text: str) -> tuple[str, str]:
     return pair(text)
 
 
-def _read_token(path: Path | None) -> str:
-    """Read the token, without a final newline."""
+def _read_token(path: Path | None, console: Console) -> str:
+    """Read the token, without a final newline, or write a fresh one; nobody else may read it."""
     if path is None:
         return ""
+    with contextlib.suppress(FileExistsError), open(path, "x", opener=_privately) as file:
+        file.write(secrets.token_urlsafe() + "\n")
+        _say(console, f"wrote a fresh token to {path}")
+    if path.stat().st_mode & 0o077:
+        try:
+            path.chmod(0o600)
+            _say(console, f"{path} was open to other users, and is so no more (mode 0600)")
+        except OSError as error:  # such as a container's secret, which belongs to root
+            _say(console, f"warning: other users can read {path}: {error.strerror}")
     token = path.read_text().strip()
     if not token or not token.isascii() or not token.isprintable():
         raise ValueError(f"{path} must contain a token of printable ASCII characters")
     return token
+
+
+def _privately(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)
 
 
 def _say(console: Console, text: str) -> None:

@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lorasp_jax.extras.serving.metrics import Histogram
+
 if TYPE_CHECKING:  # which imports JAX
     from lorasp_jax.extras.serving.served import ServedPolicies
 
@@ -52,7 +54,11 @@ class _Job:
 
 
 class Batcher:
-    """Collects rows and runs them in batches, in its own thread until `close`."""
+    """Collects rows and runs them in batches, in its own thread until `close`.
+
+    Attributes:
+        seconds: how long batches took.
+    """
 
     def __init__(self, policy: "ServedPolicies", counts: Counter[str]) -> None:
         """Start the thread.
@@ -62,6 +68,7 @@ class Batcher:
             counts: receives the numbers of batches and of their requests.
         """
         self._policy, self._counts = policy, counts
+        self.seconds: Histogram = Histogram()
         self._queue: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         self._pending: list[_Job] = []
         self._awaited: set[int] = set()
@@ -166,6 +173,7 @@ class Batcher:
                 job.fail("the policy failed: see the server's log")
             return
         milliseconds = (time.perf_counter() - start) * 1e3
+        self.seconds.observe(batch[0].adapter, milliseconds / 1e3)
         self._counts["batches"] += 1
         self._counts["batched_requests"] += len(batch)
         for job, chunk in zip(batch, actions, strict=False):

@@ -29,7 +29,7 @@ from websockets.http11 import Request as HttpRequest
 from websockets.http11 import Response
 
 import lorasp_jax
-from lorasp_jax.extras.serving import wire
+from lorasp_jax.extras.serving import metrics, wire
 from lorasp_jax.extras.serving.batching import Batcher, PolicyFailure
 from lorasp_jax.extras.serving.requests import MAX_VALUES, Request, parse
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:  # which imports JAX
     from lorasp_jax.extras.serving.served import ServedPolicies
 
 MAX_CLIENTS = 64
-"""Maximum number of connections."""
+"""Maximum number of connections, unless given."""
 _MOST_WARNINGS = 20  # keys come from outside
 _log = logging.getLogger(__name__)
 
@@ -80,14 +80,18 @@ class PolicyServer:
         counts: numbers of connections, open connections, requests, errors and batches.
     """
 
-    def __init__(self, policy: "ServedPolicies", *, token: str = "") -> None:
+    def __init__(
+        self, policy: "ServedPolicies", *, token: str = "", max_clients: int = MAX_CLIENTS
+    ) -> None:
         """Start the policy's thread; `listen` opens the port.
 
         Args:
             policy: already compiled.
             token: if not empty, clients must send it in the header "Authorization: Api-Key TOKEN".
+            max_clients: maximum number of connections.
         """
-        names = ("connections", "open_connections", "requests", "errors")
+        names = ("connections", "open_connections", "refused_connections", "requests", "errors")
+        self._max_clients, self._seconds = max_clients, metrics.Histogram()
         self.counts: Counter[str] = Counter(dict.fromkeys(names, 0))
         self._policy, self._token = policy, token
         self._batcher = Batcher(policy, self.counts)
@@ -118,28 +122,43 @@ class PolicyServer:
     ) -> Response | None:
         """Answer pages, and refuse connections without the token or beyond the limit."""
         if request.path == "/healthz":
-            if problem := self._batcher.problem():
-                return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, f"{problem}\n")
-            return connection.respond(http.HTTPStatus.OK, "OK\n")
-        headers = request.headers.get_all("Authorization")
-        if len(headers) > 1:
-            text = "there must be one header Authorization\n"
-            return connection.respond(http.HTTPStatus.BAD_REQUEST, text)
-        given = "".join(headers).removeprefix("Api-Key ")
-        if self._token and not hmac.compare_digest(given.encode(), self._token.encode()):
-            text = "this server requires a token: Authorization: Api-Key TOKEN\n"
-            return connection.respond(http.HTTPStatus.UNAUTHORIZED, text)
+            problem = self._batcher.problem()
+            status = http.HTTPStatus.SERVICE_UNAVAILABLE if problem else http.HTTPStatus.OK
+            return connection.respond(status, f"{problem or 'OK'}\n")
+        if refusal := self._refusal(request):
+            self.counts["refused_connections"] += 1
+            _log.info("refused %s: %s", _peer(connection), refusal[1])
+            return connection.respond(refusal[0], f"{refusal[1]}\n")
         if request.path == "/status":
             return connection.respond(http.HTTPStatus.OK, json.dumps(self.counts) + "\n")
-        if self.counts["open_connections"] >= MAX_CLIENTS:
-            text = f"this server has its maximum of {MAX_CLIENTS} connections\n"
-            return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, text)
+        if request.path == "/metrics":
+            histograms = {"request_seconds": self._seconds, "batch_seconds": self._batcher.seconds}
+            page = connection.respond(http.HTTPStatus.OK, metrics.text(self.counts, histograms))
+            del page.headers["Content-Type"]
+            page.headers["Content-Type"] = metrics.CONTENT_TYPE
+            return page
+        return None
+
+    def _refusal(self, request: HttpRequest) -> tuple[http.HTTPStatus, str] | None:
+        """Return why a page or a connection is refused; None if it is not."""
+        headers = request.headers.get_all("Authorization")
+        if len(headers) > 1:
+            return http.HTTPStatus.BAD_REQUEST, "there must be one header Authorization"
+        given = "".join(headers).removeprefix("Api-Key ")
+        if self._token and not hmac.compare_digest(given.encode(), self._token.encode()):
+            text = "this server requires a token: Authorization: Api-Key TOKEN"
+            return http.HTTPStatus.UNAUTHORIZED, text
+        is_page = request.path in ("/status", "/metrics")
+        if not is_page and self.counts["open_connections"] >= self._max_clients:
+            text = f"this server has its maximum of {self._max_clients} connections"
+            return http.HTTPStatus.SERVICE_UNAVAILABLE, text
         return None
 
     async def _handle(self, connection: ServerConnection) -> None:
         """Serve one connection until it closes."""
         client = ClientState(next(self._clients))
         self.counts.update(("connections", "open_connections"))
+        _log.info("client %d connected from %s", client.number, _peer(connection))
         try:
             await connection.send(self._metadata)
             async for frame in connection:
@@ -147,12 +166,13 @@ class PolicyServer:
         except ConnectionClosed:
             pass  # the client has gone, which ends its episode
         except (ValueError, PolicyFailure) as error:
-            await self._refuse(connection, str(error))
+            await self._refuse(connection, client, str(error))
         except Exception as error:  # a bug must not show the client a traceback
             _log.exception("a request failed")
-            await self._refuse(connection, f"the server failed: {type(error).__name__}")
+            await self._refuse(connection, client, f"the server failed: {type(error).__name__}")
         finally:
             self.counts["open_connections"] -= 1
+            _log.info("client %d left after %d requests", client.number, client.requests)
 
     async def _answer(
         self, connection: ServerConnection, client: ClientState, frame: bytes | str
@@ -174,6 +194,7 @@ class PolicyServer:
         }
         await connection.send(wire.pack(reply))
         client.previous_ms = (time.perf_counter() - start) * 1e3
+        self._seconds.observe(adapter, client.previous_ms / 1e3)
         self.counts["requests"] += 1
 
     def _read(self, client: ClientState, frame: bytes) -> tuple[str, Any, int | None]:
@@ -194,12 +215,21 @@ class PolicyServer:
                 self._warned.add(key)
                 _log.warning("requests have the key %.40r, which has no meaning", key)
 
-    async def _refuse(self, connection: ServerConnection, sentence: str) -> None:
+    async def _refuse(
+        self, connection: ServerConnection, client: ClientState, sentence: str
+    ) -> None:
         """Send the client one sentence and close the connection."""
         self.counts["errors"] += 1
+        _log.info("client %d is refused: %s", client.number, sentence)
         with contextlib.suppress(ConnectionClosed):
             await connection.send(sentence)
             await connection.close(CloseCode.INTERNAL_ERROR, "the previous frame says why")
+
+
+def _peer(connection: ServerConnection) -> str:
+    """Return the other end's address; a client that has gone has none."""
+    host, port = (connection.remote_address or ("nowhere", 0))[:2]
+    return f"{host} port {port}"
 
 
 def describe(policy: "ServedPolicies") -> dict[str, Any]:

@@ -86,7 +86,7 @@ def test_checkpoints_that_do_not_say_enough(options, refusal, dummy_base):
         (["a=nowhere", "b=nothing"], "several policies must all be"),
         (["x/a", "y/a"], "different names"),
         (["a", "--host", "0.0.0.0"], "anyone who reaches 0.0.0.0"),
-        (["a", "--token-file", "nothing"], "nothing: No such file"),
+        (["a", "--token-file", "no/thing"], "no/thing: No such file"),
         (["a", "--token-file", "empty"], "empty must contain a token"),
         (["a", "--max-batch", "0"], "largest batch"),
         (["assets/pi0_nano", "--base", "x"], "--base is for runs"),
@@ -167,6 +167,20 @@ def test_serving_a_run_until_an_interrupt(run, capsys, monkeypatch, policy):
         assert found["shape"] == (4, 7)
         assert [line.split()[0] for line in lines[:-2]] == ["loading", "compiling", "ready"]
         assert re.fullmatch(rf"loading {run} with --seed \d+", lines[0])
+
+
+@pytest.mark.parametrize("before", [None, "mine"])
+def test_nobody_else_can_read_the_token(before, tmp_path, capsys):
+    path = tmp_path / "token.txt"
+    if before:
+        path.write_text(f"{before}\n")
+        path.chmod(0o644)
+    token = command._read_token(path, Console())
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert "token.txt" in capsys.readouterr().out.replace("\n", "")
+    assert token == before if before else len(token) > 30
+    assert command._read_token(path, Console()) == token
+    assert not capsys.readouterr().out
 
 
 HUNG = """

@@ -14,7 +14,6 @@ from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import connect as raw_connect
 
 from lorasp_jax.extras.serving import batching, wire
-from lorasp_jax.extras.serving import server as server_module
 from lorasp_jax.extras.serving.client import PolicyError, ServerGone
 from lorasp_jax.extras.serving.server import bind
 from tests.extras.serving.stand_in import SPEC, StandIn, connect, observation, serving
@@ -212,6 +211,59 @@ def test_odd_headers_are_refused_without_a_traceback(lines, caplog):
     assert not [record for record in caplog.records if record.exc_info]
 
 
+def series(text):
+    """Return the values by name with labels, and the types by name."""
+    lines = [line.rsplit(" ", 1) for line in text.splitlines()]
+    types = {name.split()[-1]: kind for name, kind in lines if name.startswith("# TYPE")}
+    return {name: float(value) for name, value in lines if name[0] != "#"}, types
+
+
+def test_metrics_are_prometheus_series():
+    policy = StandIn(adapters=("base", 'a"b'), seconds=0.003)
+    with serving(policy) as server, connect(server) as client:
+        client.infer(observation())
+        for _ in range(2):
+            client.infer(observation(adapter='a"b'))
+        address = f"http://127.0.0.1:{server.port}/metrics"
+        with urllib.request.urlopen(address, timeout=60) as reply:
+            assert "version=0.0.4" in reply.headers["Content-Type"]
+            values, types = series(reply.read().decode())
+    assert values["lorasp_jax_requests_total"] == 3
+    assert values["lorasp_jax_open_connections"] == 1
+    assert types["lorasp_jax_open_connections"] == "gauge"
+    for name in ("lorasp_jax_request_seconds", "lorasp_jax_batch_seconds"):
+        assert types[name] == "histogram"
+        for adapter, count in (("base", 1), ('a\\"b', 2)):
+            label = f'adapter="{adapter}"'
+            buckets = [v for k, v in values.items() if k.startswith(f"{name}_bucket{{{label},")]
+            assert buckets == sorted(buckets)
+            assert values[f'{name}_bucket{{{label},le="0.002"}}'] == 0
+            assert values[f'{name}_bucket{{{label},le="+Inf"}}'] == count
+            assert values[f"{name}_count{{{label}}}"] == count
+            assert values[f"{name}_sum{{{label}}}"] >= 0.003 * count
+
+
+def test_the_log_has_connections_and_refusals(caplog):
+    caplog.set_level("INFO", "lorasp_jax.extras.serving")
+    with (
+        serving(StandIn(), token="secret", max_clients=1) as server,
+        connect(server, token="secret") as client,
+    ):
+        for token in ("", "secret"):
+            with pytest.raises(ServerGone):
+                connect(server, token=token)
+        client.infer(observation())
+        with pytest.raises(PolicyError):
+            client.infer(observation(prompt=3))
+    first, *refused, asked, left = [record.message for record in caplog.records]
+    assert first.startswith("client 0 connected from 127.0.0.1 port ")
+    assert [text.partition(": ")[2][:11] for text in refused] == ["this server", "this server"]
+    assert "requires a token" in refused[0]
+    assert "maximum of 1" in refused[1]
+    assert asked.startswith("client 0 is refused: prompt must be text")
+    assert left == "client 0 left after 1 requests"
+
+
 def test_keys_without_a_meaning_are_logged_once(caplog):
     with serving(StandIn()) as server:
         for _ in range(2):
@@ -258,8 +310,7 @@ def test_pages_in_browsers_are_refused(server):
         raw_connect(server.address, origin="https://example.org")
 
 
-def test_too_many_connections_are_refused(monkeypatch):
-    monkeypatch.setattr(server_module, "MAX_CLIENTS", 2)
-    with serving(StandIn()) as server, connect(server), connect(server):  # noqa: SIM117
+def test_too_many_connections_are_refused():
+    with serving(StandIn(), max_clients=2) as server, connect(server), connect(server):  # noqa: SIM117
         with pytest.raises(ServerGone, match=r"\(503\): .*maximum of 2"):
             connect(server)
