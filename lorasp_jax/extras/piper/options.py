@@ -10,16 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from envs import names
+from lorasp_jax.base.arguments import positive
 from lorasp_jax.base.locks import locked
+from lorasp_jax.extras.piper.keys import SIGNALS
 from lorasp_jax.extras.piper.log import Log
 from lorasp_jax.extras.piper.recording import Recording
 from lorasp_jax.extras.piper.safety import Limits
 from lorasp_jax.extras.piper.session import Session
 from lorasp_jax.extras.piper.settings import Settings
 from lorasp_jax.extras.piper.teaching import Lesson
-
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
-"""Those that end or suspend a program, and so must stop the arm."""
 
 
 def add_shared(parser: argparse.ArgumentParser) -> None:
@@ -31,8 +30,14 @@ def add_shared(parser: argparse.ArgumentParser) -> None:
         "first")  # fmt: skip
     add("--robot", default="piper", help="robot of the policy's training; another than the arm is "
         "refused unless it is named here (default: %(default)s)")  # fmt: skip
-    add("--prompt", default="", help="the request in words; default: one of the task's")
+    add("--prompt", action="append", default=[], help="the request in words; several take turns; "
+        "default: one of the task's")  # fmt: skip
+    add("--patience", type=float, default=2.0, metavar="S", help="longest time to wait for an "
+        "answer [s] (default: %(default)s)")  # fmt: skip
     add = parser.add_argument_group("execution").add_argument
+    add("--episodes", type=positive, default=1, help="default: %(default)s")
+    add("--record", type=Path, metavar="FOLDER", help="add the successful episodes to an RLDS "
+        "dataset, which train.py takes as --data.source")  # fmt: skip
     add("--execute", type=int, default=5, help="actions of each chunk (default: %(default)s)")
     add("--ahead", type=int, default=0, help="actions before their end to ask for the next chunk; "
         "0: the arm waits for the answer (default: %(default)s)")  # fmt: skip
@@ -61,10 +66,11 @@ def limits(options: argparse.Namespace) -> Limits:
 def settings(options: argparse.Namespace, prompt: str, **more: Any) -> Settings:
     """Return the settings of a session; raise ValueError if one is out of range."""
     return Settings(
-        options.prompt or prompt,
+        prompt,
         control_dt=period(options),
         execute=options.execute,
         ahead=options.ahead,
+        patience=options.patience,
         **more,
     )
 

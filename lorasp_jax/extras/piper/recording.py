@@ -55,7 +55,7 @@ class Recording:
                 raise ValueError(f"{folder} has {name} {was}, not {value}: choose another folder")
         known = [*earlier.get("instructions", []), *instructions]
         self._shared["instructions"] = tuple(dict.fromkeys(known))
-        self._image_size = image_size
+        self._image_size, self._failures = image_size, 0
         self.say(prompt)
         self.discard()
 
@@ -83,6 +83,11 @@ class Recording:
         if prompt not in self._shared["instructions"]:
             self._shared["instructions"] += (prompt,)
 
+    def fail(self) -> None:
+        """Forget the present episode, and count it as an attempt with the next one that is kept."""
+        self._failures += 1
+        self.discard()
+
     def discard(self) -> None:
         """Forget the present episode."""
         self._images: dict[str, list[np.ndarray]] = {}
@@ -105,9 +110,10 @@ class Recording:
             action=np.stack(self._actions)[None].astype(np.float32),
             length=np.array([self.steps], np.int32),
             instruction=np.array([instructions.index(self._prompt)], np.int32),
-            attempted=1,
+            attempted=1 + self._failures,
             **self._shared,
         )
         self._writer.append(episode)
         self._writer.complete()
+        self._failures = 0
         self.discard()

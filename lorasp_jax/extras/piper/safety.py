@@ -218,8 +218,8 @@ class Governor:
         self.approaching, self.blocked = True, False
         self._target: np.ndarray | None = None
 
-    def step(self, target: np.ndarray) -> np.ndarray:
-        """Return the command [7] of this tick on the way to a target [7].
+    def step(self, target: np.ndarray, *, slow: bool = False) -> np.ndarray:
+        """Return the command [7] of this tick on the way to a target [7], as an approach if slow.
 
         Raises:
             Unsafe: the target has the wrong shape or is not finite.
@@ -227,7 +227,7 @@ class Governor:
         target = np.clip(check_chunk(target[None])[0], self.limits.lower, self.limits.upper)
         if np.abs(target - self.pose)[:6].max() <= _NEAR:
             self.approaching = False
-        speed = self.limits.speed * (_APPROACH if self.approaching else 1.0)
+        speed = self.limits.speed * (_APPROACH if self.approaching or slow else 1.0)
         before = target if self._target is None or self.approaching else self._target
         self._target = target
         forward = np.clip((target - before) / self._dt, -speed, speed)

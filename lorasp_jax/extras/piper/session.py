@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lorasp_jax.base.errors import one_line
-from lorasp_jax.extras.piper.arm import PiperArm
+from lorasp_jax.extras.piper.arm import NoArm, PiperArm
 from lorasp_jax.extras.piper.asking import InThread
 from lorasp_jax.extras.piper.cameras import Look, NoPicture
 from lorasp_jax.extras.piper.clock import Clock
@@ -41,7 +41,7 @@ REST = np.array([0.0, 0.06, -0.06, 0.0, 0.35, 0.0, 0.0])
 """Pose in which the arm lies folded [rad, m]: all joints near zero; our choice."""
 _REACHED = 0.01  # rad from the rest pose that counts as arrived
 _APPROACH_TIME = 20.0  # s that the way to the first action may take
-_GO_TIME = 60.0  # s that the way to the rest pose may take
+_GO_TIME = 60.0  # s that the way to the rest or start pose may take
 _INSTANT = 1e-6  # control steps that rounding may take from a clock's time
 _LATE = 0.05  # s of delay after which ticks are skipped instead of made up for
 
@@ -57,7 +57,7 @@ class Session:
 
     def __init__(
         self,
-        arm: PiperArm,
+        arm: PiperArm | NoArm,
         look: Look,
         asker: InThread,
         limits: Limits,
@@ -98,6 +98,16 @@ class Session:
             BaseException: whatever else a camera, the log, `say` or `done` raised.
         """
         return self._guarded(lambda: self._follow(seconds, done))
+
+    def home(self, pose: np.ndarray) -> str | None:
+        """Move slowly to a pose [7] after a run; result and errors are those of `run`."""
+
+        def work() -> None:
+            self._say("moving slowly to the start pose")
+            if not self._go(pose):
+                self._hold("the start pose is out of reach")
+
+        return self._guarded(work)
 
     def _guarded(self, work: Callable[[], None]) -> str | None:
         """Work on an arm at rest; however that ends, brake, then say why, and only then raise."""
@@ -281,12 +291,13 @@ class Session:
     def _go(self, pose: np.ndarray) -> bool:
         """Move slowly to a pose [7] and return True, or False where something prevents it."""
         self._governor.start(self._governor.pose)
-        end = self._clock.now() + _GO_TIME
+        self._next = self._clock.now()
+        end = self._next + _GO_TIME
         while np.abs(self._governor.pose - pose)[:6].max() > _REACHED and not self.stopped:
             reading = self._read()
             if fault(reading, self._limits) or self._clock.now() > end:
                 return False
-            self._send(self._governor.step(pose), reading)
+            self._send(self._governor.step(pose, slow=True), reading)
             self._wait()
         return True
 

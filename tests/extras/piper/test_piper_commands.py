@@ -2,10 +2,15 @@
 
 import dataclasses
 import json
+import os
+import pty
 import signal
+import sys
+import termios
 import types
 from unittest.mock import Mock
 
+import av
 import numpy as np
 import pytest
 
@@ -21,7 +26,9 @@ from lorasp_jax.extras.piper.fake import __main__ as faking
 from lorasp_jax.extras.piper.fake.__main__ import main as fake
 from lorasp_jax.extras.piper.fake.firmware import FakePiper
 from lorasp_jax.extras.piper.fake.timing import RealTime
+from lorasp_jax.extras.piper.keys import SIGNALS, Keys
 from lorasp_jax.extras.piper.recording import Recording
+from lorasp_jax.extras.piper.session import Session
 from lorasp_jax.extras.serving.client import PolicyClient
 from tests.cases import mostly_slow
 from tests.extras.piper.benches import channel
@@ -86,6 +93,12 @@ def test_the_expert_on_the_fake_arm(tmp_path, capsys, limit, seconds):
     assert f"episode 0: {'success' if won else 'failure'}" in printed
     assert f"{won:d} of 1 succeeded" in printed
     assert film.stat().st_size > 1000
+    with av.open(str(film)) as container:
+        *_, last = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    assert last.shape == (256, 512, 3)
+    edge = last[2:10, 100:400].mean((0, 1))  # green after success, else red
+    assert edge.argmax() == int(won)
+    assert edge.max() > 100 > 60 > edge[1 - won]
     lines = (tmp_path / "log" / "log.jsonl").read_text().splitlines()
     assert json.loads(lines[0])["episode"] == 0
     if won:
@@ -296,13 +309,110 @@ def linked(monkeypatch, film, world, patient):
     return ["--camera", f"side={film}", "--camera", f"wrist={film}", "--task", "press"]
 
 
-def test_the_real_command_with_an_arm_on_the_bus(server, linked, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("builtins.input", lambda question: "y")
+class Script(Keys):
+    """Answers questions with the keys of a script."""
+
+    def __init__(self, keys):
+        self.script, self.questions = [*keys], []
+
+    def __enter__(self):
+        self.ended = False
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def ask(self, question, keys, seconds=None):
+        self.questions.append(question)
+        while self.script:
+            if (key := self.script.pop(0)) in keys:
+                return key
+        raise EOFError("nobody")
+
+
+@pytest.fixture
+def press_keys(monkeypatch):
+    def script(during, after):
+        keys = Script(after)
+        monkeypatch.setattr(command, "Keys", lambda: keys)
+        pending = [*during]
+        keys.pressed = lambda seconds=0.0: pending.pop(0) if pending else ""
+        return keys
+
+    return script
+
+
+def test_the_real_command_with_an_arm_on_the_bus(server, linked, tmp_path, press_keys, capsys):
+    press_keys("", "s")
     words = ["--server", server.address, *linked, "--seconds", "1.5"]
     words += ["--log", str(tmp_path / "log"), "--record", str(tmp_path / "data")]
     assert real([*words, "--image-size", "16"]) == 0, capsys.readouterr()
     assert "1 episodes recorded" in capsys.readouterr().out
     assert open_source(tmp_path / "data").num_steps >= 5
+
+
+def test_several_episodes_are_recorded_in_one_start_and_in_the_next(
+    server, linked, tmp_path, press_keys, capsys
+):
+    """One fails, one is done again, and two succeed, with prompts that take turns."""
+    words = ["--server", server.address, *linked, "--seconds", "0.3", "--image-size", "16"]
+    words += ["--record", str(tmp_path / "data"), "--episodes", "2"]
+    words += ["--prompt", "press it", "--prompt", "tap it"]
+    keys = press_keys("", "f\na\ns\ns")
+    assert real([*words, "--log", str(tmp_path / "log")]) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("moving slowly to the start pose") == 3
+    assert "2 of 3 succeeded" in printed
+    assert sum("scene" in question for question in keys.questions) == 3
+    press_keys("", "q")  # a person who ends the next session at once
+    assert real([*words, "--log", str(tmp_path / "log2")]) == 0
+    press_keys("", "s\nf\nq")
+    assert real([*words, "--log", str(tmp_path / "log3")]) == 0
+    source = open_source(tmp_path / "data")
+    episodes = [source.episode(i) for i in range(len(source))]
+    said = [e.instructions[int(e.instruction[0])] for e in episodes]
+    assert said == ["press it", "tap it", "press it"]
+    assert source.metadata["attempted"] == 4
+
+
+def test_a_key_ends_an_episode(server, linked, tmp_path, press_keys, capsys):
+    keys = press_keys(["", "", "x", "s"], "")
+    words = ["--server", server.address, *linked, "--seconds", "60", "--episodes", "2"]
+    assert real([*words, "--log", str(tmp_path / "log"), "--reset-time", "0"]) == 0
+    assert keys.questions == ["put the scene back, then press Enter, or q to quit"]
+    assert "1 of 1 succeeded" in capsys.readouterr().out
+
+
+def test_a_dry_run_needs_no_bus(film, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(command, "PiperArm", Mock(side_effect=AssertionError("a bus")))
+    monkeypatch.setattr("lorasp_jax.extras.piper.cameras.MAX_AGE", 60.0)
+    words = ["--camera", f"side={film}", "--camera", f"wrist={film}", "--task", "press"]
+    with serving(Still()) as server:
+        words += ["--server", server.address, "--seconds", "0.3", "--dry-run"]
+        assert real([*words, "--log", str(tmp_path)]) == 0
+    assert "would command" in capsys.readouterr().out
+
+
+def test_the_camera_is_asked_for_size_rate_and_format(server, monkeypatch, capsys):
+    opened = Mock(side_effect=OSError("no device"))
+    monkeypatch.setattr("av.open", opened)
+    words = ["--server", server.address, "--task", "press", "--camera-size", "320x240"]
+    words += ["--camera-rate", "60", "--camera-format", "mjpeg"]
+    assert real([*words, "--camera", "side=/dev/video0", "--camera", "wrist=/dev/video2"]) == 2
+    assert "cannot open camera side" in capsys.readouterr().err
+    expected = {"video_size": "320x240", "framerate": "60", "input_format": "mjpeg"}
+    opened.assert_called_once_with("/dev/video0", format="v4l2", options=expected)
+
+
+def test_patience_is_an_option(linked, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(Session, "_rest", lambda _: None)  # the way to it takes long
+    policy = Still()
+    policy.gate.clear()
+    with serving(policy) as slow:
+        words = ["--server", slow.address, *linked, "--patience", "0.2"]
+        assert real([*words, "--log", str(tmp_path / "log")]) == HELD
+        policy.gate.set()
+    assert "did not answer within 0.2 s" in capsys.readouterr().out
 
 
 def test_a_dry_run_of_the_real_command(linked, tmp_path, capsys):
@@ -315,36 +425,67 @@ def test_a_dry_run_of_the_real_command(linked, tmp_path, capsys):
     assert before.count("the policy was not trained for 'press the red button', but for") == 1
 
 
-def test_teaching_with_the_real_command(linked, tmp_path, monkeypatch, capsys):
-    questions = []
-    monkeypatch.setattr("builtins.input", lambda question: questions.append(question) or "n")
+def test_teaching_with_the_real_command(linked, tmp_path, monkeypatch, press_keys, capsys):
+    keys = press_keys("", "q")
     monkeypatch.setattr("lorasp_jax.extras.piper.teaching._STILL", -1.0)
     words = [*linked, "--seconds", "0.6", "--record", str(tmp_path / "data"), "--image-size", "16"]
     assert real([*words, "--teach", "hand"]) == 0
-    assert questions[0].startswith("keep this episode of ")
+    assert keys.questions == [command.QUESTION]
     assert real([*words, "--teach", "leader"]) == HELD
     assert "no leader sends targets" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("number", [None, *options.SIGNALS])
-def test_an_episode_that_nobody_judges_is_not_lost(number, tmp_path, monkeypatch, capsys):
-    def ask(question):
-        if number:
-            signal.raise_signal(number)
-        raise EOFError("EOF when reading a line")
+@pytest.fixture
+def terminal(monkeypatch):
+    """A terminal; what is written to it are keys."""
+    outer, inner = pty.openpty()
+    with os.fdopen(inner) as stdin, os.fdopen(outer, "wb", buffering=0) as typing:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        yield typing
 
-    monkeypatch.setattr("builtins.input", ask)
+
+def test_keys_come_without_enter_and_the_terminal_is_given_back(terminal):
+    before = termios.tcgetattr(sys.stdin)
+    with Keys() as keys:
+        assert keys.pressed() == ""
+        terminal.write(b"xs")
+        assert keys.ask("?", "sf") == "s"
+        assert keys.ask("?", "sf", 0.01) == ""
+        assert not keys.ended
+    assert termios.tcgetattr(sys.stdin) == before
+
+
+def test_without_a_terminal_nobody_answers(monkeypatch):
+    with open(os.devnull) as null:
+        monkeypatch.setattr(sys, "stdin", null)
+        with Keys() as keys, pytest.raises(EOFError):
+            keys.ask("?", "s")
+        assert keys.ended
+        assert keys.pressed() == ""
+
+
+@pytest.mark.parametrize("number", [None, *SIGNALS])
+def test_an_episode_that_nobody_judges_is_not_lost(number, tmp_path, capsys, terminal):
     ways = {"task": "press", "instructions": (), "control_dt": 0.1, "image_size": 16}
     recorder = Recording(tmp_path / "data", prompt="press it", **ways)
     recorder.step({"side": np.zeros((16, 16, 3), np.uint8)}, np.ones(7), np.ones(7))
-    handlers = {each: signal.getsignal(each) for each in options.SIGNALS}
+    handlers = {each: signal.getsignal(each) for each in SIGNALS}
+    rig = command.Rig(None, None, None, recorder, None, Keys())
+
+    def interrupt(*_):
+        signal.raise_signal(number)
+
     try:
         options.stop_on_signals(types.SimpleNamespace(stop=lambda: None))
-        if number == signal.SIGINT:
-            with pytest.raises(KeyboardInterrupt, match="not kept"):
-                command._keep(recorder)
-        else:
-            command._keep(recorder)
+        with rig.keys:
+            rig.keys.ended = number is None
+            rig.keys.pressed = interrupt
+            if number == signal.SIGINT:
+                with pytest.raises(KeyboardInterrupt, match="not kept"):
+                    command._keep(rig, "")
+            else:
+                assert command._keep(rig, "") == "s"
+                assert rig.keys.ended
     finally:
         for each, handler in handlers.items():
             signal.signal(each, handler)

@@ -12,8 +12,9 @@ from websockets.exceptions import ConcurrencyError
 from lorasp_jax.extras.piper import session as sessions
 from lorasp_jax.extras.piper.cameras import NoPicture
 from lorasp_jax.extras.piper.fake import frames
+from lorasp_jax.extras.piper.keys import SIGNALS
 from lorasp_jax.extras.piper.log import Log
-from lorasp_jax.extras.piper.options import SIGNALS, stop_on_signals
+from lorasp_jax.extras.piper.options import stop_on_signals
 from lorasp_jax.extras.piper.remote import Server
 from lorasp_jax.extras.piper.session import PERIOD
 from lorasp_jax.extras.serving.client import PolicyClient, PolicyError
