@@ -122,10 +122,16 @@ def _episodes(options: argparse.Namespace, rig: Rig, prompts: Sequence[str], sec
     """Run until enough episodes were judged, or recorded; return the exit code."""
     start, judged, kept = rig.arm.read().pose, 0, 0
     judging = bool(rig.recorder) or options.episodes > 1
+    work: Session | Lesson | None = None
     while True:
-        work = _prepare(options, rig, prompts[(kept if rig.recorder else judged) % len(prompts)])
+        prompt = prompts[(kept if rig.recorder else judged) % len(prompts)]
+        before, work = work, _prepare(options, rig, prompt)
         shared.stop_on_signals(work)
+        if before and before.stopped:  # meanwhile
+            break
         verdict = ""
+        while judging and rig.keys.pressed():
+            pass  # what was typed before is no verdict
 
         def done() -> bool:
             nonlocal verdict
@@ -216,7 +222,7 @@ def _keep(rig: Rig, verdict: str) -> str:
 def _sources(options: argparse.Namespace, server: remote.Server | None) -> dict[str, str]:
     """Return the cameras' sources after checking that there are those that the policy needs."""
     sources = dict(options.camera)
-    needed = server.metadata.get("cameras", []) if server else list(sources)[:1] or ["side"]
+    needed = (server.metadata.get("cameras") or []) if server else list(sources)[:1] or ["side"]
     if missing := [name for name in needed if name not in sources]:
         examples = " ".join(f"--camera {name}=SOURCE" for name in missing)
         raise ValueError(

@@ -24,15 +24,16 @@ class Keys:
 
     def __enter__(self) -> Self:
         """Let keys arrive at once if there is a terminal."""
-        self.ended, self._stack = False, contextlib.ExitStack()
-        with contextlib.suppress(OSError, ValueError):  # nobody is there, as `pressed` finds
+        self.ended, self._stack = True, contextlib.ExitStack()
+        with contextlib.suppress(OSError, ValueError):  # nobody is there
             self._file = sys.stdin.fileno()
             if os.isatty(self._file):
+                if os.tcgetpgrp(self._file) != os.getpgrp():
+                    return self  # in the background, reading it would suspend the program
                 before = termios.tcgetattr(self._file)
                 self._stack.callback(termios.tcsetattr, self._file, termios.TCSANOW, before)
                 tty.setcbreak(self._file)  # Ctrl-C stays a signal
-            return self
-        self.ended = True
+            self.ended = False
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -99,6 +99,8 @@ class Batcher:
         seconds = time.monotonic() - self._begun
         if self._running and seconds > HUNG:
             return f"the policy has not answered for {seconds:.0f} s"
+        if not self._thread.is_alive():
+            return "the policy's thread has ended"
         return "the policy failed when it was last asked" if self._failed else None
 
     def close(self, timeout: float | None = None) -> bool:

@@ -376,7 +376,7 @@ def test_several_episodes_are_recorded_in_one_start_and_in_the_next(
 
 
 def test_a_key_ends_an_episode(server, linked, tmp_path, press_keys, capsys):
-    keys = press_keys(["", "", "x", "s"], "")
+    keys = press_keys(["f", "f", "", "", "x", "s"], "")
     words = ["--server", server.address, *linked, "--seconds", "60", "--episodes", "2"]
     assert real([*words, "--log", str(tmp_path / "log"), "--reset-time", "0"]) == 0
     assert keys.questions == ["put the scene back, then press Enter, or q to quit"]
@@ -439,6 +439,7 @@ def test_teaching_with_the_real_command(linked, tmp_path, monkeypatch, press_key
 def terminal(monkeypatch):
     """A terminal; what is written to it are keys."""
     outer, inner = pty.openpty()
+    monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp())
     with os.fdopen(inner) as stdin, os.fdopen(outer, "wb", buffering=0) as typing:
         monkeypatch.setattr(sys, "stdin", stdin)
         yield typing
@@ -453,6 +454,15 @@ def test_keys_come_without_enter_and_the_terminal_is_given_back(terminal):
         assert keys.ask("?", "sf", 0.01) == ""
         assert not keys.ended
     assert termios.tcgetattr(sys.stdin) == before
+
+
+def test_in_the_background_the_terminal_is_left_alone(terminal, monkeypatch):
+    monkeypatch.setattr(os, "tcgetpgrp", lambda _: -1)
+    monkeypatch.setattr("tty.setcbreak", Mock(side_effect=AssertionError("suspended")))
+    with Keys() as keys:
+        assert keys.ended
+        terminal.write(b"s")
+        assert keys.pressed() == ""
 
 
 def test_without_a_terminal_nobody_answers(monkeypatch):

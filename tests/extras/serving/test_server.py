@@ -190,6 +190,9 @@ def test_closing_does_not_wait_for_a_hung_policy():
         assert refusals == ["the policy does not answer"]
         with pytest.raises(PolicyError, match="the server is closing"):
             late.infer(observation())
+        policy.gate.set()
+        assert server.close(60)
+        assert health(server) == (503, "the policy's thread has ended\n")
 
 
 ODD = (
