@@ -40,7 +40,7 @@ class Server:
         self._lock = threading.Lock()  # a question that nobody waits for any more may be open
         self.ended: str | None = None
         self._size = client.metadata.get("image_size") or 0
-        continues = client.metadata.get("execution", "naive") != "naive"
+        continues = (client.metadata.get("execution") or "naive") != "naive"
         self._unknown = () if continues else _CONTINUATION
 
     @property

@@ -105,7 +105,8 @@ class Session:
         def work() -> None:
             self._say("moving slowly to the start pose")
             if not self._go(pose):
-                self._hold("the start pose is out of reach")
+                problem = fault(self._reading, self._limits)
+                self._hold(problem or "the start pose is out of reach")
 
         return self._guarded(work)
 
