@@ -104,9 +104,8 @@ class Session:
 
         def work() -> None:
             self._say("moving slowly to the start pose")
-            if not self._go(pose):
-                problem = fault(self._reading, self._limits)
-                self._hold(problem or "the start pose is out of reach")
+            if problem := self._go(pose):
+                self._hold(problem)
 
         return self._guarded(work)
 
@@ -286,21 +285,23 @@ class Session:
         if fault(self._read(), self._limits) or self.stopped:
             return
         self._say("moving slowly to the rest pose")
-        if not self._go(REST):
-            self._untold.append("holding: the rest pose is out of reach")
+        if problem := self._go(REST):
+            self._untold.append(f"holding: {problem}")
 
-    def _go(self, pose: np.ndarray) -> bool:
-        """Move slowly to a pose [7] and return True, or False where something prevents it."""
+    def _go(self, pose: np.ndarray) -> str | None:
+        """Move slowly to a pose [7]; return what prevents it in a sentence, if anything does."""
         self._governor.start(self._governor.pose)
         self._next = self._clock.now()
         end = self._next + _GO_TIME
         while np.abs(self._governor.pose - pose)[:6].max() > _REACHED and not self.stopped:
             reading = self._read()
-            if fault(reading, self._limits) or self._clock.now() > end:
-                return False
+            if problem := fault(reading, self._limits):
+                return problem
+            if self._clock.now() > end:
+                return "the pose is out of reach"
             self._send(self._governor.step(pose, slow=True), reading)
             self._wait()
-        return True
+        return None
 
     def _settle(self) -> None:
         """Brake, whatever fails meanwhile, then leave the arm holding its last target."""
