@@ -229,7 +229,7 @@ class ShardWriter:
         return self.metadata["attempted"]
 
     def append(self, episodes: Episodes) -> None:
-        """Append a shard, and add its attempts to `attempted`.
+        """Append a shard, and add its attempts to `attempted`; instructions may be added, too.
 
         Raises:
             ValueError: the arrays are inconsistent, or the metadata differs from earlier shards.
@@ -242,6 +242,9 @@ class ShardWriter:
         shared["widths"] = [episodes.state.shape[2], episodes.action.shape[2]]
         if not self.metadata["parts"]:
             self.metadata |= shared
+        before = len(self.metadata["instructions"])  # episodes have indices into them
+        if shared["instructions"][:before] == self.metadata["instructions"]:
+            self.metadata["instructions"] = shared["instructions"]
         _check_same(self.folder, {name: self.metadata.get(name) for name in shared}, shared)
         serializer = rlds_schema.serializer(rlds_schema.features(self.metadata))
         record = functools.partial(rlds_schema.record, serializer, jax.device_get(episodes))
@@ -308,7 +311,7 @@ def _check_same(folder: Path, old: Mapping[str, Any], new: Mapping[str, Any]) ->
     for name in sorted(old.keys() | new.keys()):
         if old.get(name) != new.get(name):
             was, now = old.get(name), new.get(name)
-            raise ValueError(f"{folder} has {name} {was!r}, not {now!r}: delete it to start over")
+            raise ValueError(f"{folder} has {name} {was!r}, not {now!r}: choose another folder")
 
 
 def _write_records(file: Path, records: Iterable[bytes]) -> None:

@@ -11,13 +11,19 @@ from PIL import Image
 _COLORS = 256  # in a GIF's largest palette
 
 
-def write_video(path: Path, frames: np.ndarray, fps: float) -> None:
+def write_video(path: Path, frames: np.ndarray, fps: float, *, times: int = 1) -> None:
     """Write `[T, H, W, 3]` uint8 frames as H.264 in MP4 (yuv420p, which browsers play).
+
+    Args:
+        path: file to write.
+        frames: the pictures.
+        fps: pictures per second.
+        times: factor by which pictures are enlarged, by repeating their pixels.
 
     Raises:
         ValueError: H or W is odd, which yuv420p does not allow.
     """
-    height, width = frames.shape[1:3]
+    height, width = (times * side for side in frames.shape[1:3])
     if height % 2 or width % 2:
         raise ValueError(f"a video's height and width must be even, got {height} x {width}")
     options = {"movflags": "+faststart"}  # browsers can play it while it loads
@@ -27,7 +33,8 @@ def write_video(path: Path, frames: np.ndarray, fps: float) -> None:
         stream.pix_fmt = "yuv420p"
         stream.options = {"crf": "23"}  # x264's default quality
         for frame in frames:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+            large = frame.repeat(times, axis=0).repeat(times, axis=1)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(large, format="rgb24")))
         container.mux(stream.encode())
 
 

@@ -73,15 +73,15 @@ def describe(error: Exception, remedy: str = "") -> str | None:
     """Describe an error on one line; return None for a bug."""
     if isinstance(error, MemoryError) or _is_out_of_memory(error):
         text = "out of memory"
-        return f"{text} ({_one_line(error)[:200]}){remedy}" if str(error) else f"{text}{remedy}"
+        return f"{text} ({one_line(error)[:200]}){remedy}" if str(error) else f"{text}{remedy}"
     if isinstance(error, ValueError):
-        return _one_line(error)
+        return one_line(error)
     if isinstance(error, ModuleNotFoundError):
         return missing_group(error)
     if not isinstance(error, OSError):
         return None
     if error.strerror is None:  # raised with only a message
-        return _one_line(error)
+        return one_line(error)
     prefix = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
     return f"{prefix}{error.strerror}{remedy if error.errno in DISK_FULL else ''}"
 
@@ -111,7 +111,7 @@ def _is_out_of_memory(error: Exception) -> bool:
     return type(error).__name__ == "JaxRuntimeError" and "RESOURCE_EXHAUSTED" in str(error)
 
 
-def _one_line(error: Exception) -> str:
+def one_line(error: BaseException) -> str:
     """Return the message on one line, cutting out the middle if it is too long."""
     text, half = " ".join(str(error).split()), MAX_LENGTH // 2
     return text if len(text) <= MAX_LENGTH else f"{text[:half]} ... {text[-half:]}"

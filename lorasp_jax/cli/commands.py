@@ -36,6 +36,8 @@ COMMANDS = {
         "compare forms in which a run can be deployed, or save one",
     ),
     "serve": ("lorasp_jax.extras.serving.__main__", "serve a policy to robots over websockets"),
+    "piper": ("lorasp_jax.extras.piper.__main__", "run a policy on a PiPER, or record episodes"),
+    "fake-piper": ("lorasp_jax.extras.piper.fake.__main__", "the same on a simulated PiPER"),
     "export": ("lorasp_jax.extras.serving.export", "export a policy, to run without this package"),
 }
 """Module and help text of each command. A module has `main(arguments, program)`, which returns the

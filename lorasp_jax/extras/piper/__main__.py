@@ -2,32 +2,36 @@
 
 import argparse
 import contextlib
-import signal
 import sys
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 from rich.console import Console
 
 from lorasp_jax.base.arguments import pair
 from lorasp_jax.base.errors import run_command
 from lorasp_jax.extras.piper import options as shared
-from lorasp_jax.extras.piper.arm import PiperArm
+from lorasp_jax.extras.piper import remote
+from lorasp_jax.extras.piper.arm import NoArm, PiperArm
 from lorasp_jax.extras.piper.asking import InThread
-from lorasp_jax.extras.piper.cameras import open_cameras
+from lorasp_jax.extras.piper.cameras import Look, open_cameras
 from lorasp_jax.extras.piper.clock import RealClock
+from lorasp_jax.extras.piper.keys import Keys
+from lorasp_jax.extras.piper.log import Log
 from lorasp_jax.extras.piper.recording import Recording
 from lorasp_jax.extras.piper.safety import Unsafe
-from lorasp_jax.extras.piper.session import Session, Settings
+from lorasp_jax.extras.piper.session import Session
 from lorasp_jax.extras.piper.teaching import Lesson
 
 HELD = 3
 """Exit code after a problem in which the arm held."""
+KEYS = "sfaq"
+"""Keys of a person's verdict on an episode, which also end it."""
+QUESTION = "success (s), failure (f), again (a) or quit (q)?"
 
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.piper") -> int:
-    """Run one episode; return the exit code: `HELD`, or one of `lorasp_jax.base.errors`."""
+    """Run episodes; return the exit code: `HELD`, or one of `lorasp_jax.base.errors`."""
     options = parser(program).parse_args(arguments)
     return run_command(lambda: _run(options), Console(stderr=True))
 
@@ -43,114 +47,182 @@ def parser(program: str) -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--task", default="", help="one of the simulation's tasks, for its request and time limit")
     add("--seconds", type=float, default=0.0, help="length; default: the task's limit, or 60")
-    add("--dry-run", action="store_true", help="print commands instead of sending them")
-    add("--record", type=Path, metavar="FOLDER", help="add the episode to an RLDS dataset, which "
-        "train.py takes as --data.source")  # fmt: skip
+    add("--dry-run", action="store_true", help="print commands instead of sending them; needs no "
+        "arm, unless --can names one to read")  # fmt: skip
+    add("--reset-time", type=float, metavar="S", help="time between two episodes to put the scene "
+        "back [s]; default: until you press a key")  # fmt: skip
     add("--teach", choices=("hand", "leader"), help="record what a person shows the arm, guided by "
         "hand or through a leader arm, in place of a policy")  # fmt: skip
     add("--image-size", type=int, default=224, help="of recorded pictures [px] (default: 224)")
     add = parser.add_argument_group("robot").add_argument
-    add("--can", default="can0", help="CAN interface (default: %(default)s)")
+    add("--can", default="", help="CAN interface (default: can0)")
     add("--bus", choices=("socketcan", "slcan"), default="socketcan", help="its kind "
         "(default: %(default)s)")  # fmt: skip
     add("--camera", action="append", type=pair, default=[], metavar="NAME=SOURCE", help="such as "
         "side=/dev/video0; once for each of the policy's cameras")  # fmt: skip
+    add("--camera-size", default="640x480", help="that devices are asked for (default: "
+        "%(default)s)")  # fmt: skip
+    add("--camera-rate", default="30", help="the same, pictures per second (default: %(default)s)")
+    add("--camera-format", default="", help="the same, ffmpeg's input_format such as mjpeg or "
+        "yuyv422; default: the driver's choice")  # fmt: skip
     shared.add_shared(parser)
     return parser
 
 
+class Rig(NamedTuple):
+    """What episodes need; server and log are None if a person teaches."""
+
+    arm: Any
+    look: Look
+    server: remote.Server | None
+    recorder: Recording | None
+    log: Log | None
+    keys: Keys
+
+
 def _run(options: argparse.Namespace) -> int:
     task = shared.task(options.task) if options.task else None
-    prompt = options.prompt or (task.instructions[0] if task else "")
-    if not prompt:
+    prompts = options.prompt or ([task.instructions[0]] if task else [])
+    if not all(prompts or [""]):
         raise ValueError("pass --task or --prompt: the policy must be told what to do")
     if options.teach and not options.record:
         raise ValueError("--teach needs --record FOLDER")
     if options.record and options.dry_run:
         raise ValueError("--record has nothing to record in a --dry-run")
-    settings = shared.settings(options, prompt, dry_run=options.dry_run)
+    shared.settings(options, prompts[0])
     seconds = options.seconds or (task.time_limit if task else 60.0)
     with contextlib.ExitStack() as stack:
-        server = None if options.teach else stack.enter_context(shared.policy(options))
-        look = open_cameras(_sources(options, server), stack)
+        server = None if options.teach else stack.enter_context(remote.policy(options))
+        device = {"video_size": options.camera_size, "framerate": options.camera_rate}
+        if options.camera_format:
+            device["input_format"] = options.camera_format
+        look = open_cameras(_sources(options, server), stack, device)
         if server:
-            server.warn([prompt])
-        recorder = stack.enter_context(
-            shared.recording(options, task, prompt=prompt, image_size=options.image_size)
-        )
-        arm = PiperArm(options.can, bus=options.bus, **shared.motion(options))
+            server.warn(prompts)
+        size = {"image_size": options.image_size}
+        recorder = stack.enter_context(shared.recording(options, task, prompt=prompts[0], **size))
+        arm: Any = _open(options)
         stack.callback(arm.close)
         arm.connect()
         if not (options.dry_run or options.teach == "leader"):
             arm.enable(shared.limits(options))
-        if server:
-            log = stack.enter_context(contextlib.closing(shared.open_log(options)))
-            problem = _execute(options, settings, (arm, look, server, recorder, log), seconds)
-        else:
-            problem = _teach(options, (arm, look, recorder), seconds)
-        if recorder and not problem:
-            _keep(recorder)
-        return HELD if problem else 0
+        log = stack.enter_context(contextlib.closing(shared.open_log(options))) if server else None
+        keys = stack.enter_context(Keys())
+        return _episodes(options, Rig(arm, look, server, recorder, log, keys), prompts, seconds)
 
 
-def _execute(
-    options: argparse.Namespace, settings: Settings, parts: tuple, seconds: float
-) -> str | None:
-    """Run the policy; return the problem in a sentence, if there is one."""
-    arm, look, server, recorder, log = parts
-    server.reset()
-    more = {"recorder": recorder, "log": log}
-    limits = shared.limits(options)
-    session = Session(arm, look, InThread(server), limits, settings, RealClock(), **more)
-    shared.stop_on_signals(session)
-    return session.run(seconds)
+def _open(options: argparse.Namespace) -> PiperArm | NoArm:
+    if options.dry_run and not options.can:
+        print("a dry run without an arm: it stands in the start pose")
+        return NoArm()
+    return PiperArm(options.can or "can0", bus=options.bus, **shared.motion(options))
 
 
-def _teach(options: argparse.Namespace, parts: tuple, seconds: float) -> str | None:
-    """Record a person; return the problem in a sentence, if there is one."""
-    arm, look, recorder = parts
-    way = {"way": options.teach, "control_dt": options.control_dt}
-    lesson = Lesson(arm, look, recorder, shared.limits(options), RealClock(), **way)
-    shared.stop_on_signals(lesson)
-    print("show the task, then press Ctrl-C")
+def _episodes(options: argparse.Namespace, rig: Rig, prompts: Sequence[str], seconds: float) -> int:
+    """Run until enough episodes were judged, or recorded; return the exit code."""
+    start, judged, kept = rig.arm.read().pose, 0, 0
+    judging = bool(rig.recorder) or options.episodes > 1
+    work: Session | Lesson | None = None
+    while True:
+        prompt = prompts[(kept if rig.recorder else judged) % len(prompts)]
+        before, work = work, _prepare(options, rig, prompt)
+        shared.stop_on_signals(work)
+        if before and before.stopped:  # meanwhile
+            break
+        verdict = ""
+        while judging and rig.keys.pressed():
+            pass  # what was typed before is no verdict
+
+        def done() -> bool:
+            nonlocal verdict
+            verdict = verdict or (key if judging and (key := rig.keys.pressed()) in KEYS else "")
+            return bool(verdict)
+
+        if _execute(work, seconds, done):
+            return HELD
+        if judging:
+            verdict = _keep(rig, verdict)
+            judged, kept = judged + (verdict in "sf"), kept + (verdict == "s")
+        enough = (kept if rig.recorder else judged) >= options.episodes
+        if not judging or enough or work.stopped or verdict == "q" or rig.keys.ended:
+            break
+        if isinstance(work, Session) and work.home(start):
+            return HELD
+        if work.stopped or not _reset(options, rig):
+            break
+    if options.episodes > 1:
+        print(f"{kept} of {judged} succeeded")
+    return 0
+
+
+def _reset(options: argparse.Namespace, rig: Rig) -> bool:
+    """Give a person time for the scene; return whether there is to be another episode."""
     try:
-        lesson.run(seconds)
+        sentence = "put the scene back, then press Enter, or q to quit"
+        return rig.keys.ask(sentence, "\nq", options.reset_time) != "q"
+    except EOFError:
+        return False
+
+
+def _prepare(options: argparse.Namespace, rig: Rig, prompt: str) -> Session | Lesson:
+    """Return the next episode: a policy's, or a lesson."""
+    limits, clock = shared.limits(options), RealClock()
+    print(f"next: {prompt}", flush=True)
+    if rig.recorder:
+        rig.recorder.say(prompt)
+    if rig.server:
+        rig.server.reset()
+        settings = shared.settings(options, prompt, dry_run=options.dry_run)
+        more = {"recorder": rig.recorder, "log": rig.log}
+        return Session(rig.arm, rig.look, InThread(rig.server), limits, settings, clock, **more)
+    assert rig.recorder
+    way = {"way": options.teach, "control_dt": shared.period(options)}
+    print(f"show the task, then press a key: {QUESTION}")
+    return Lesson(rig.arm, rig.look, rig.recorder, limits, clock, **way)
+
+
+def _execute(work: Session | Lesson, seconds: float, done: Callable[[], bool]) -> str | None:
+    """Run an episode; return the problem in a sentence, if there is one."""
+    if isinstance(work, Session):
+        return work.run(seconds, done)
+    try:
+        work.run(seconds, done)
     except Unsafe as error:
         print(f"recording ended: {error}")
         return str(error)
     return None
 
 
-def _keep(recorder: Recording) -> None:
-    """Let a person judge the episode; it is kept if nobody can.
+def _keep(rig: Rig, verdict: str) -> str:
+    """Return a person's verdict on the episode, after recording it if it succeeded.
+
+    An episode that nobody can judge is kept, and is the last.
 
     Raises:
         KeyboardInterrupt: Ctrl-C in place of an answer; the episode is not kept.
     """
-    before = [signal.signal(number, _end_prompt) for number in shared.SIGNALS]
-    answer, note = "y", ""
+    note, recorder = "", rig.recorder
     try:
-        answer = input(f"keep this episode of {recorder.steps} steps? [y/N] ").strip().lower()
-    except (EOFError, OSError) as error:
-        note = f"nobody answers ({error}), so the episode is kept: "
-    finally:  # what is being written must not be interrupted
-        for number, handler in zip(shared.SIGNALS, before, strict=True):
-            signal.signal(number, handler)
-    if answer == "y":
+        verdict = verdict or rig.keys.ask(QUESTION, KEYS)
+    except EOFError as error:
+        verdict, note = "s", f"nobody answers ({error}), so the episode is kept: "
+        rig.keys.ended = True
+    except KeyboardInterrupt as stop:
+        raise KeyboardInterrupt("the episode is not kept") from stop
+    if recorder and verdict == "f":
+        recorder.fail()
+    elif recorder and verdict in "aq":
+        recorder.discard()
+    elif recorder:
         recorder.keep()
         print(f"{note}{recorder.num_episodes} episodes recorded")
+    return verdict
 
 
-def _end_prompt(number: int, _: Any) -> None:
-    if number == signal.SIGINT:
-        raise KeyboardInterrupt("the episode is not kept")
-    raise EOFError(signal.Signals(number).name)  # the terminal may be gone
-
-
-def _sources(options: argparse.Namespace, server: shared.Server | None) -> dict[str, str]:
+def _sources(options: argparse.Namespace, server: remote.Server | None) -> dict[str, str]:
     """Return the cameras' sources after checking that there are those that the policy needs."""
     sources = dict(options.camera)
-    needed = server.metadata.get("cameras", []) if server else list(sources)[:1] or ["side"]
+    needed = (server.metadata.get("cameras") or []) if server else list(sources)[:1] or ["side"]
     if missing := [name for name in needed if name not in sources]:
         examples = " ".join(f"--camera {name}=SOURCE" for name in missing)
         raise ValueError(

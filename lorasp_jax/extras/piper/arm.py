@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.robots.piper import SDK_OFFSET
+from envs.robots.piper import ROBOT, SDK_OFFSET
 from lorasp_jax.extras.piper.clock import Clock, RealClock
 from lorasp_jax.extras.piper.safety import (
     CAN_CONTROL,
@@ -213,6 +213,25 @@ class PiperArm:
                     f"the firmware's limits of joint {number} are corrupted (a range of {span:g} "
                     f"degrees, {speed / 1000:g} rad/s): set them with piper_sdk first"
                 )
+
+
+class NoArm:
+    """What a dry run needs of an arm, without a bus: it stands in its start pose."""
+
+    pose = np.append(ROBOT.home, ROBOT.stroke)
+
+    def connect(self) -> None:
+        """Do nothing."""
+
+    def read(self) -> Reading:
+        """Return the start pose."""
+        return Reading(self.pose, 0.0, 0.0, CAN_CONTROL, 0, True)
+
+    def command(self, pose: np.ndarray) -> None:
+        """Do nothing."""
+
+    def close(self) -> None:
+        """Do nothing."""
 
 
 def _angles(joints: Any) -> np.ndarray:

@@ -46,8 +46,9 @@ class InThread:
         if not self._outcome:
             return None
         actions, error = self._outcome[0]
-        if error:
-            raise PolicyError(str(error) or type(error).__name__) from error
+        if error:  # some servers answer with a traceback, whose last line says what is wrong
+            sentence = str(error).strip().rpartition("\n")[2]
+            raise PolicyError(sentence or type(error).__name__) from error
         return actions
 
 

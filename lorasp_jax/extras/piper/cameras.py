@@ -4,6 +4,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from types import MappingProxyType
 from typing import Any
 
 import av
@@ -14,6 +15,7 @@ from lorasp_jax.extras.piper.safety import Unsafe
 
 MAX_AGE = 0.3
 """Age beyond which a picture is stale [s]: nine frames at 30 per second; our choice."""
+_DEFAULT: Mapping[str, str] = MappingProxyType({})  # as the device likes
 
 
 class NoPicture(Unsafe):
@@ -27,22 +29,24 @@ Look = Callable[[], dict[str, np.ndarray]]
 class Camera:
     """One source of pictures, decoded in a thread that keeps only the newest."""
 
-    def __init__(self, name: str, source: str) -> None:
+    def __init__(self, name: str, source: str, options: Mapping[str, str] = _DEFAULT) -> None:
         """Open a source and wait for its first picture.
 
         Args:
             name: of the camera, such as wrist.
             source: a device such as /dev/video0, or a file or address that ffmpeg can read.
+            options: what ffmpeg asks a device for: video_size, framerate, input_format.
 
         Raises:
             ConnectionError: the source cannot be opened, or shows nothing.
         """
         self._name, self._newest, self._stop = name, (-np.inf, None), False
         device = source.startswith("/dev/")
-        options = {"video_size": "640x480", "framerate": "30"} if device else {}
         try:
             self._container: Any = av.open(
-                source, format="v4l2" if device else None, options=options
+                source,
+                format="v4l2" if device else None,
+                options=dict(options) if device else {},
             )
         except (FFmpegError, OSError, ValueError) as error:
             raise ConnectionError(f"cannot open camera {name} at {source}: {error}") from error
@@ -80,14 +84,16 @@ class Camera:
         self._container.close()
 
 
-def open_cameras(sources: Mapping[str, str], stack: ExitStack) -> Look:
-    """Open camera name -> source until the stack is closed.
+def open_cameras(
+    sources: Mapping[str, str], stack: ExitStack, options: Mapping[str, str] = _DEFAULT
+) -> Look:
+    """Open camera name -> source until the stack is closed; `options` as in `Camera`.
 
     Raises:
         ConnectionError: a source cannot be opened.
     """
     cameras: dict[str, Camera] = {}
     for name, source in sources.items():
-        cameras[name] = Camera(name, source)
+        cameras[name] = Camera(name, source, options)
         stack.callback(cameras[name].close)
     return lambda: {name: camera.read() for name, camera in cameras.items()}

@@ -35,8 +35,8 @@ class Recording:
         """Open or create a dataset.
 
         Args:
-            folder: of the dataset; an existing one must have the same settings.
-            task: its name.
+            folder: of the dataset; an existing one goes on, and must have the same settings.
+            task: its name; "": that of the existing dataset, or "task".
             instructions: phrasings of the task.
             prompt: the phrasing of the present episode; added to the others if it is new.
             control_dt: duration of an action [s].
@@ -46,11 +46,17 @@ class Recording:
         Raises:
             ValueError: the folder holds something else, or a dataset with other settings.
         """
-        known = tuple(instructions) if prompt in instructions else (*instructions, prompt)
-        self._shared = {"task": task, "robot": "piper", "instructions": known}
-        self._shared |= {"control_dt": control_dt, "physics_dt": physics_dt}
-        self._image_size, self._prompt = image_size, prompt
         self._writer = ShardWriter(folder, {"image_size": image_size})
+        earlier = self._writer.metadata
+        self._shared = {"task": task or earlier.get("task", "task"), "robot": "piper"}
+        self._shared |= {"control_dt": control_dt, "physics_dt": physics_dt}
+        for name, value in self._shared.items():  # before somebody demonstrates in vain
+            if (was := earlier.get(name, value)) != value:
+                raise ValueError(f"{folder} has {name} {was}, not {value}: choose another folder")
+        known = [*earlier.get("instructions", []), *instructions]
+        self._shared["instructions"] = tuple(dict.fromkeys(known))
+        self._image_size, self._failures = image_size, 0
+        self.say(prompt)
         self.discard()
 
     @property
@@ -72,8 +78,15 @@ class Recording:
         self._actions.append(action)
 
     def say(self, prompt: str) -> None:
-        """Set the phrasing of the present episode, one of the dataset's."""
+        """Set the phrasing of the present episode, which is added to the dataset's if it is new."""
         self._prompt = prompt
+        if prompt not in self._shared["instructions"]:
+            self._shared["instructions"] += (prompt,)
+
+    def fail(self) -> None:
+        """Forget the present episode, and count it as an attempt with the next one that is kept."""
+        self._failures += 1
+        self.discard()
 
     def discard(self) -> None:
         """Forget the present episode."""
@@ -97,9 +110,10 @@ class Recording:
             action=np.stack(self._actions)[None].astype(np.float32),
             length=np.array([self.steps], np.int32),
             instruction=np.array([instructions.index(self._prompt)], np.int32),
-            attempted=1,
+            attempted=1 + self._failures,
             **self._shared,
         )
         self._writer.append(episode)
         self._writer.complete()
+        self._failures = 0
         self.discard()

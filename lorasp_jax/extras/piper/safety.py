@@ -28,6 +28,7 @@ CAN_CONTROL = 1
 _NEAR = np.deg2rad(5.0)  # rad; a target this close to the measured pose needs no slow approach
 _APPROACH = 0.2  # share of the speed limit for slow approaches
 _IMPLAUSIBLE = np.deg2rad(10.0)  # rad beyond the joint limits at which feedback is not believed
+_ABSURD = np.append(np.full(6, _IMPLAUSIBLE), 0.02)  # beyond the limits [rad, m]; our choice
 _CTRL_MODES = {0: "standby", 2: "teaching", 3: "ethernet", 4: "wifi", 5: "remote control"}
 _CTRL_MODES |= {6: "leader of another arm", 7: "offline trajectory"}
 _ARM_STATUS = {
@@ -142,6 +143,20 @@ def check_chunk(actions: Any) -> np.ndarray:
     return chunk.astype(float)
 
 
+def clamped(chunk: np.ndarray, limits: Limits) -> str | None:
+    """Say in a sentence that a chunk [C, 7] is clamped as a whole, by far; None: it is not."""
+    beyond = np.maximum(limits.lower - chunk, chunk - limits.upper).min(axis=0)
+    number = int((beyond - _ABSURD).argmax())
+    if beyond[number] <= _ABSURD[number]:
+        return None
+    name = f"joint {number + 1}" if number < 6 else "the gripper"
+    unit = "radians" if number < 6 else "meters"
+    return (
+        f"warning: all actions of {name} are far beyond its limits, such as "
+        f"{chunk[0, number]:.4g}, and clamped: are they in {unit}?"
+    )
+
+
 def fault(reading: Reading, limits: Limits) -> str | None:
     """Say in a sentence why an arm must not be commanded now; None: it may be."""
     joints = reading.pose[:6]
@@ -203,8 +218,8 @@ class Governor:
         self.approaching, self.blocked = True, False
         self._target: np.ndarray | None = None
 
-    def step(self, target: np.ndarray) -> np.ndarray:
-        """Return the command [7] of this tick on the way to a target [7].
+    def step(self, target: np.ndarray, *, slow: bool = False) -> np.ndarray:
+        """Return the command [7] of this tick on the way to a target [7], as an approach if slow.
 
         Raises:
             Unsafe: the target has the wrong shape or is not finite.
@@ -212,7 +227,7 @@ class Governor:
         target = np.clip(check_chunk(target[None])[0], self.limits.lower, self.limits.upper)
         if np.abs(target - self.pose)[:6].max() <= _NEAR:
             self.approaching = False
-        speed = self.limits.speed * (_APPROACH if self.approaching else 1.0)
+        speed = self.limits.speed * (_APPROACH if self.approaching or slow else 1.0)
         before = target if self._target is None or self.approaching else self._target
         self._target = target
         forward = np.clip((target - before) / self._dt, -speed, speed)

@@ -1,19 +1,20 @@
 """The control loop: read the arm, ask the policy, command the arm, 200 times a second.
 
-Whatever goes wrong, the arm brakes and holds. If feedback or pictures come back soon, it goes on
-from where it holds. Otherwise, and after a refused chunk or a policy's error, it moves slowly to
-its rest pose and stays there, powered; it does not move again while it reports a fault itself.
-Signals and all other errors stop it where it is.
+Whatever goes wrong, the arm brakes and holds. Only then one sentence says why, since a terminal may
+block. If feedback or pictures come back soon, it goes on from where it holds. Otherwise, and after
+a refused chunk or a policy's error, it moves slowly to its rest pose and stays there, powered; it
+does not move again while it reports a fault itself. Signals and all other errors stop it where it
+is.
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from lorasp_jax.extras.piper.arm import PiperArm
+from lorasp_jax.base.errors import one_line
+from lorasp_jax.extras.piper.arm import NoArm, PiperArm
 from lorasp_jax.extras.piper.asking import InThread
 from lorasp_jax.extras.piper.cameras import Look, NoPicture
 from lorasp_jax.extras.piper.clock import Clock
@@ -28,8 +29,10 @@ from lorasp_jax.extras.piper.safety import (
     Reading,
     Unsafe,
     check_chunk,
+    clamped,
     fault,
 )
+from lorasp_jax.extras.piper.settings import Settings
 from lorasp_jax.extras.serving.client import PolicyError
 
 PERIOD = 0.005
@@ -38,43 +41,9 @@ REST = np.array([0.0, 0.06, -0.06, 0.0, 0.35, 0.0, 0.0])
 """Pose in which the arm lies folded [rad, m]: all joints near zero; our choice."""
 _REACHED = 0.01  # rad from the rest pose that counts as arrived
 _APPROACH_TIME = 20.0  # s that the way to the first action may take
-_REST_TIME = 60.0  # s that the way to the rest pose may take
+_GO_TIME = 60.0  # s that the way to the rest or start pose may take
 _INSTANT = 1e-6  # control steps that rounding may take from a clock's time
 _LATE = 0.05  # s of delay after which ticks are skipped instead of made up for
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How a policy's chunks are executed.
-
-    Attributes:
-        prompt: the request in words.
-        control_dt: duration of an action [s], as in the policy's training.
-        execute: actions of each chunk that are executed.
-        ahead: how many actions before the end of these the next chunk is asked for. At 0 the arm
-            waits for the answer. Otherwise the new chunk counts from when it was asked for, and
-            takes over when the action ends during which it arrives: its first actions are then in
-            the past. If it arrives after the end of the previous chunk, the arm has waited.
-        patience: longest time to wait for an answer [s].
-        hold: time to hold, after which the arm goes to rest [s].
-        dry_run: print commands instead of sending them.
-    """
-
-    prompt: str
-    control_dt: float = 0.1
-    execute: int = 5
-    ahead: int = 0
-    patience: float = 2.0
-    hold: float = 3.0
-    dry_run: bool = False
-
-    def __post_init__(self) -> None:
-        """Raise ValueError if a number is out of range."""
-        if not 0 <= self.ahead < self.execute:
-            raise ValueError(f"ahead must be 0 to {self.execute - 1}, got {self.ahead}")
-        for name in ("control_dt", "patience", "hold"):
-            if not 0 < (value := getattr(self, name)) < math.inf:
-                raise ValueError(f"{name} must be above 0 s and finite, got {value}")
 
 
 class Session:
@@ -88,7 +57,7 @@ class Session:
 
     def __init__(
         self,
-        arm: PiperArm,
+        arm: PiperArm | NoArm,
         look: Look,
         asker: InThread,
         limits: Limits,
@@ -107,6 +76,8 @@ class Session:
         self.problem: str | None = None
         self.chunks = 0
         self._final, self._since, self.stopped, self._next = False, 0.0, False, 0.0
+        self._untold: list[str] = []
+        self._warned = False
         self._forget()
 
     def stop(self) -> None:
@@ -126,17 +97,40 @@ class Session:
                 moved.
             BaseException: whatever else a camera, the log, `say` or `done` raised.
         """
-        self._governor.start(self._arm.read().pose)
-        try:
-            self._follow(seconds, done)
-        except BaseException as error:
-            self._settle()
-            self._hold(str(error) or type(error).__name__)
-            raise
+        return self._guarded(lambda: self._follow(seconds, done))
+
+    def home(self, pose: np.ndarray) -> str | None:
+        """Move slowly to a pose [7] after a run; result and errors are those of `run`."""
+
+        def work() -> None:
+            self._say("moving slowly to the start pose")
+            if problem := self._go(pose):
+                self._hold(problem)
+
+        return self._guarded(work)
+
+    def _guarded(self, work: Callable[[], None]) -> str | None:
+        """Work on an arm at rest; however that ends, brake, then say why, and only then raise."""
+        self._governor.start(self._read().pose)
+        self._failures: list[BaseException] = []
+        self._attempt(work)
         self._settle()
+        if self._failures:
+            first = self._failures[0]
+            self._attempt(self._hold, one_line(first) or type(first).__name__)
+        self._attempt(self._tell)
+        if self._failures:
+            raise self._failures[0]
         if self.stopped:
             self._say("stopped")
         return self.problem
+
+    def _attempt(self, part: Callable[..., Any], *arguments: Any) -> None:
+        """Call a function; what it raises, if anything, waits until the arm has braked."""
+        try:
+            part(*arguments)
+        except BaseException as error:
+            self._failures.append(error)
 
     def _follow(self, seconds: float, done: Callable[[], bool]) -> None:
         self._next = start = self._clock.now()
@@ -155,10 +149,12 @@ class Session:
             elif not self._final:
                 self._drive(reading, now)
         except (Unsafe, PolicyError) as error:
-            self._hold(str(error))
+            self._hold(one_line(error))
             self._final |= not isinstance(error, NoPicture)
         if self.problem:
             self._send(self._governor.brake(), reading)
+        if not self._governor.velocity.any():
+            self._tell()
         self._wait()
 
     def _drive(self, reading: Reading, now: float) -> None:
@@ -217,6 +213,9 @@ class Session:
             return
         settings, chunk = self._settings, check_chunk(actions)
         self._check_length(chunk)
+        if not self._warned and (warning := clamped(chunk, self._limits)):
+            self._warned = True
+            self._untold.append(warning)
         own = chunk[: settings.execute + settings.ahead]
         if self._path is None:
             self._path = Path(self._governor.pose.copy(), own, settings.control_dt)
@@ -273,37 +272,51 @@ class Session:
         if self.problem:
             return
         self.problem, self._since = problem, self._clock.now()
+        self._untold.append(f"holding: {problem}")
         self._write(self._since, problem=problem)
-        self._say(f"holding: {problem}")
+
+    def _tell(self) -> None:
+        """Say what is to be said, now that the arm stands still."""
+        while self._untold:
+            self._say(self._untold.pop(0))
 
     def _rest(self) -> None:
         """Move slowly to the rest pose, unless the arm itself reports a fault."""
-        reading = self._read()
-        if fault(reading, self._limits) or self.stopped:
+        if fault(self._read(), self._limits) or self.stopped:
             return
         self._say("moving slowly to the rest pose")
+        if problem := self._go(REST):
+            self._untold.append(f"holding: {problem}")
+
+    def _go(self, pose: np.ndarray) -> str | None:
+        """Move slowly to a pose [7]; return what prevents it in a sentence, if anything does."""
         self._governor.start(self._governor.pose)
-        end = self._clock.now() + _REST_TIME
-        while np.abs(self._governor.pose - REST)[:6].max() > _REACHED and not self.stopped:
+        self._next = self._clock.now()
+        end = self._next + _GO_TIME
+        while np.abs(self._governor.pose - pose)[:6].max() > _REACHED and not self.stopped:
             reading = self._read()
-            if fault(reading, self._limits) or self._clock.now() > end:
-                self._say("holding: the rest pose is out of reach")
-                return
-            self._send(self._governor.step(REST), reading)
+            if problem := fault(reading, self._limits):
+                return problem
+            if self._clock.now() > end:
+                return "the pose is out of reach"
+            self._send(self._governor.step(pose, slow=True), reading)
             self._wait()
+        return None
 
     def _settle(self) -> None:
-        """Brake, then leave the arm holding its last target."""
-        self._send(self._governor.brake(), self._read())
-        while self._governor.velocity.any():
-            self._wait()
-            self._send(self._governor.brake(), self._read())
+        """Brake, whatever fails meanwhile, then leave the arm holding its last target."""
+        while True:
+            self._attempt(self._read)
+            self._attempt(self._send, self._governor.brake(), self._reading)
+            if not self._governor.velocity.any():
+                return
+            self._attempt(self._wait)
 
     def _read(self) -> Reading:
-        reading = self._arm.read()
+        self._reading = self._arm.read()
         if self._settings.dry_run:  # the arm need not be ready
-            return reading._replace(ctrl_mode=CAN_CONTROL, enabled=True)
-        return reading
+            self._reading = self._reading._replace(ctrl_mode=CAN_CONTROL, enabled=True)
+        return self._reading
 
     def _send(self, command: np.ndarray, reading: Reading) -> None:
         now = self._clock.now()

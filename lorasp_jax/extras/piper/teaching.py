@@ -22,7 +22,11 @@ _STILL = 0.002  # rad or m; a pose this close to the last has not moved
 
 
 class Lesson:
-    """One demonstration."""
+    """One demonstration.
+
+    Attributes:
+        stopped: whether `stop` was called.
+    """
 
     def __init__(
         self,
@@ -38,11 +42,11 @@ class Lesson:
         """Prepare a demonstration; for guiding by hand, the arm must be enabled."""
         self._arm, self._look, self._recorder = arm, look, recorder
         self._limits, self._clock, self._way, self._dt = limits, clock, way, control_dt
-        self._stopped = False
+        self.stopped = False
 
     def stop(self) -> None:
         """End the demonstration; may be called from a signal handler."""
-        self._stopped = True
+        self.stopped = True
 
     def run(self, seconds: float, done: Callable[[], bool] = lambda: False) -> None:
         """Record until the time is over, `stop` is called or `done` says so.
@@ -65,7 +69,7 @@ class Lesson:
     def _record(self, seconds: float, done: Callable[[], bool]) -> None:
         start = due = self._clock.now()
         before = shown = None
-        while self._clock.now() - start < seconds and not self._stopped and not done():
+        while self._clock.now() - start < seconds and not self.stopped and not done():
             reading = self._read()
             target = self._target(reading)
             if before is not None:

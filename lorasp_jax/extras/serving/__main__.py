@@ -2,7 +2,10 @@
 
 import argparse
 import asyncio
+import contextlib
 import functools
+import logging
+import os
 import secrets
 import signal
 import socket
@@ -17,6 +20,9 @@ from rich.console import Console
 from lorasp_jax.base.arguments import indices, pair, positive
 from lorasp_jax.base.errors import run_command
 
+GRACE = 5.0
+"""Time that the policy has for its last answer [s]; a container is killed 10 s after SIGTERM."""
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 UNSAID = ("openpi_config", "size", "chunk", "relative", "prompt_state", "joints", "action_length")
 """Options that say what the files of a published checkpoint do not; see `checkpoint.Unsaid`."""
 CHECKPOINT_OPTIONS = ("statistics", "dataset", "dtype", "camera", "adapter", *UNSAID)
@@ -24,7 +30,10 @@ CHECKPOINT_OPTIONS = ("statistics", "dataset", "dtype", "camera", "adapter", *UN
 
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.serving") -> int:
-    """Serve until SIGINT or SIGTERM; return the exit code, one of `lorasp_jax.base.errors`."""
+    """Serve until SIGINT or SIGTERM; return the exit code, one of `lorasp_jax.base.errors`.
+
+    Exit with 1 if the policy hangs then.
+    """
     options = parser(program).parse_args(arguments)
     console = Console(stderr=True)
     return run_command(lambda: _serve(options, Console()), console)
@@ -35,7 +44,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=program,
         description="Serve a policy over websockets, in openpi's protocol.",
-        epilog="Pages on the same port: /healthz and /status. See docs/serving.md.",
+        epilog="Pages on the same port: /healthz, /status and /metrics. See docs/serving.md.",
     )
     add = parser.add_argument
     add(
@@ -50,7 +59,10 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--host", default="127.0.0.1", help="address to listen on; others than the default need a "
         "token (default: %(default)s)")  # fmt: skip
     add("--port", type=int, default=8000, help="default: %(default)s")
-    add("--token-file", type=Path, metavar="FILE", help="file with the token of the clients")
+    add("--token-file", type=Path, metavar="FILE", help="file with the token of the clients; "
+        "written with a fresh one if there is none, and made readable only by you")  # fmt: skip
+    add("--max-clients", type=positive, default=64, help="maximum number of connections (default: "
+        "%(default)s)")  # fmt: skip
     add("--prompt", default="", help="instruction of requests that have none")
     add("--max-batch", type=int, help="largest batch (default: 8)")
     add("--num-steps", type=int, help="flow steps (default: 10)")
@@ -93,25 +105,38 @@ def _add_checkpoint_options(group: Any) -> None:
 def _serve(options: argparse.Namespace, console: Console) -> None:
     from lorasp_jax.extras.serving import server
 
-    token = _read_token(options.token_file)
+    logging.basicConfig(format="%(asctime)s %(message)s")
+    logging.getLogger("lorasp_jax.extras.serving").setLevel(logging.INFO)
+    token = _read_token(options.token_file, console)
     with server.bind(options.host, options.port, token=token) as port:  # before what takes long
         policy = _load(options, console)
-        policy_server = server.PolicyServer(policy, token=token)
-        asyncio.run(_run(policy_server, port, console))
+        policy_server = server.PolicyServer(policy, token=token, max_clients=options.max_clients)
+        answers = asyncio.run(_run(policy_server, port, console))
+    if not answers:
+        from lorasp_jax.training.distributed import processes
+
+        _say(console, f"the policy has not answered within {GRACE:g} s: ended without it")
+        processes.exit_all(1)  # a thread that hangs cannot be stopped
 
 
-async def _run(policy_server: Any, port: socket.socket, console: Console) -> None:
-    """Serve until SIGINT or SIGTERM."""
-    stop = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+async def _run(policy_server: Any, port: socket.socket, console: Console) -> bool:
+    """Serve until SIGINT or SIGTERM; return whether the policy then still answered.
+
+    A second signal ends the process by the system, whatever hangs.
+    """
+    stop, loop = asyncio.Event(), asyncio.get_running_loop()
+    for number in _SIGNALS:
+        loop.add_signal_handler(number, stop.set)
     async with policy_server.listen(port):
         host, number = port.getsockname()[:2]
         host = f"[{host}]" if ":" in host else host
         _say(console, f"listening on ws://{host}:{number}")
         await stop.wait()
+        for number in _SIGNALS:
+            loop.remove_signal_handler(number)
+            signal.signal(number, signal.SIG_DFL)
         _say(console, "closing connections")
-    policy_server.close()
+        return await asyncio.to_thread(policy_server.close, GRACE)
 
 
 def _load(options: argparse.Namespace, console: Console) -> Any:
@@ -194,14 +219,27 @@ def _named(text: str) -> tuple[str, str]:
     return pair(text)
 
 
-def _read_token(path: Path | None) -> str:
-    """Read the token, without a final newline."""
+def _read_token(path: Path | None, console: Console) -> str:
+    """Read the token, without a final newline, or write a fresh one; nobody else may read it."""
     if path is None:
         return ""
+    with contextlib.suppress(FileExistsError), open(path, "x", opener=_privately) as file:
+        file.write(secrets.token_urlsafe() + "\n")
+        _say(console, f"wrote a fresh token to {path}")
+    if path.stat().st_mode & 0o077:
+        try:
+            path.chmod(0o600)
+            _say(console, f"{path} was open to other users, and is so no more (mode 0600)")
+        except OSError as error:  # such as a container's secret, which belongs to root
+            _say(console, f"warning: other users can read {path}: {error.strerror}")
     token = path.read_text().strip()
     if not token or not token.isascii() or not token.isprintable():
         raise ValueError(f"{path} must contain a token of printable ASCII characters")
     return token
+
+
+def _privately(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)
 
 
 def _say(console: Console, text: str) -> None:

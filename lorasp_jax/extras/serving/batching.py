@@ -9,22 +9,27 @@ can, so share batches instead of taking turns.
 """
 
 import asyncio
+import contextlib
 import logging
 import queue
 import threading
 import time
 from collections import Counter
-from concurrent.futures import Future
+from concurrent.futures import Future, InvalidStateError
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from lorasp_jax.extras.serving.metrics import Histogram
 
 if TYPE_CHECKING:  # which imports JAX
     from lorasp_jax.extras.serving.served import ServedPolicies
 
 WAIT = 0.003
 """Longest time to wait for the clients of the previous batch [s]."""
+HUNG = 10.0
+"""Time after which a policy that has not answered counts as hung [s]; clients wait as long."""
 _log = logging.getLogger(__name__)
 
 
@@ -39,9 +44,21 @@ class _Job:
     row: Any
     future: Future[tuple[np.ndarray, float]] = field(default_factory=Future)
 
+    def fail(self, sentence: str) -> None:
+        with contextlib.suppress(InvalidStateError):  # the other thread was faster
+            self.future.set_exception(PolicyFailure(sentence))
+
+    def answer(self, chunk: np.ndarray, milliseconds: float) -> None:
+        with contextlib.suppress(InvalidStateError):  # `close` has given it up
+            self.future.set_result((chunk, milliseconds))
+
 
 class Batcher:
-    """Collects rows and runs them in batches, in its own thread until `close`."""
+    """Collects rows and runs them in batches, in its own thread until `close`.
+
+    Attributes:
+        seconds: how long batches took.
+    """
 
     def __init__(self, policy: "ServedPolicies", counts: Counter[str]) -> None:
         """Start the thread.
@@ -51,10 +68,13 @@ class Batcher:
             counts: receives the numbers of batches and of their requests.
         """
         self._policy, self._counts = policy, counts
+        self.seconds: Histogram = Histogram()
         self._queue: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         self._pending: list[_Job] = []
         self._awaited: set[int] = set()
-        self._finished = 0.0
+        self._finished, self._begun = 0.0, 0.0
+        self._running: list[_Job] = []
+        self._closing = self._failed = False
         self._thread = threading.Thread(target=self._work, name="policy", daemon=True)
         self._thread.start()
 
@@ -65,26 +85,51 @@ class Batcher:
             actions f32 `[C, J+1]`, and the time that the policy took for the batch [ms].
 
         Raises:
-            PolicyFailure: the policy failed, or returned values that are not finite.
+            PolicyFailure: the policy failed, returned values that are not finite, or will not
+                answer, as the server closes.
         """
+        if self._closing:
+            raise PolicyFailure("the server is closing")
         job = _Job(client, adapter, row)
         self._queue.put(job)
         return await asyncio.wrap_future(job.future)
 
-    def close(self) -> None:
-        """Stop the thread after the current batch."""
+    def problem(self) -> str | None:
+        """Say why the policy does not answer; None if it does, or has nothing to answer."""
+        seconds = time.monotonic() - self._begun
+        if self._running and seconds > HUNG:
+            return f"the policy has not answered for {seconds:.0f} s"
+        if not self._thread.is_alive():
+            return "the policy's thread has ended"
+        return "the policy failed when it was last asked" if self._failed else None
+
+    def close(self, timeout: float | None = None) -> bool:
+        """Stop the thread after the current batch; return False if that takes longer [s]."""
+        self._closing = True
         self._queue.put(None)
-        self._thread.join()
+        self._thread.join(timeout)
+        hung = self._thread.is_alive()
+        for job in self._running if hung else ():
+            job.fail("the policy does not answer")
+        self._cancel()
+        return not hung
+
+    def _cancel(self) -> None:
+        """Cancel what has not begun."""
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._pending += filter(None, [self._queue.get_nowait()])
+        for job in self._pending:
+            job.future.cancel()
 
     def _work(self) -> None:
         while self._collect():
-            batch = self._take_batch()
-            if batch:
+            if batch := self._take_batch():
+                self._begun, self._running = time.monotonic(), batch
                 self._run(batch)
+                self._running = []
                 self._awaited = {job.client for job in batch}
                 self._finished = time.monotonic()
-        for job in self._pending:
-            job.future.cancel()
 
     def _collect(self) -> bool:
         """Fill the pending jobs, at least with one; return False after `close`."""
@@ -122,17 +167,19 @@ class Batcher:
         start = time.perf_counter()
         try:
             actions = self._policy.run(batch[0].adapter, rows)
+            self._failed = False
         except Exception:  # a failed batch must not stop the server
+            self._failed = True
             _log.exception("the policy failed")
             for job in batch:
-                job.future.set_exception(PolicyFailure("the policy failed: see the server's log"))
+                job.fail("the policy failed: see the server's log")
             return
         milliseconds = (time.perf_counter() - start) * 1e3
+        self.seconds.observe(batch[0].adapter, milliseconds / 1e3)
         self._counts["batches"] += 1
         self._counts["batched_requests"] += len(batch)
         for job, chunk in zip(batch, actions, strict=False):
             if np.isfinite(chunk).all():
-                job.future.set_result((chunk, milliseconds))
+                job.answer(chunk, milliseconds)
             else:
-                message = "the policy returned actions that are not finite"
-                job.future.set_exception(PolicyFailure(message))
+                job.fail("the policy returned actions that are not finite")

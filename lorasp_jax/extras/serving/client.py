@@ -9,13 +9,15 @@ Needs only NumPy, msgpack and websockets. Works with openpi's servers too.
 """
 
 import asyncio
+import os
+import ssl
 import threading
 import time
-from collections.abc import Coroutine, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from typing import Any, Self, TypeVar
 
 from websockets.asyncio.client import ClientConnection, connect
-from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
+from websockets.exceptions import ConnectionClosed, InvalidStatus, InvalidURI, WebSocketException
 
 from lorasp_jax.extras.serving import wire
 
@@ -30,6 +32,13 @@ class PolicyError(RuntimeError):
 
 class ServerGone(ConnectionError):
     """There is no server, it closed the connection, or it did not reply in time."""
+
+
+def _may_pass(error: Exception) -> bool:
+    """Whether what prevents a connection may end by itself, for example while a server starts."""
+    if isinstance(error, InvalidStatus):
+        return error.response.status_code in (502, 503, 504)
+    return not isinstance(error, ssl.SSLError | InvalidURI)
 
 
 class PolicyClient:
@@ -50,6 +59,7 @@ class PolicyClient:
         token: str = "",
         timeout: float = 10.0,
         wait: float = 0.0,
+        say: Callable[[str], None] = lambda _: None,
     ) -> None:
         """Connect to a server.
 
@@ -58,7 +68,9 @@ class PolicyClient:
                 trusts.
             token: the server's token, if it requires one.
             timeout: how long to wait for the connection and for each reply [s].
-            wait: how long to try again if there is no server yet [s].
+            wait: how long to try again if there is no server yet, its name is not known yet, or it
+                or a proxy says that it is not ready (502, 503, 504) [s].
+            say: told why it waits, once for each reason.
 
         Raises:
             ServerGone: there is no server at this address, it requires another token, or its
@@ -80,7 +92,7 @@ class PolicyClient:
         self._thread.start()
         self._socket: ClientConnection | None = None
         try:
-            self._socket = self._run(self._connect(wait))
+            self._socket = self._run(self._connect(wait, say))
             self.metadata: dict[str, Any] = self._exchange(None, timeout)
         except BaseException:
             self.close()
@@ -138,23 +150,37 @@ class PolicyClient:
         """Run a coroutine in the connection's thread."""
         return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result()
 
-    async def _connect(self, wait: float) -> ClientConnection:
-        """Connect, trying again for some time while the address refuses connections."""
-        end = time.monotonic() + wait
+    async def _connect(self, wait: float, say: Callable[[str], None]) -> ClientConnection:
+        """Connect, trying again for some time where the reason for a refusal may pass."""
+        end, said = time.monotonic() + wait, ""
         while True:
             try:
                 return await connect(self.address, **self._options)
-            except ConnectionRefusedError as error:
-                if time.monotonic() > end:
-                    raise ServerGone(f"no policy server at {self.address}: {error}") from error
-                await asyncio.sleep(RETRY_EVERY)
-            except InvalidStatus as error:
-                code, body = error.response.status_code, error.response.body or b""
-                text = body.decode(errors="replace").strip()
-                message = f"{self.address} refused the connection ({code}): {text}"
-                raise ServerGone(message) from error
             except (OSError, WebSocketException) as error:
-                raise ServerGone(f"no policy server at {self.address}: {error}") from error
+                problem = self._problem(error)
+                if time.monotonic() > end or not _may_pass(error):
+                    raise ServerGone(problem) from error
+                if problem != said:
+                    say(f"{problem}; trying again for up to {end - time.monotonic():.0f} s")
+                said = problem
+                await asyncio.sleep(RETRY_EVERY)
+
+    def _problem(self, error: Exception) -> str:
+        """Say why there is no connection."""
+        if isinstance(error, InvalidStatus):
+            code, body = error.response.status_code, error.response.body or b""
+            text = " ".join(body.decode(errors="replace").split())[:200]
+            return f"{self.address} refused the connection ({code}): {text}"
+        if isinstance(error, ssl.SSLCertVerificationError):
+            file = os.environ.get("SSL_CERT_FILE", "")
+            remedy = f"SSL_CERT_FILE names {file}, which does not exist"
+            if not file or os.path.exists(file):
+                remedy = "let SSL_CERT_FILE name a file with the certificate of its authority"
+            reason = error.verify_message
+            return f"the certificate of {self.address} is not trusted ({reason}): {remedy}"
+        if isinstance(error, ssl.SSLError):
+            return f"{self.address} does not encrypt ({error.strerror}): it may be for ws://"
+        return f"no policy server at {self.address}: {str(error) or type(error).__name__}"
 
     def _exchange(self, frame: bytes | None, timeout: float) -> dict[str, Any]:
         """Send a frame, unless it is None, and return the next reply."""

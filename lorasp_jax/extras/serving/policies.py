@@ -15,6 +15,8 @@ from lorasp_jax.policies.policy import Observation, Policy
 from lorasp_jax.policies.processor import Processor
 from lorasp_jax.policies.prompt_table import Ids
 
+FAR = 50.0
+"""Normalized states beyond this are absurd, such as degrees in place of radians; our choice."""
 CACHED_PROMPTS = 1024
 """Number of instructions whose tokens are kept."""
 
@@ -51,6 +53,7 @@ class CompiledPolicy:
             metadata=loaded.metadata,
         )
         self.instructions: tuple[str, ...] = policy.processor.prompts.instructions
+        self.plausible: np.ndarray = plausible_states(policy.processor)
         self._table, self._words = policy.processor.prompts, loaded.words
         self._policy = without_prompts(policy)
         self._guidance = None if guidance is None else np.float32(guidance)
@@ -101,6 +104,20 @@ def describe(policy: Policy, **settings: Any) -> Description:
         antialias=processor.inputs.antialias,
         **settings,
     )
+
+
+def plausible_states(processor: Processor) -> np.ndarray:
+    """Return the bounds `[2, J+1]` of states within `FAR` of the demonstrations' normalized ones.
+
+    Normalization is affine, so two states determine it.
+    """
+    slots = np.array(processor.state_slots)
+    zero, one = (
+        np.asarray(processor.normalize_state(jnp.full(len(slots), x)))[slots] for x in (0.0, 1.0)
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):  # what is not normalized has no bounds
+        ends = (np.array([[-FAR], [FAR]]) - zero) / (one - zero)
+    return np.where(one == zero, [[-np.inf], [np.inf]], ends)
 
 
 def without_prompts(policy: Policy) -> Policy:

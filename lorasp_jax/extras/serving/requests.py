@@ -21,6 +21,8 @@ import numpy as np
 from lorasp_jax.extras.serving.exported import PolicyInterface
 from lorasp_jax.extras.serving.pictures import to_square
 
+MAX_VALUES = 4096
+"""Maximum number of values in a request, see `wire.unpack`; reading one then takes few ms."""
 MAX_PROMPT = 1000
 """Maximum length of an instruction [characters]."""
 
@@ -82,6 +84,9 @@ FORMS = (
 )
 
 
+_KEYS = {"image", "images", "prompt", "adapter", "reset", "executed", "delay"}  # of any form
+
+
 @dataclass(frozen=True)
 class Request:
     """A checked request.
@@ -97,6 +102,7 @@ class Request:
             does not continue it.
         delay: d, further actions of the previous chunk that the robot will execute.
         previous: f32 `[C, J+1]`, the previous chunk. The server knows it.
+        unknown: keys of the message that have no meaning.
     """
 
     images: Mapping[str, np.ndarray] = field(repr=False)
@@ -108,6 +114,7 @@ class Request:
     executed: int | None = None
     delay: int = 0
     previous: np.ndarray | None = field(default=None, repr=False)
+    unknown: tuple[str, ...] = ()
 
 
 def parse(message: Any, spec: PolicySpec) -> Request:
@@ -136,6 +143,7 @@ def parse(message: Any, spec: PolicySpec) -> Request:
         actions=form.actions,
         executed=executed,
         delay=delay,
+        unknown=tuple(message.keys() - _KEYS - {*form.state, *form.pictures}),
     )
 
 
@@ -144,10 +152,13 @@ def _progress(message: Mapping[str, Any], spec: PolicySpec) -> tuple[int | None,
     executed, delay = message.get("executed"), message.get("delay", 0)
     if executed is None and delay == 0:
         return None, 0
-    for name, value in (("executed", executed), ("delay", delay)):
+    values = {"delay": delay} if executed is None else {"executed": executed, "delay": delay}
+    for name, value in values.items():
         if type(value) is not int or not 0 <= value <= spec.chunk:
             got = str(value)[:40]
             raise ValueError(f"{name} must be an integer from 0 to {spec.chunk}, got {got}")
+    if executed is None:
+        raise ValueError("delay counts from executed, the actions already executed: send that, too")
     if executed + delay > spec.chunk:
         raise ValueError(
             f"executed and delay must be at most {spec.chunk} together, the length of a chunk, got "

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import itertools
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -12,6 +13,8 @@ import numpy as np
 from lorasp_jax.extras.serving.exported import ExportedPolicy, PolicyInterface, build_row
 from lorasp_jax.extras.serving.policies import CompiledPolicy
 from lorasp_jax.extras.serving.requests import PolicySpec, Request
+
+_log = logging.getLogger(__name__)
 
 
 class ServedPolicies:
@@ -52,7 +55,7 @@ class ServedPolicies:
             ValueError: the policies need different observations or are of different robots, or
                 cannot continue chunks as `execution` demands.
         """
-        self._policies, self._prompt = dict(policies), prompt
+        self._policies, self._prompt, self._warned = dict(policies), prompt, set()
         self.spec: PolicySpec = _common_spec(policies, execution)
         self.metadata: dict[str, Any] = dict(next(iter(policies.values())).description.metadata)
         self.instructions: dict[str, tuple[str, ...]] = {
@@ -68,6 +71,7 @@ class ServedPolicies:
         spec = self.spec
         picture = np.zeros((spec.image_size, spec.image_size, 3), np.uint8)
         images, state = dict.fromkeys(spec.cameras, picture), np.zeros(spec.state_dim, np.float32)
+        self._warned = {*self._policies}  # not of these zeros
         programs = list(itertools.product(self._policies, self.sizes))
         for number, (adapter, size) in enumerate(programs, start=1):
             say(f"compiling {adapter}, batch {size} ({number} of {len(programs)})")
@@ -75,6 +79,7 @@ class ServedPolicies:
             request = Request(images, state, next(filter(None, prompt)), adapter)
             for _ in range(2):
                 self.run(adapter, [self.prepare(request, (0, 0))] * size)
+        self._warned = set()
 
     def prepare(self, request: Request, index: tuple[int, int]) -> dict[str, Any]:
         """Convert a request to a row of a batch.
@@ -91,6 +96,7 @@ class ServedPolicies:
         prompt = request.prompt or self._prompt or (known[0] if len(known) == 1 else "")
         if not prompt:
             raise ValueError("the request must contain a prompt")
+        self._warn(adapter, request.state)
         rest = None
         if execution != "naive":
             rest = np.zeros((0, self.spec.action_length), np.float32)
@@ -101,6 +107,19 @@ class ServedPolicies:
         if rest is not None and execution == "guided":
             row["overlap"] = np.array(len(rest), np.int32)
         return {**row, "index": np.array(index, np.int32)}
+
+    def _warn(self, adapter: str, state: np.ndarray) -> None:
+        """Tell the log once of a state that no demonstration can have had."""
+        bounds = getattr(self._policies[adapter], "plausible", None)  # exported ones have none
+        if adapter in self._warned or bounds is None:
+            return
+        if (beyond := (state < bounds[0]) | (state > bounds[1])).any():
+            self._warned.add(adapter)
+            number = int(beyond.argmax())
+            _log.warning(
+                "number %d of a state is %g, but %g to %g would be plausible: check its unit",
+                *(number, state[number], *bounds[:, number]),
+            )
 
     def run(self, adapter: str, rows: Sequence[dict[str, Any]]) -> np.ndarray:
         """Return actions f32 `[B, C, J+1]`; B is one of `sizes`."""

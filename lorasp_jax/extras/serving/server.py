@@ -17,7 +17,7 @@ import logging
 import socket
 import time
 from collections import Counter
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -29,15 +29,16 @@ from websockets.http11 import Request as HttpRequest
 from websockets.http11 import Response
 
 import lorasp_jax
-from lorasp_jax.extras.serving import wire
+from lorasp_jax.extras.serving import metrics, wire
 from lorasp_jax.extras.serving.batching import Batcher, PolicyFailure
-from lorasp_jax.extras.serving.requests import Request, parse
+from lorasp_jax.extras.serving.requests import MAX_VALUES, Request, parse
 
 if TYPE_CHECKING:  # which imports JAX
     from lorasp_jax.extras.serving.served import ServedPolicies
 
 MAX_CLIENTS = 64
-"""Maximum number of connections."""
+"""Maximum number of connections, unless given."""
+_MOST_WARNINGS = 20  # keys come from outside
 _log = logging.getLogger(__name__)
 
 
@@ -79,19 +80,23 @@ class PolicyServer:
         counts: numbers of connections, open connections, requests, errors and batches.
     """
 
-    def __init__(self, policy: "ServedPolicies", *, token: str = "") -> None:
+    def __init__(
+        self, policy: "ServedPolicies", *, token: str = "", max_clients: int = MAX_CLIENTS
+    ) -> None:
         """Start the policy's thread; `listen` opens the port.
 
         Args:
             policy: already compiled.
             token: if not empty, clients must send it in the header "Authorization: Api-Key TOKEN".
+            max_clients: maximum number of connections.
         """
-        names = ("connections", "open_connections", "requests", "errors")
+        names = ("connections", "open_connections", "refused_connections", "requests", "errors")
+        self._max_clients, self._seconds = max_clients, metrics.Histogram()
         self.counts: Counter[str] = Counter(dict.fromkeys(names, 0))
         self._policy, self._token = policy, token
         self._batcher = Batcher(policy, self.counts)
         self._metadata = wire.pack(describe(policy))
-        self._clients = itertools.count()
+        self._clients, self._warned = itertools.count(), set[str]()
 
     @contextlib.asynccontextmanager
     async def listen(self, port: socket.socket) -> AsyncIterator[Server]:
@@ -108,31 +113,52 @@ class PolicyServer:
         ) as server:
             yield server
 
-    def close(self) -> None:
-        """Stop the policy's thread."""
-        self._batcher.close()
+    def close(self, timeout: float | None = None) -> bool:
+        """Stop the policy's thread; return False if it does not answer in time [s]."""
+        return self._batcher.close(timeout)
 
     def _process_request(
         self, connection: ServerConnection, request: HttpRequest
     ) -> Response | None:
         """Answer pages, and refuse connections without the token or beyond the limit."""
         if request.path == "/healthz":
-            return connection.respond(http.HTTPStatus.OK, "OK\n")
-        given = request.headers.get("Authorization", "").removeprefix("Api-Key ")
-        if self._token and not hmac.compare_digest(given.encode(), self._token.encode()):
-            text = "this server requires a token: Authorization: Api-Key TOKEN\n"
-            return connection.respond(http.HTTPStatus.UNAUTHORIZED, text)
+            problem = self._batcher.problem()
+            status = http.HTTPStatus.SERVICE_UNAVAILABLE if problem else http.HTTPStatus.OK
+            return connection.respond(status, f"{problem or 'OK'}\n")
+        if refusal := self._refusal(request):
+            self.counts["refused_connections"] += 1
+            _log.info("refused %s: %s", _peer(connection), refusal[1])
+            return connection.respond(refusal[0], f"{refusal[1]}\n")
         if request.path == "/status":
             return connection.respond(http.HTTPStatus.OK, json.dumps(self.counts) + "\n")
-        if self.counts["open_connections"] >= MAX_CLIENTS:
-            text = f"this server has its maximum of {MAX_CLIENTS} connections\n"
-            return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, text)
+        if request.path == "/metrics":
+            histograms = {"request_seconds": self._seconds, "batch_seconds": self._batcher.seconds}
+            page = connection.respond(http.HTTPStatus.OK, metrics.text(self.counts, histograms))
+            del page.headers["Content-Type"]
+            page.headers["Content-Type"] = metrics.CONTENT_TYPE
+            return page
+        return None
+
+    def _refusal(self, request: HttpRequest) -> tuple[http.HTTPStatus, str] | None:
+        """Return why a page or a connection is refused; None if it is not."""
+        headers = request.headers.get_all("Authorization")
+        if len(headers) > 1:
+            return http.HTTPStatus.BAD_REQUEST, "there must be one header Authorization"
+        given = "".join(headers).removeprefix("Api-Key ")
+        if self._token and not hmac.compare_digest(given.encode(), self._token.encode()):
+            text = "this server requires a token: Authorization: Api-Key TOKEN"
+            return http.HTTPStatus.UNAUTHORIZED, text
+        is_page = request.path in ("/status", "/metrics")
+        if not is_page and self.counts["open_connections"] >= self._max_clients:
+            text = f"this server has its maximum of {self._max_clients} connections"
+            return http.HTTPStatus.SERVICE_UNAVAILABLE, text
         return None
 
     async def _handle(self, connection: ServerConnection) -> None:
         """Serve one connection until it closes."""
         client = ClientState(next(self._clients))
         self.counts.update(("connections", "open_connections"))
+        _log.info("client %d connected from %s", client.number, _peer(connection))
         try:
             await connection.send(self._metadata)
             async for frame in connection:
@@ -140,12 +166,13 @@ class PolicyServer:
         except ConnectionClosed:
             pass  # the client has gone, which ends its episode
         except (ValueError, PolicyFailure) as error:
-            await self._refuse(connection, str(error))
+            await self._refuse(connection, client, str(error))
         except Exception as error:  # a bug must not show the client a traceback
             _log.exception("a request failed")
-            await self._refuse(connection, f"the server failed: {type(error).__name__}")
+            await self._refuse(connection, client, f"the server failed: {type(error).__name__}")
         finally:
             self.counts["open_connections"] -= 1
+            _log.info("client %d left after %d requests", client.number, client.requests)
 
     async def _answer(
         self, connection: ServerConnection, client: ClientState, frame: bytes | str
@@ -167,11 +194,13 @@ class PolicyServer:
         }
         await connection.send(wire.pack(reply))
         client.previous_ms = (time.perf_counter() - start) * 1e3
+        self._seconds.observe(adapter, client.previous_ms / 1e3)
         self.counts["requests"] += 1
 
     def _read(self, client: ClientState, frame: bytes) -> tuple[str, Any, int | None]:
         """Return the adapter's name, the row and the number of action dimensions."""
-        request = parse(wire.unpack(frame), self._policy.spec)
+        request = parse(wire.unpack(frame, max_values=MAX_VALUES), self._policy.spec)
+        self._warn(request.unknown)
         adapters = list(self._policy.instructions)
         adapter = request.adapter or adapters[0]
         if adapter not in adapters:
@@ -179,12 +208,28 @@ class PolicyServer:
         row = self._policy.prepare(*client.advance(request))
         return adapter, row, request.actions
 
-    async def _refuse(self, connection: ServerConnection, sentence: str) -> None:
+    def _warn(self, keys: Iterable[str]) -> None:
+        """Tell the log once of a key that has no meaning, such as a misspelt one."""
+        for key in keys:
+            if key not in self._warned and len(self._warned) < _MOST_WARNINGS:
+                self._warned.add(key)
+                _log.warning("requests have the key %.40r, which has no meaning", key)
+
+    async def _refuse(
+        self, connection: ServerConnection, client: ClientState, sentence: str
+    ) -> None:
         """Send the client one sentence and close the connection."""
         self.counts["errors"] += 1
+        _log.info("client %d is refused: %s", client.number, sentence)
         with contextlib.suppress(ConnectionClosed):
             await connection.send(sentence)
             await connection.close(CloseCode.INTERNAL_ERROR, "the previous frame says why")
+
+
+def _peer(connection: ServerConnection) -> str:
+    """Return the other end's address; a client that has gone has none."""
+    host, port = (connection.remote_address or ("nowhere", 0))[:2]
+    return f"{host} port {port}"
 
 
 def describe(policy: "ServedPolicies") -> dict[str, Any]:

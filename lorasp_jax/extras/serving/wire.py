@@ -5,8 +5,9 @@ An array is a map with bytes keys (openpi_client/msgpack_numpy.py at 15a9616):
     {b"__ndarray__": True, b"data": raw bytes, b"dtype": "<f4", b"shape": [2, 3]}
     {b"__npgeneric__": True, b"data": 1.5, b"dtype": "<f4"}          a NumPy scalar
 
-`unpack` never trusts these fields: it checks dtype, rank and sizes against the length of the data
-before NumPy sees them. Nothing is ever unpickled.
+`unpack` never trusts a frame: it bounds depth and number of values before anything is built, and
+checks dtype, rank and sizes of arrays against the length of the data before NumPy sees them.
+Nothing is ever unpickled.
 """
 
 import math
@@ -20,7 +21,9 @@ MAX_FRAME = 32 * 2**20
 MAX_RANK = 8
 """Maximum number of axes of an array."""
 MAX_VALUES = 65_536
-"""Maximum number of values in the lists and maps of a frame; arrays count as one value."""
+"""Maximum number of values in the lists and maps of a frame, an array counts nine."""
+MAX_DEPTH = 16
+"""Maximum depth of lists and maps in each other; a request needs 4."""
 NUMERIC = frozenset(["b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8"])
 """Dtypes that a frame may contain, without byte order. Strings, such as U12, are allowed too."""
 MAX_TEXT = 4096
@@ -42,7 +45,7 @@ def pack(message: Any) -> bytes:
     return cast(bytes, msgpack.packb(message, default=_encode))
 
 
-def unpack(frame: bytes) -> Any:
+def unpack(frame: bytes, *, max_values: int = MAX_VALUES) -> Any:
     """Decode a frame. Arrays are read-only views of it.
 
     Raises:
@@ -50,45 +53,53 @@ def unpack(frame: bytes) -> Any:
     """
     if len(frame) > MAX_FRAME:
         raise FrameError(f"a frame must have at most {MAX_FRAME} bytes, got {len(frame)}")
-    decoder = _Decoder()
     try:
-        return msgpack.unpackb(
-            frame,
-            object_hook=decoder.map,
-            list_hook=decoder.list,
-            max_array_len=MAX_VALUES,
-            max_map_len=MAX_VALUES,
-            max_ext_len=0,
-        )
+        _bound(frame, max_values)
+        return msgpack.unpackb(frame, object_hook=_map, max_ext_len=0)
     except FrameError:
         raise
-    except (ValueError, TypeError, msgpack.UnpackException, RecursionError) as error:
+    except IndexError as error:
+        raise FrameError("the frame is not a msgpack message: it is incomplete") from error
+    except (ValueError, TypeError, msgpack.UnpackException) as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise FrameError(f"the frame is not a msgpack message: {reason}") from error
 
 
-class _Decoder:
-    """Decodes the maps of one frame that are arrays, and counts all values."""
+def _bound(frame: bytes, max_values: int) -> None:
+    """Refuse a frame of very many or very deep values by its headers, without building any."""
+    scan = msgpack.Unpacker(max_buffer_size=MAX_FRAME)
+    scan.feed(frame)
+    values, remaining = 1, [1]  # values that are still to come at each depth
+    while remaining:
+        if not remaining[-1]:
+            remaining.pop()
+            continue
+        remaining[-1] -= 1
+        header = frame[scan.tell()]
+        if header & 0xF0 == 0x80 or header in (0xDE, 0xDF):
+            remaining.append(2 * scan.read_map_header())
+        elif header & 0xF0 == 0x90 or header in (0xDC, 0xDD):
+            remaining.append(scan.read_array_header())
+        else:
+            scan.skip()
+            continue
+        values += remaining[-1]
+        if values > max_values:
+            raise FrameError(f"a frame must have at most {max_values} values, arrays apart")
+        if len(remaining) > MAX_DEPTH + 1:
+            raise FrameError(f"lists and maps must be at most {MAX_DEPTH} deep in each other")
 
-    def __init__(self) -> None:
-        self._values = 0
 
-    def list(self, values: list[Any]) -> list[Any]:
-        self._values += len(values)
-        if self._values > MAX_VALUES:
-            raise FrameError(f"a frame must have at most {MAX_VALUES} values, arrays apart")
-        return values
-
-    def map(self, fields: dict[Any, Any]) -> Any:
-        self.list([*fields])
-        if b"nd" in fields or "__ndarray__" in fields:
-            raise FrameError(
-                "arrays must be encoded as openpi_client.msgpack_numpy does, as a map with the "
-                f"bytes keys __ndarray__, data, dtype and shape; got the keys {[*fields][:4]}"
-            )
-        if b"__ndarray__" in fields:
-            return _array(fields)
-        return _scalar(fields) if b"__npgeneric__" in fields else fields
+def _map(fields: dict[Any, Any]) -> Any:
+    """Decode the maps that are arrays."""
+    if b"nd" in fields or "__ndarray__" in fields:
+        raise FrameError(
+            "arrays must be encoded as openpi_client.msgpack_numpy does, as a map with the "
+            f"bytes keys __ndarray__, data, dtype and shape; got the keys {[*fields][:4]}"
+        )
+    if b"__ndarray__" in fields:
+        return _array(fields)
+    return _scalar(fields) if b"__npgeneric__" in fields else fields
 
 
 def _encode(value: Any) -> Any:

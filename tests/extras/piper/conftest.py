@@ -3,10 +3,14 @@
 import numpy as np
 import pytest
 
+from envs.rendering.video import write_video
+from lorasp_jax.extras.piper import remote, safety
 from lorasp_jax.extras.piper import session as sessions
 from lorasp_jax.extras.piper.fake.world import World
 from lorasp_jax.extras.piper.safety import Limits
 from tests.extras.piper.benches import Bench
+from tests.extras.piper.piper_runs import Still
+from tests.extras.serving.stand_in import serving
 
 
 @pytest.fixture(scope="session")
@@ -26,3 +30,25 @@ def bench(world):
 def near_rest(bench, monkeypatch):
     """Let the rest pose be near, so that the way to it is short."""
     monkeypatch.setattr(sessions, "REST", bench.world.pose + 0.1 * np.eye(7)[0])
+
+
+@pytest.fixture
+def patient(monkeypatch):
+    """Tolerate that a busy machine pauses the arm's thread."""
+    monkeypatch.setattr(safety, "MAX_AGE", 60.0)
+    monkeypatch.setattr(safety, "MAX_DRIVER_AGE", 60.0)
+
+
+@pytest.fixture
+def server(monkeypatch):
+    monkeypatch.setattr(remote, "_WAIT", 0.0)
+    policy = Still()
+    with serving(policy) as server:
+        server.policy = policy
+        yield server
+
+
+@pytest.fixture
+def film(tmp_path):
+    write_video(tmp_path / "film.mp4", np.zeros((5, 32, 32, 3), np.uint8), 30)
+    return str(tmp_path / "film.mp4")

@@ -4,10 +4,20 @@ import numpy as np
 
 from lorasp_jax.extras.piper.asking import InTurn
 from lorasp_jax.extras.piper.safety import Limits
-from lorasp_jax.extras.piper.session import PERIOD, Session, Settings
+from lorasp_jax.extras.piper.session import PERIOD, Session
+from lorasp_jax.extras.piper.settings import Settings
+from tests.extras.serving.stand_in import StandIn
 
 LIMITS = Limits.of()
 ARM_STEP = np.array([0.03, 0, 0, 0, 0, 0, 0])  # rad per action
+
+
+class Still(StandIn):
+    """Answers with the state, so that the arm does not move."""
+
+    def prepare(self, request, index):
+        self.last_request = request
+        return request.state
 
 
 class Turning:

@@ -1,5 +1,6 @@
 """The arm's driver and the fake arm, through the unmodified piper_sdk on a virtual CAN bus."""
 
+import can
 import numpy as np
 import pytest
 
@@ -13,6 +14,7 @@ from lorasp_jax.extras.piper.safety import (
     Limits,
     Unsafe,
     fault,
+    finger_tips,
 )
 from tests.extras.piper.benches import Bench, channel
 
@@ -74,12 +76,11 @@ def test_enabling_again_does_not_return_to_an_earlier_target(bench):
     arm.disable()
     wait(clock, 0.1)
     fake.world.data.qpos[0] -= 0.6  # a person pushes the powerless arm
-    fake._setpoint[0] -= 0.6
-    wait(clock, 0.1)
+    wait(clock, 0.05)
     before = fake.world.pose
     arm.enable(LIMITS)
     wait(clock, 0.5)
-    np.testing.assert_allclose(fake.world.pose, before, atol=5e-3)
+    np.testing.assert_allclose(fake.world.pose[0], before[0], atol=5e-3)  # the others have fallen
     assert fake.unsafe == []
 
 
@@ -252,3 +253,37 @@ def test_frames_have_eight_bytes():
     made += [frames.driver(True), frames.firmware_limits(6, -120, 120, 3)]
     assert {len(frame) for frame in made} == {8}
     assert frames.unpack_pair(frames.pair(-90_000, 1)) == (-90_000, 1)
+
+
+def send(fake, kind, *data):
+    data = bytes([*data, *[0] * (8 - len(data))])
+    fake._obey(can.Message(arbitration_id=kind, data=data, is_extended_id=False))
+
+
+@pytest.mark.parametrize(
+    ("frame", "status", "seconds"),
+    [
+        ((frames.STOP_OR_TEACH, 1), 1, 0.8),
+        ((frames.STOP_OR_TEACH, 2), 0, 0.15),
+        ((frames.ENABLE, 7, 1), 0, 0.15),
+    ],
+    ids=["emergency stop", "reset", "disable"],
+)
+def test_the_fake_arm_sinks_at_a_stop_and_falls_without_power(bench, frame, status, seconds):
+    """By 10 cm, in a time that tells sinking from falling."""
+    arm, fake, clock = ready(bench)
+    wait(clock, 0.05)  # until all that the arm was told has arrived
+    height = finger_tips(fake.world.pose[:6])[2]
+    send(fake, *frame)
+    wait(clock, 0.6 * seconds)
+    assert finger_tips(fake.world.pose[:6])[2] > height - 0.1
+    wait(clock, 0.8 * seconds)
+    assert finger_tips(fake.world.pose[:6])[2] < height - 0.1
+    reading = arm.read()
+    assert (reading.arm_status, reading.enabled) == (status, status == 1)
+    send(fake, frames.STOP_OR_TEACH, 2)  # ends the stop, too
+    wait(clock, 2.0)
+    arm.enable(LIMITS)
+    before = fake.world.pose
+    wait(clock, 0.3)
+    np.testing.assert_allclose(fake.world.pose, before, atol=5e-3)

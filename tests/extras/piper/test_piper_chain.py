@@ -7,7 +7,8 @@ from lorasp_jax.extras.piper.asking import InTurn
 from lorasp_jax.extras.piper.fake.demonstrator import Demonstrator
 from lorasp_jax.extras.piper.fake.world import World
 from lorasp_jax.extras.piper.safety import Limits
-from lorasp_jax.extras.piper.session import Session, Settings
+from lorasp_jax.extras.piper.session import Session
+from lorasp_jax.extras.piper.settings import Settings
 from tests.extras.piper.benches import Bench
 
 EPISODES = 8

@@ -2,38 +2,22 @@
 
 import dataclasses
 import json
-import signal
-import types
 from unittest.mock import Mock
 
+import av
 import numpy as np
 import pytest
 
-from envs.rendering.video import write_video
 from envs.tasks import press
 from lorasp_jax.data.opening import open_source
-from lorasp_jax.extras.piper import __main__ as command
-from lorasp_jax.extras.piper import options, safety
-from lorasp_jax.extras.piper.__main__ import HELD
+from lorasp_jax.extras.piper import remote
 from lorasp_jax.extras.piper.__main__ import main as real
-from lorasp_jax.extras.piper.arm import PiperArm
 from lorasp_jax.extras.piper.fake import __main__ as faking
 from lorasp_jax.extras.piper.fake.__main__ import main as fake
-from lorasp_jax.extras.piper.fake.firmware import FakePiper
-from lorasp_jax.extras.piper.fake.timing import RealTime
-from lorasp_jax.extras.piper.recording import Recording
 from lorasp_jax.extras.serving.client import PolicyClient
 from tests.cases import mostly_slow
-from tests.extras.piper.benches import channel
-from tests.extras.serving.stand_in import SPEC, StandIn, serving
-
-
-class Still(StandIn):
-    """Answers with the state, so that the arm does not move."""
-
-    def prepare(self, request, index):
-        self.last_request = request
-        return request.state
+from tests.extras.piper.piper_runs import Still
+from tests.extras.serving.stand_in import SPEC, serving
 
 
 @pytest.fixture(autouse=True)
@@ -45,33 +29,11 @@ def shared_world(world, monkeypatch):
 
 
 @pytest.fixture
-def patient(monkeypatch):
-    """Tolerate that a busy machine pauses the arm's thread."""
-    monkeypatch.setattr(safety, "MAX_AGE", 60.0)
-    monkeypatch.setattr(safety, "MAX_DRIVER_AGE", 60.0)
-
-
-@pytest.fixture
 def limit(monkeypatch):
     """Return a function that sets the task's time limit [s]."""
     return lambda seconds: monkeypatch.setattr(
         press, "TASK", dataclasses.replace(press.TASK, time_limit=seconds)
     )
-
-
-@pytest.fixture
-def server(monkeypatch):
-    monkeypatch.setattr(options, "_WAIT", 0.0)
-    policy = Still()
-    with serving(policy) as server:
-        server.policy = policy
-        yield server
-
-
-@pytest.fixture
-def film(tmp_path):
-    write_video(tmp_path / "film.mp4", np.zeros((5, 32, 32, 3), np.uint8), 30)
-    return str(tmp_path / "film.mp4")
 
 
 @pytest.mark.parametrize("seconds", mostly_slow([0.4, 8.0], [0.4]))
@@ -86,6 +48,12 @@ def test_the_expert_on_the_fake_arm(tmp_path, capsys, limit, seconds):
     assert f"episode 0: {'success' if won else 'failure'}" in printed
     assert f"{won:d} of 1 succeeded" in printed
     assert film.stat().st_size > 1000
+    with av.open(str(film)) as container:
+        *_, last = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    assert last.shape == (256, 512, 3)
+    edge = last[2:10, 100:400].mean((0, 1))  # green after success, else red
+    assert edge.argmax() == int(won)
+    assert edge.max() > 100 > 60 > edge[1 - won]
     lines = (tmp_path / "log" / "log.jsonl").read_text().splitlines()
     assert json.loads(lines[0])["episode"] == 0
     if won:
@@ -162,12 +130,38 @@ def test_a_policy_of_another_task_is_warned_of(known, warned, limit, tmp_path, c
     assert (expected in before) == ("warning" in before) == warned
 
 
+@pytest.mark.parametrize(
+    ("metadata", "words", "code", "message"),
+    [
+        ({"robot": "so100"}, [], 2, "of the robot so100, not of piper: pass --robot so100"),
+        ({"robot": "so100"}, ["--robot", "so100"], 0, ""),
+        ({"action_dim": 8}, [], 2, "have 8 numbers, but a PiPER takes 7"),
+        ({"control_dt": 0.05}, [], 0, ""),
+        ({"control_dt": 0.05}, ["--control-dt", "0.1"], 0, "acts every 0.05 s, not every 0.1 s"),
+        ({"cameras": 5}, [], 2, "are malformed: cameras must be a list"),
+    ],
+)
+def test_the_policys_robot_and_period_are_kept(
+    metadata, words, code, message, tmp_path, limit, capsys
+):
+    limit(0.15)
+    policy = Still(metadata=metadata)
+    with serving(policy) as server:
+        words = ["--server", server.address, "--log", str(tmp_path), "--execute", "2", *words]
+        assert fake(words) == code
+    printed = capsys.readouterr()
+    assert message in " ".join((printed.out + printed.err).split())
+    assert ("warning" in printed.out) == (code == 0 and bool(message))
+    told = {"control_dt": 0.05}.items() <= metadata.items() and not message
+    assert len(policy.batches) == (0 if code else 2 if told else 1)
+
+
 @pytest.mark.parametrize("adapter", ["", "pour", "press"])
 def test_an_adapter_of_another_task_is_warned_of(adapter, capsys):
     policy = Still(adapters=("pour", "press"))
     policy.instructions = {"pour": ("pour it", "tip it"), "press": ("press it",)}
     with serving(policy) as server, PolicyClient(server.address) as client:
-        options.Server(client, adapter).warn(["tip it", "press it"])
+        remote.Server(client, adapter).warn(["tip it", "press it"])
     new, known = ("tip it", "press it") if adapter == "press" else ("press it", "pour it")
     assert f"not trained for {new!r}, but for requests such as {known!r}" in capsys.readouterr().out
 
@@ -177,10 +171,10 @@ def test_an_adapter_of_the_server_can_be_chosen():
     state, picture = np.zeros(7, np.float32), np.zeros((48, 64, 3), np.uint8)
     question = {"image": {"side": picture, "wrist": picture}, "state": state, "prompt": "go"}
     with serving(policy) as server, PolicyClient(server.address) as client:
-        options.Server(client)(question)
-        options.Server(client, "b")(question)
+        remote.Server(client)(question)
+        remote.Server(client, "b")(question)
         with pytest.raises(ValueError, match="the server has no adapter 'c', but a, b"):
-            options.Server(client, "c")
+            remote.Server(client, "c")
     assert [name for name, _ in policy.batches] == ["a", "b"]
 
 
@@ -188,7 +182,7 @@ def test_an_adapter_of_the_server_can_be_chosen():
 def test_only_servers_that_continue_chunks_are_told_how_far_the_arm_is(execution):
     policy = Still(dataclasses.replace(SPEC, execution=execution))
     with serving(policy) as server, PolicyClient(server.address) as client:
-        ask = options.Server(client)
+        ask = remote.Server(client)
         state, large = np.zeros(7, np.float32), np.zeros((48, 64, 3), np.uint8)
         question = {"image": {"side": large, "wrist": large}, "state": state, "prompt": "go"}
         assert ask(question).shape == (10, 7)
@@ -213,7 +207,7 @@ def test_the_fake_arm_refuses_wrong_options(words, message, tmp_path, capsys):
 
 
 def test_no_server(monkeypatch, capsys):
-    monkeypatch.setattr(options, "_WAIT", 0.0)
+    monkeypatch.setattr(remote, "_WAIT", 0.0)
     assert fake(["--server", "ws://127.0.0.1:9"]) == 2
     assert "no policy server at ws://127.0.0.1:9" in capsys.readouterr().err
 
@@ -243,88 +237,6 @@ def test_the_real_arm_is_not_on_a_virtual_bus(capsys):
     with pytest.raises(SystemExit):
         real(["--task", "press", "--bus", "virtual"])
     assert "--bus: invalid choice: 'virtual'" in capsys.readouterr().err
-
-
-class LinkedArm(PiperArm):
-    """A real arm's driver on the bus of a fake arm that lives in a thread."""
-
-    def __init__(self, can, *, bus, **options):
-        name = channel()
-        self.world.reset(0)
-        self.fake = FakePiper(name, self.world)
-        super().__init__(name, bus="virtual", **options)
-        self.time = RealTime(self.fake)
-        self.time.start(self)
-
-    def close(self):
-        self.time.stop()
-        super().close()
-        self.fake.close()
-
-
-@pytest.fixture
-def linked(monkeypatch, film, world, patient):
-    monkeypatch.setattr(LinkedArm, "world", world, raising=False)
-    monkeypatch.setattr("lorasp_jax.extras.piper.__main__.PiperArm", LinkedArm)
-    monkeypatch.setattr("lorasp_jax.extras.piper.cameras.MAX_AGE", 60.0)
-    return ["--camera", f"side={film}", "--camera", f"wrist={film}", "--task", "press"]
-
-
-def test_the_real_command_with_an_arm_on_the_bus(server, linked, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("builtins.input", lambda question: "y")
-    words = ["--server", server.address, *linked, "--seconds", "1.5"]
-    words += ["--log", str(tmp_path / "log"), "--record", str(tmp_path / "data")]
-    assert real([*words, "--image-size", "16"]) == 0, capsys.readouterr()
-    assert "1 episodes recorded" in capsys.readouterr().out
-    assert open_source(tmp_path / "data").num_steps >= 5
-
-
-def test_a_dry_run_of_the_real_command(linked, tmp_path, capsys):
-    policy = Still(instructions=("pour it",))
-    with serving(policy) as server:
-        words = ["--server", server.address, *linked, "--seconds", "0.5", "--dry-run"]
-        assert real([*words, "--log", str(tmp_path)]) == 0
-    before, command, _ = capsys.readouterr().out.partition("would command")
-    assert command
-    assert before.count("the policy was not trained for 'press the red button', but for") == 1
-
-
-def test_teaching_with_the_real_command(linked, tmp_path, monkeypatch, capsys):
-    questions = []
-    monkeypatch.setattr("builtins.input", lambda question: questions.append(question) or "n")
-    monkeypatch.setattr("lorasp_jax.extras.piper.teaching._STILL", -1.0)
-    words = [*linked, "--seconds", "0.6", "--record", str(tmp_path / "data"), "--image-size", "16"]
-    assert real([*words, "--teach", "hand"]) == 0
-    assert questions[0].startswith("keep this episode of ")
-    assert real([*words, "--teach", "leader"]) == HELD
-    assert "no leader sends targets" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("number", [None, *options.SIGNALS])
-def test_an_episode_that_nobody_judges_is_not_lost(number, tmp_path, monkeypatch, capsys):
-    def ask(question):
-        if number:
-            signal.raise_signal(number)
-        raise EOFError("EOF when reading a line")
-
-    monkeypatch.setattr("builtins.input", ask)
-    ways = {"task": "press", "instructions": (), "control_dt": 0.1, "image_size": 16}
-    recorder = Recording(tmp_path / "data", prompt="press it", **ways)
-    recorder.step({"side": np.zeros((16, 16, 3), np.uint8)}, np.ones(7), np.ones(7))
-    handlers = {each: signal.getsignal(each) for each in options.SIGNALS}
-    try:
-        options.stop_on_signals(types.SimpleNamespace(stop=lambda: None))
-        if number == signal.SIGINT:
-            with pytest.raises(KeyboardInterrupt, match="not kept"):
-                command._keep(recorder)
-        else:
-            command._keep(recorder)
-    finally:
-        for each, handler in handlers.items():
-            signal.signal(each, handler)
-    kept = number != signal.SIGINT
-    assert recorder.num_episodes == kept
-    assert ("the episode is kept: 1 episodes recorded" in capsys.readouterr().out) == kept
 
 
 @pytest.mark.parametrize(

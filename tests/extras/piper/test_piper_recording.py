@@ -4,6 +4,7 @@ import can
 import numpy as np
 import pytest
 
+from envs.datasets.rlds import read
 from envs.robots.piper import SDK_OFFSET
 from lorasp_jax.data.opening import open_source
 from lorasp_jax.extras.piper.asking import InTurn
@@ -11,7 +12,8 @@ from lorasp_jax.extras.piper.fake import frames
 from lorasp_jax.extras.piper.fake.demonstrator import Demonstrator
 from lorasp_jax.extras.piper.recording import Recording
 from lorasp_jax.extras.piper.safety import Limits, Unsafe
-from lorasp_jax.extras.piper.session import Session, Settings
+from lorasp_jax.extras.piper.session import Session
+from lorasp_jax.extras.piper.settings import Settings
 from lorasp_jax.extras.piper.teaching import Lesson
 
 LIMITS = Limits.of()
@@ -143,8 +145,9 @@ def test_other_settings_or_nothing_are_refused(tmp_path):
     filled(recording(tmp_path / "data")).keep()
     with pytest.raises(ValueError, match="image_size"):
         Recording(tmp_path / "data", prompt="press it", image_size=32, **WAYS)
-    with pytest.raises(ValueError, match="control_dt"):
-        filled(recording(tmp_path / "data", control_dt=0.2)).keep()
+    for name, other in (("control_dt", 0.2), ("task", "pour")):  # before anything is demonstrated
+        with pytest.raises(ValueError, match=f"data has {name} .* choose another folder"):
+            recording(tmp_path / "data", **{name: other})
     with pytest.raises(ValueError, match="no step"):
         recording(tmp_path / "data").keep()
     assert len(open_source(tmp_path / "data")) == 1
@@ -155,3 +158,15 @@ def test_a_new_phrasing_is_added(tmp_path):
     episode = only_episode(tmp_path / "data")
     assert episode.instructions == ("press it", "push it", "tap it")
     assert int(episode.instruction[0]) == 2
+
+
+def test_a_dataset_takes_new_phrasings_in_later_sessions(tmp_path):
+    filled(recording(tmp_path / "data", "tap it")).keep()
+    filled(recording(tmp_path / "data", "hit it", task="", instructions=())).keep()
+    filled(recording(tmp_path / "data", "press it")).keep()
+    source = open_source(tmp_path / "data")
+    episodes = [source.episode(i) for i in range(len(source))]
+    said = [e.instructions[int(e.instruction[0])] for e in episodes]
+    assert said == ["tap it", "hit it", "press it"]
+    assert episodes[0].instructions == ("press it", "push it", "tap it", "hit it")
+    read(tmp_path / "data").validate()

@@ -13,9 +13,11 @@ from websockets.exceptions import ConcurrencyError
 from lorasp_jax.extras.piper import log as logs
 from lorasp_jax.extras.piper import session as sessions
 from lorasp_jax.extras.piper.asking import InThread
+from lorasp_jax.extras.piper.keys import SIGNALS
 from lorasp_jax.extras.piper.log import Log
 from lorasp_jax.extras.piper.options import stop_on_signals
-from lorasp_jax.extras.piper.session import PERIOD, Settings
+from lorasp_jax.extras.piper.session import PERIOD
+from lorasp_jax.extras.piper.settings import Settings
 from lorasp_jax.extras.serving.client import PolicyError, ServerGone
 from lorasp_jax.extras.serving.wire import FrameError
 from tests.cases import mostly_slow
@@ -139,9 +141,6 @@ def test_a_first_target_out_of_reach(bench, monkeypatch):
     assert_safe(run)
 
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-
-
 @pytest.mark.parametrize("number", mostly_slow(SIGNALS, [signal.SIGTERM]))
 def test_signals_brake_and_hold(bench, number):
     handlers = {each: signal.getsignal(each) for each in SIGNALS}
@@ -220,3 +219,39 @@ def test_asking_in_a_thread(bench):
         asker._thread.join()
         with pytest.raises(PolicyError, match="gone"):
             asker.answer()
+
+
+def test_after_an_episode_the_arm_goes_home_slowly(bench):
+    start = bench.arm.read().pose
+    run = Run(bench, Turning())
+    assert run(1.5) is None
+    moved = bench.world.pose[0] - start[0]
+    assert moved > 0.2
+    sent, begin = len(run.sent), bench.clock.now()
+    assert run.session.home(start) is None
+    assert run.said == ["moving slowly to the start pose"]
+    bench.wait(0.3)
+    np.testing.assert_allclose(bench.world.pose[:6], start[:6], atol=0.02)
+    speed = np.abs(np.diff(np.stack(run.sent[sent:])[:, 0])).max() / PERIOD
+    assert 0.1 < speed <= 0.2 + 1e-9
+    assert bench.clock.now() - begin > 1.0
+    assert_safe(run)
+
+
+@pytest.mark.parametrize("stopped", [True, False])
+def test_the_way_home_ends_where_something_prevents_it(bench, stopped):
+    start = bench.arm.read().pose
+    run = Run(bench, Turning())
+    assert run(1.5) is None
+    command, end = bench.arm.command, bench.clock.now() + 0.4
+
+    def prevent(pose):
+        command(pose)
+        if bench.clock.now() > end:
+            run.session.stop() if stopped else vars(bench.fake.faults).update(status=7)
+
+    bench.arm.command = prevent
+    problem = run.session.home(start)
+    assert (problem is None) if stopped else "collision" in problem
+    assert run.said[1:] == ["stopped" if stopped else f"holding: {problem}"]
+    assert bench.world.pose[0] > start[0] + 0.05

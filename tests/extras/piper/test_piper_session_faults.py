@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+import signal
 import types
 
 import numpy as np
@@ -11,10 +12,12 @@ from websockets.exceptions import ConcurrencyError
 from lorasp_jax.extras.piper import session as sessions
 from lorasp_jax.extras.piper.cameras import NoPicture
 from lorasp_jax.extras.piper.fake import frames
+from lorasp_jax.extras.piper.keys import SIGNALS
 from lorasp_jax.extras.piper.log import Log
-from lorasp_jax.extras.piper.options import Server
+from lorasp_jax.extras.piper.options import stop_on_signals
+from lorasp_jax.extras.piper.remote import Server
 from lorasp_jax.extras.piper.session import PERIOD
-from lorasp_jax.extras.serving.client import PolicyClient
+from lorasp_jax.extras.serving.client import PolicyClient, PolicyError
 from lorasp_jax.extras.serving.wire import FrameError
 from tests.cases import mostly_slow
 from tests.extras.piper.piper_runs import Run, Turning, assert_braked, assert_holds, assert_safe
@@ -179,6 +182,7 @@ def test_a_policy_that_raises_anything(bench, error):
 
 
 PLACES = ("look", "recorder", "log", "done")
+TRACEBACK = "Traceback (most recent call last):\n  File \"x.py\"\nKeyError: 'state'"
 CASES = [(place, error) for place in PLACES for error in (OSError, KeyboardInterrupt)]
 FAST = [*CASES[::2], ("look", KeyboardInterrupt)]
 
@@ -205,6 +209,105 @@ def test_every_other_error_brakes_and_is_raised(bench, case):
         run(30.0, work if where == "done" else lambda: False)
     assert run.said == ["holding: it broke"]
     assert_braked(run)
+
+
+@pytest.mark.parametrize("part", ["read", "line", "say"])
+def test_a_part_that_stays_broken_does_not_stop_the_brake(bench, part, monkeypatch):
+    """The bus, the disk or the screen fails in mid-motion, and all that comes after it, too."""
+    due = bench.clock.now() + 0.45
+
+    def work(*_, **__):
+        if bench.clock.now() > due:
+            raise OSError("it broke")
+        return read()
+
+    read = bench.arm.read
+    log = types.SimpleNamespace(observation=lambda *_: None, line=lambda *_, **__: None)
+    options = {"say": work} if part == "say" else {}
+    run = Run(bench, ask := Turning(), log=log, **options)
+    monkeypatch.setattr(
+        *{"read": (bench.arm, "read"), "line": (log, "line")}.get(part, (run, "x")),
+        work,
+        raising=False,
+    )
+    if part == "say":
+        run.at = {0.45: lambda: setattr(ask, "change", lambda actions: actions[:, :3])}
+    with pytest.raises(OSError, match="it broke"):
+        run(30.0)
+    assert run.session.problem
+    assert_braked(run)
+
+
+def test_the_arm_stands_still_before_anything_is_said(bench):
+    """A terminal may block, for example when its connection hangs."""
+    speeds = []
+
+    def say(_):
+        speeds.append(np.abs(run.session._governor.velocity).max())
+
+    run = Run(bench, ask := Turning(), say=say)
+    run.at = {0.3: lambda: setattr(ask, "change", lambda actions: actions[:, :3])}
+    assert "actions must be numbers" in run(1.5)
+    assert len(speeds) == 2
+    assert not any(speeds)
+    assert_braked(run)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (np.rad2deg, "joint 2 are far beyond its limits, such as 87"),
+        (lambda actions: actions + 0.9 * np.eye(7)[6], "the gripper are far beyond its limits"),
+        (lambda actions: actions + 0.01 * np.eye(7)[6], None),
+        (lambda actions: np.where(np.arange(10)[:, None] % 2, actions, 9.0), None),  # not all
+    ],
+)
+def test_wholly_clamped_chunks_are_warned_of_once(bench, change, words):
+    run = Run(bench, ask := Turning())
+    ask.change = change
+    run(1.2)
+    warnings = [text for text in run.said if text.startswith("warning")]
+    assert len(warnings) == (words is not None)
+    assert not words or words in warnings[0]
+    assert_safe(run)
+
+
+@pytest.mark.parametrize("number", mostly_slow(SIGNALS, [signal.SIGHUP]))
+def test_a_signal_brakes_also_if_the_terminal_has_gone(bench, number):
+    def say(sentence):
+        raise OSError(f"no terminal for {sentence!r}")
+
+    before = {each: signal.getsignal(each) for each in SIGNALS}
+    run = Run(bench, Turning(), say=say)
+    run.at = {0.45: lambda: signal.raise_signal(number)}
+    try:
+        stop_on_signals(run.session)
+        with pytest.raises(OSError, match="no terminal for 'stopped'"):
+            run(30.0)
+    finally:
+        for each, handler in before.items():
+            signal.signal(each, handler)
+    assert_braked(run)
+
+
+@pytest.mark.usefixtures("near_rest")
+def test_a_servers_traceback_is_one_sentence(bench):
+    def ask(observation):
+        raise PolicyError(TRACEBACK)
+
+    run = Run(bench, ask)
+    assert run(30.0) == "KeyError: 'state'"
+    assert_holds(run, "KeyError: 'state'")
+
+
+@pytest.mark.parametrize("actions", [None, "x", {"x": 1}, [[1.0], [1.0, 2.0]], [], 5, {}])
+def test_replies_of_any_type_hold(bench, actions):
+    reply = {"actions": actions} if actions != {} else {}
+    client = types.SimpleNamespace(metadata={}, infer=lambda _: reply)
+    run = Run(bench, Server(client))
+    problem = run(0.2)
+    assert "actions" in problem
+    assert_holds(run, problem)
 
 
 def test_a_closed_stdout_does_not_stop_the_brake(bench):

@@ -2,15 +2,21 @@
 
 import signal
 import socket
+import ssl
 import subprocess
 import sys
 import threading
 import time
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from websockets.datastructures import Headers
+from websockets.exceptions import InvalidMessage, InvalidStatus
+from websockets.http11 import Response
 from websockets.sync.server import serve
 
+from lorasp_jax.extras.serving import client as client_module
 from lorasp_jax.extras.serving import wire
 from lorasp_jax.extras.serving.client import PolicyClient, PolicyError, ServerGone
 from tests import ROOT
@@ -45,6 +51,86 @@ def test_waiting_for_a_server(free_port):
 def test_waiting_has_an_end(free_port):
     with pytest.raises(ServerGone, match=f"^no policy server at ws://127.0.0.1:{free_port}: "):
         PolicyClient(f"ws://127.0.0.1:{free_port}", wait=0.3)
+
+
+def untrusted(message):
+    error = ssl.SSLCertVerificationError(1, "certificate verify failed")
+    error.verify_message = message
+    return error
+
+
+REASONS = {
+    "refused": ConnectionRefusedError("refused"),
+    "two addresses": OSError("Multiple exceptions: [Errno 111] a, [Errno 111] b"),
+    "no name yet": socket.gaierror(-2, "Name or service not known"),
+    "unreachable": OSError(113, "No route to host"),
+    "no HTTP": InvalidMessage("did not receive a valid HTTP response"),
+    **{str(code): InvalidStatus(Response(code, "", Headers(), b"no")) for code in (502, 503, 504)},
+}
+LASTING = {
+    **{str(code): InvalidStatus(Response(code, "", Headers(), b"no")) for code in (401, 403, 404)},
+    "certificate": untrusted("self-signed certificate"),
+    "no encryption": ssl.SSLError(1, "wrong version number"),
+}
+
+
+@pytest.mark.parametrize("reason", REASONS.values(), ids=REASONS)
+def test_what_may_pass_is_tried_again(reason, monkeypatch):
+    """Each reason lasts for two attempts, and is told once."""
+    attempts, said = [reason, reason], []
+
+    def connect_later(*arguments, **options):
+        if attempts:
+            raise attempts.pop()
+        return connect_now(*arguments, **options)
+
+    connect_now = client_module.connect
+    monkeypatch.setattr(client_module, "connect", connect_later)
+    monkeypatch.setattr(client_module, "RETRY_EVERY", 0.01)
+    with serving(StandIn()) as server:
+        PolicyClient(server.address, wait=30, say=said.append).close()
+    assert len(said) == 1
+    assert "trying again" in said[0]
+
+
+@pytest.mark.parametrize("reason", LASTING.values(), ids=LASTING)
+def test_what_does_not_pass_is_not_waited_for(reason, monkeypatch):
+    monkeypatch.setattr(client_module, "connect", Mock(side_effect=reason))
+    start = time.monotonic()
+    with pytest.raises(ServerGone):
+        PolicyClient("wss://127.0.0.1:1", wait=30)
+    assert time.monotonic() - start < 10
+
+
+def test_a_missing_certificate_is_named(monkeypatch):
+    """Python ignores a file that does not exist."""
+    error = untrusted("unable to get local issuer certificate")
+    monkeypatch.setattr(client_module, "connect", Mock(side_effect=error))
+    for file, words in (("nowhere.pem", "nowhere.pem, which does not exist"), ("", "let SSL_C")):
+        monkeypatch.setenv("SSL_CERT_FILE", file)
+        with pytest.raises(ServerGone, match=f"local issuer certificate.*{words}"):
+            PolicyClient("wss://127.0.0.1:1")
+
+
+def test_closing_ends_a_call_of_another_thread():
+    policy = StandIn()
+    policy.gate.clear()
+    with serving(policy) as server, connect(server) as client:
+        gone = []
+
+        def ask():
+            with pytest.raises(ServerGone) as error:
+                client.infer(observation(), timeout=600)
+            gone.append(error)
+
+        thread = threading.Thread(target=ask)
+        thread.start()
+        while not policy.batches:
+            time.sleep(0.001)
+        client.close()
+        thread.join(30)
+        assert gone
+        policy.gate.set()
 
 
 def test_a_late_reply_is_never_taken_for_the_next_one():

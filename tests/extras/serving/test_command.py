@@ -1,10 +1,14 @@
 """Test the command line and what it loads."""
 
+import contextlib
 import os
 import re
 import signal
 import socket
+import subprocess
+import sys
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -17,7 +21,7 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io import native
 from lorasp_jax.extras.serving import __main__ as command
 from lorasp_jax.extras.serving import loading
-from lorasp_jax.extras.serving.client import PolicyClient
+from lorasp_jax.extras.serving.client import PolicyClient, PolicyError, ServerGone
 from lorasp_jax.peft import LoRA
 from tests import ROOT
 from tests.cases import mostly_slow
@@ -82,7 +86,7 @@ def test_checkpoints_that_do_not_say_enough(options, refusal, dummy_base):
         (["a=nowhere", "b=nothing"], "several policies must all be"),
         (["x/a", "y/a"], "different names"),
         (["a", "--host", "0.0.0.0"], "anyone who reaches 0.0.0.0"),
-        (["a", "--token-file", "nothing"], "nothing: No such file"),
+        (["a", "--token-file", "no/thing"], "no/thing: No such file"),
         (["a", "--token-file", "empty"], "empty must contain a token"),
         (["a", "--max-batch", "0"], "largest batch"),
         (["assets/pi0_nano", "--base", "x"], "--base is for runs"),
@@ -163,3 +167,54 @@ def test_serving_a_run_until_an_interrupt(run, capsys, monkeypatch, policy):
         assert found["shape"] == (4, 7)
         assert [line.split()[0] for line in lines[:-2]] == ["loading", "compiling", "ready"]
         assert re.fullmatch(rf"loading {run} with --seed \d+", lines[0])
+
+
+@pytest.mark.parametrize("before", [None, "mine"])
+def test_nobody_else_can_read_the_token(before, tmp_path, capsys):
+    path = tmp_path / "token.txt"
+    if before:
+        path.write_text(f"{before}\n")
+        path.chmod(0o644)
+    token = command._read_token(path, Console())
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert "token.txt" in capsys.readouterr().out.replace("\n", "")
+    assert token == before if before else len(token) > 30
+    assert command._read_token(path, Console()) == token
+    assert not capsys.readouterr().out
+
+
+HUNG = """
+import sys, threading
+from lorasp_jax.extras.serving import __main__ as command
+from tests.extras.serving.stand_in import StandIn
+policy = StandIn()
+policy.gate.clear()
+command.GRACE, command._load = float(sys.argv[1]), lambda *_: policy
+sys.exit(command.main(["x", "--port", "0"]))
+"""
+
+
+@pytest.mark.parametrize(("grace", "signals"), [(0.2, 1), (600, 2)])
+def test_a_hung_policy_does_not_keep_the_server_alive(grace, signals):
+    """The first signal gives it some time, the second ends the process at once."""
+    words = [sys.executable, "-c", HUNG, str(grace)]
+    pipes = {"stdout": subprocess.PIPE, "cwd": ROOT, "text": True}
+    with subprocess.Popen(words, **pipes) as process, contextlib.ExitStack() as stack:
+        stack.callback(process.kill)
+        address = process.stdout.readline().split()[-1]
+        client = stack.enter_context(PolicyClient(address, timeout=60))
+
+        def ask():
+            with contextlib.suppress(PolicyError, ServerGone):
+                client.infer(observation())
+
+        thread = threading.Thread(target=ask)
+        thread.start()
+        time.sleep(0.2)  # until the policy has the request
+        for number in range(signals):
+            process.send_signal(signal.SIGTERM)
+            if number == 0:
+                assert process.stdout.readline() == "closing connections\n"
+        assert process.wait(30) == (1 if signals == 1 else -signal.SIGTERM)
+        assert ("has not answered within" in process.stdout.read()) == (signals == 1)
+        thread.join()

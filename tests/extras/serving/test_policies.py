@@ -206,3 +206,17 @@ def test_a_prompt_table_for_other_instructions_is_the_same_as_a_new_one():
         assert other.instructions == expected.instructions
         for a, b in zip(jax.tree.leaves(other), jax.tree.leaves(expected), strict=True):
             np.testing.assert_array_equal(a, b)
+
+
+def test_a_state_that_no_demonstration_had_is_logged_once(caplog):
+    served = compiled({"a": make_policy()}, max_batch=1)
+    spec = served.spec
+    for unit in (1.0, 1.0, 60.0, 60.0):  # radians, then degrees
+        served.prepare(
+            dataclasses.replace(request(spec), state=np.full(7, unit, np.float32)), (0, 0)
+        )
+        assert len(caplog.records) == (unit > 1)
+    assert "a state is 60, but" in caplog.text
+    caplog.clear()
+    served.warm_up()
+    assert not caplog.records

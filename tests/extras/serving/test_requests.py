@@ -112,7 +112,8 @@ def test_values_of_other_types(prompt, state):
         ({"executed": 2.0}, "got 2.0"),
         ({"executed": True}, "got True"),
         ({"executed": 0, "delay": "1"}, "delay must be an integer"),
-        ({"delay": 1}, "executed must be an integer from 0 to 10, got None"),
+        ({"delay": 1}, "delay counts from executed"),
+        ({"delay": -1}, "delay must be an integer from 0 to 10, got -1"),
         ({"executed": 6, "delay": 5}, "at most 10 together"),
     ],
 )

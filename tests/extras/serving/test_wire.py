@@ -71,10 +71,7 @@ FRAMES = {
     "unused code": b"\xc1",
     "truncated": pack({"x": 1})[:-1],
     "too long": pack({"x": 1}) + b"\0",
-    "huge list": b"\xdd\xff\xff\xff\xff",
-    "huge map": b"\xdf\xff\xff\xff\xff",
     "huge bytes": b"\xc6\xff\xff\xff\xff",
-    "deep": b"\x91" * 5000,
     "key that is no text": b"\x81\xc0\x01",
     "extension": msgpack.packb(msgpack.ExtType(5, b"abc")),
     "time": msgpack.packb(msgpack.Timestamp(1)),
@@ -89,8 +86,30 @@ def test_frames_that_are_no_messages_are_refused(frame):
     assert "\n" not in str(refusal.value)
 
 
+@pytest.mark.parametrize("head", [b"\x91", b"\x81\xa1a"])
+def test_deep_frames_are_refused(head):
+    unpack(head * wire.MAX_DEPTH + b"\xc0")
+    with pytest.raises(FrameError, match="at most 16 deep"):
+        unpack(head * (wire.MAX_DEPTH + 1) + b"\xc0")
+    with pytest.raises(FrameError, match="at most 16 deep"):
+        unpack(head * 5000)
+
+
+def test_what_is_refused_is_never_built(monkeypatch):
+    """Each frame is short, and would be many objects."""
+    monkeypatch.setattr(msgpack, "unpackb", lambda *_, **__: pytest.fail("it was built"))
+    many = b"\xdc\x13\x88" + b"\x80" * 5000  # empty maps
+    few_each = b"\xdc\x04\x00" + (b"\x9f" + b"\xc0" * 15) * 1024
+    for frame in (many, few_each):
+        with pytest.raises(FrameError, match="at most 4096 values"):
+            unpack(frame, max_values=4096)
+
+
 def test_frames_of_very_many_values_are_refused():
     with pytest.raises(FrameError, match="at most 65536 values"):
         unpack(msgpack.packb([[0] * 1000] * 100))
+    for head in (b"\xdd", b"\xdf"):
+        with pytest.raises(FrameError, match="at most 65536 values"):
+            unpack(head + b"\xff" * 4)
     with pytest.raises(FrameError, match="at most 33554432 bytes"):
         unpack(bytes(wire.MAX_FRAME + 1))

@@ -1,6 +1,7 @@
 """Run a policy on the fake PiPER: `python -m lorasp_jax.extras.piper.fake --task press`."""
 
 import argparse
+import functools
 import itertools
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -13,10 +14,10 @@ from rich.console import Console
 
 from envs.rendering.video import side_by_side, write_video
 from lorasp_jax.base import compilation_cache as cache
-from lorasp_jax.base.arguments import positive
 from lorasp_jax.base.errors import run_command
 from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.extras.piper import options as shared
+from lorasp_jax.extras.piper import remote
 from lorasp_jax.extras.piper.arm import PiperArm
 from lorasp_jax.extras.piper.asking import InThread, InTurn
 from lorasp_jax.extras.piper.fake.demonstrator import Demonstrator
@@ -28,6 +29,8 @@ from lorasp_jax.extras.serving.client import ServerGone
 
 _LARGEST_LATENCY = 0.15  # s, of commands; our choice
 _VIDEO_RATE = 10  # pictures per second
+_VIDEO_HEIGHT = 256  # pixels, at least
+_FRAME, _PAUSE = 32, 1.0  # part of the height; s between two episodes
 _SETTLING = 0.3  # s, longer than a command can take
 _CHANNELS = itertools.count()  # the SDK keeps one interface per name in a process
 
@@ -51,7 +54,6 @@ def parser(program: str) -> argparse.ArgumentParser:
         "--task", default="press", help="open_pot, pick_place, pour or press (default: %(default)s)"
     )
     add("--expert", action="store_true", help="the scripted expert in place of a server")
-    add("--episodes", type=positive, default=1, help="default: %(default)s")
     add("--seed", type=int, default=0, help="of the first layout (default: %(default)s)")
     add("--latency", type=float, default=0.0, help="of commands on their way to the motors [s], "
         f"at most {_LARGEST_LATENCY} (default: %(default)s)")  # fmt: skip
@@ -61,8 +63,6 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--realtime", action="store_true", help="let time run while the policy thinks")
     add("--image-size", type=int, default=64, help="of pictures [px], for policies that do not "
         "say it (default: %(default)s)")  # fmt: skip
-    add("--record", type=Path, metavar="FOLDER", help="add the successful episodes to an RLDS "
-        "dataset, which train.py takes as --data.source")  # fmt: skip
     add("--video", type=Path, metavar="FILE", help="MP4 of what the cameras see")
     shared.add_shared(parser)
     return parser
@@ -77,15 +77,15 @@ def _run(options: argparse.Namespace, console: Console) -> None:
     shared.limits(options)
     shared.settings(options, "")
     cache.enable()
-    source = nullcontext() if options.expert else shared.policy(options)
+    source = nullcontext() if options.expert else remote.policy(options)
     with source as server, closing(shared.open_log(options)) as log:
         size = (server and server.metadata.get("image_size")) or options.image_size
         world = World(options.task, image_size=size)
         world.reset(options.seed)
         if server:
-            server.warn([options.prompt] if options.prompt else world.env.instructions)
+            server.warn(options.prompt or world.env.instructions)
         settings = {"image_size": size, "physics_dt": TIMESTEP}
-        prompt = options.prompt or task.instructions[0]
+        prompt = (options.prompt or task.instructions)[0]
         with (
             _video(options.video) as film,
             _bench(options, world) as bench,
@@ -108,10 +108,12 @@ def _episodes(
     for episode in range(options.episodes):
         bench.reset(options.seed + episode)
         log.line(bench.clock.now(), episode=episode)
-        session = _session(options, bench, server, options.seed + episode, records, console)
+        session = _session(options, bench, server, episode, records, console)
         world = bench.fake.world
         problem = session.run(limit, _judge(world, film))
         wins += world.success
+        if film:
+            film += [_framed(film[-1], world.success)] * round(_PAUSE * _VIDEO_RATE)
         if recorder and world.success:
             recorder.keep()
         elif recorder:
@@ -140,14 +142,23 @@ def _video(path: Path | None) -> Iterator[list[np.ndarray] | None]:
     finally:
         if path and film:
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_video(path, np.stack(film), _VIDEO_RATE)
+            times = 2 * -(-_VIDEO_HEIGHT // (2 * len(film[0])))  # even, as videos must be
+            write_video(path, np.stack(film), _VIDEO_RATE, times=times)
+
+
+def _framed(picture: np.ndarray, success: bool) -> np.ndarray:
+    """Return the last picture of an episode in a green frame after success, else in a red one."""
+    color = (0, 160, 0) if success else (200, 0, 0)
+    framed, edge = picture.copy(), max(1, len(picture) // _FRAME)
+    framed[:edge] = framed[-edge:] = framed[:, :edge] = framed[:, -edge:] = color
+    return framed
 
 
 def _session(
     options: argparse.Namespace,
     bench: "Bench",
     server: Any,
-    seed: int,
+    episode: int,
     records: tuple,
     console: Console,
 ) -> Session:
@@ -156,13 +167,15 @@ def _session(
     bench.arm.enable(limits)
     if server:
         server.reset()
-    ask = server or Demonstrator(world, clock, seed)
+    ask = server or Demonstrator(world, clock, options.seed + episode)
     asker = InThread(ask) if options.realtime else InTurn(ask, clock, options.thinking)
-    settings = shared.settings(options, world.instruction)
+    prompts = options.prompt or [world.instruction]
+    settings = shared.settings(options, prompts[episode % len(prompts)])
     log, recorder, _ = records
     if recorder:
         recorder.say(settings.prompt)
-    more = {"log": log, "recorder": recorder, "say": console.print}
+    say = functools.partial(console.print, markup=False, highlight=False, soft_wrap=True)
+    more = {"log": log, "recorder": recorder, "say": say}
     session = Session(bench.arm, world.images, asker, limits, settings, clock, **more)
     shared.stop_on_signals(session)
     return session

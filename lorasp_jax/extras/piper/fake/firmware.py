@@ -1,7 +1,8 @@
 """The fake arm's controller: CAN frames in, servo targets out, feedback at 200 Hz.
 
 It imitates what matters to a client: drivers that must be switched on, control modes, the speed
-percentage, the last target that stays in force, delays and noise.
+percentage, the last target that stays in force, delays and noise; and that the arm sinks after an
+emergency stop, and falls after a reset or without its drivers.
 """
 
 import threading
@@ -22,6 +23,7 @@ _FASTEST, _GRIPPER_SPEED = 3.0, 0.1  # rad/s as the firmware's default; m/s, our
 _STANDBY, _CAN, _TEACHING = 0, 1, 2
 _MIT = 0xAD
 _EMERGENCY, _GUIDED = 1, 11  # arm_status
+_STOP, _RESUME = 1, 2  # of the frame 0x150
 
 
 class FakePiper:
@@ -120,16 +122,30 @@ class FakePiper:
                 self._ctrl_mode = data[0]
             self._percent = data[2]
         elif kind == frames.ENABLE:
-            self._enabled[:] = data[1] == 0x02
+            self._switch(data[1] == 0x02)
         elif kind == frames.STOP_OR_TEACH:
             self._stop_or_teach(data)
         elif kind == frames.ASK_LIMITS and data[1] == 0x01:
             self._tell_limits(data[0])
 
+    def _switch(self, on: bool) -> None:
+        """Switch the drivers: without them the arm falls, and with them it stays where it is."""
+        if self._enabled.any() and not on:
+            self.world.support("none")
+        elif on and not self._enabled.all():
+            self.world.support("none" if self._stopped else "motors")
+            self._target, self._setpoint = self.world.pose, self.world.pose
+        self._enabled[:] = on
+
     def _stop_or_teach(self, data: bytes) -> None:
         if data[0]:
             self.unsafe.append("emergency stop or reset")
-            self._stopped = _EMERGENCY if data[0] == 1 else 0
+        if data[0] == _STOP:
+            self._stopped = _EMERGENCY
+            self.world.support("damping")  # it sinks
+        elif data[0] == _RESUME:  # which cuts the power at once
+            self._stopped, self._ctrl_mode = 0, _STANDBY
+            self._switch(False)
         if data[2] in (1, 2):
             self._ctrl_mode = _TEACHING if data[2] == 1 else _STANDBY
             self._target = self.world.pose

@@ -6,7 +6,7 @@ judge success. Physics differ from training: the engine, its time step, gains, f
 
 import functools
 import threading
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ from envs.state import Poses, State
 from envs.tasks import View
 
 _FIELDS = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "xpos", "xmat", "site_xpos")
+_SUPPORT = ("actuator_gainprm", "actuator_biasprm", "body_gravcomp", "dof_damping")
 _MATRICES = ("geom_xmat", "cam_xmat", "xmat", "site_xmat")
 
 
@@ -28,6 +29,7 @@ TIMESTEP = 0.0025
 _GAINS = 1.15  # factor on the servos' stiffness and damping
 _FRICTION = 0.9  # factor on the friction of all contacts
 _DRY_FRICTION = 0.05  # N m, friction torque in the arm's joints
+_SINKING = 10.0  # N m s, damping of the joints after an emergency stop
 
 
 class World:
@@ -65,6 +67,7 @@ class World:
         self.model.actuator_biasprm *= _GAINS
         self.model.geom_friction *= _FRICTION
         self.model.dof_frictionloss[:6] = _DRY_FRICTION
+        self._supported = {name: getattr(self.model, name).copy() for name in _SUPPORT}
         self.data = mujoco.MjData(self.model)
         self.data.qpos[:] = np.asarray(self.state.data.qpos[0])
         self.command(self.pose)
@@ -80,6 +83,16 @@ class World:
     def command(self, pose: np.ndarray) -> None:
         """Set the servos' targets [7]."""
         self.data.ctrl[:] = np.append(pose[:6], pose[6] / 2)
+
+    def support(self, by: Literal["motors", "damping", "none"]) -> None:
+        """Choose what carries the arm: its motors, or against its weight only damping, or none."""
+        with self._lock:
+            for name, value in self._supported.items():
+                getattr(self.model, name)[:] = value if by == "motors" else 0.0
+            if by == "damping":
+                self.model.dof_damping[:6] = _SINKING
+            elif by == "none":
+                self.model.dof_damping[:] = self._supported["dof_damping"]
 
     def advance(self, seconds: float) -> None:
         """Simulate a multiple of the time step."""

@@ -1,0 +1,125 @@
+"""The policy's server, as the client of an arm sees it."""
+
+import argparse
+import contextlib
+import functools
+import threading
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from lorasp_jax.base import json_values
+from lorasp_jax.extras.piper.asking import Observation
+from lorasp_jax.extras.serving.client import PolicyClient, PolicyError, ServerGone
+from lorasp_jax.extras.serving.pictures import to_square
+
+_CONTINUATION = ("executed", "delay")  # keys for servers whose chunks continue the previous one
+_WAIT = 300.0  # s to wait for a server that is still compiling
+_SCHEMA = {"robot?": str, "control_dt?": float, "action_dim?": int, "image_size?": int}
+_SCHEMA |= {"cameras?": [str], "adapters?": [str], "instructions?": {str: [str]}, "execution?": str}
+
+
+class Server:
+    """A policy server as the function that a session asks, one question at a time.
+
+    Attributes:
+        ended: why the connection has ended, in a sentence; None while it has not.
+    """
+
+    def __init__(self, client: PolicyClient, adapter: str = "") -> None:
+        """Wrap a connection; raise ValueError if the server has no adapter of this name."""
+        known = client.metadata.get("adapters") or []  # openpi's servers do not choose
+        if adapter and adapter not in known:
+            there = ", ".join(map(str, known)) or "none to choose from"
+            raise ValueError(f"the server has no adapter {adapter!r}, but {there}")
+        self._choice = {"adapter": adapter} if adapter else {}
+        trained = client.metadata.get("instructions") or {}
+        self._instructions = trained.get(adapter or next(iter(known), ""), [])
+        self._client = client
+        self._lock = threading.Lock()  # a question that nobody waits for any more may be open
+        self.ended: str | None = None
+        self._size = client.metadata.get("image_size") or 0
+        continues = (client.metadata.get("execution") or "naive") != "naive"
+        self._unknown = () if continues else _CONTINUATION
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """The server's description of its policy."""
+        return self._client.metadata
+
+    def warn(self, prompts: Sequence[str]) -> None:
+        """Warn if a prompt is new to the policy, as far as the server says what is not."""
+        known = self._instructions
+        if known and (new := [p for p in prompts if p not in known]):
+            print(
+                f"warning: the policy was not trained for {new[0]!r}, but for requests such as "
+                f"{known[0]!r}",
+                flush=True,
+            )
+
+    def reset(self) -> None:
+        """Begin an episode with the next question, once no earlier one is open."""
+        with self._lock:
+            self._client.reset()
+
+    def __call__(self, observation: Observation) -> np.ndarray:
+        """Return the server's actions [C, 7]; its pictures are resized here, so less is sent.
+
+        Raises:
+            ServerGone, PolicyError: as `PolicyClient.infer`.
+        """
+        pictures = observation["image"]
+        if self._size > 0:
+            pictures = {name: to_square(name, x, self._size) for name, x in pictures.items()}
+        known = {key: x for key, x in observation.items() if key not in self._unknown}
+        try:
+            with self._lock:
+                reply = self._client.infer({**known, **self._choice, "image": pictures})
+        except (ServerGone, PolicyError) as error:
+            self.ended = self.ended or str(error)
+            raise
+        if "actions" not in reply:
+            keys = ", ".join(map(str, reply))[:200] or "nothing"
+            raise PolicyError(f"the server's reply has no actions, only {keys}")
+        try:
+            return np.asarray(reply["actions"])
+        except ValueError as error:
+            raise PolicyError("the server's actions are lists of different lengths") from error
+
+
+@contextlib.contextmanager
+def policy(options: argparse.Namespace) -> Iterator[Server]:
+    """Connect to the server, and let an action last as long as in its policy's training.
+
+    Raises:
+        ServerGone: there is no server.
+        OSError: the token cannot be read.
+        ValueError: the policy is of another robot or of another size, or its period is not the
+            one given.
+    """
+    token = options.token_file.read_text().strip() if options.token_file else ""
+    say = functools.partial(print, flush=True)
+    with PolicyClient(options.server, token=token, wait=_WAIT, say=say) as client:
+        try:
+            json_values.check(client.metadata, _SCHEMA, nulls=True)
+        except ValueError as error:
+            raise ValueError(f"the metadata of {options.server} are malformed: {error}") from error
+        options.control_dt = _period(options, client.metadata)
+        yield Server(client, options.adapter)
+
+
+def _period(options: argparse.Namespace, metadata: dict[str, Any]) -> float | None:
+    """Return the duration of an action [s], after comparing the policy with the arm."""
+    robot, size = metadata.get("robot") or options.robot, metadata.get("action_dim") or 7
+    if robot != options.robot:
+        raise ValueError(
+            f"the policy is of the robot {robot}, not of {options.robot}: pass --robot {robot} to "
+            "run it nevertheless"
+        )
+    if size != 7:
+        raise ValueError(f"the policy's actions have {size} numbers, but a PiPER takes 7")
+    trained, given = metadata.get("control_dt"), options.control_dt
+    if trained and given and abs(trained - given) > 1e-6:
+        print(f"warning: the policy acts every {trained:g} s, not every {given:g} s", flush=True)
+    return given or trained

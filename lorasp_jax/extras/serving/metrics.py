@@ -1,0 +1,69 @@
+"""Counts and latencies as Prometheus reads them, in its text format 0.0.4."""
+
+import bisect
+from collections import defaultdict
+from collections.abc import Mapping
+
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+_BOUNDS = (
+    0.001,
+    0.002,
+    0.005,
+    0.01,
+    0.02,
+    0.05,
+    0.1,
+    0.2,
+    0.5,
+    1.0,
+    2.0,
+    5.0,
+    10.0,
+)  # s; our choice
+_GAUGES = ("open_connections",)
+
+
+class Histogram:
+    """Durations by adapter."""
+
+    def __init__(self) -> None:
+        """Begin without any."""
+        self._counts: dict[str, list[int]] = defaultdict(lambda: [0] * (len(_BOUNDS) + 1))
+        self._sums: dict[str, float] = defaultdict(float)
+
+    def observe(self, adapter: str, seconds: float) -> None:
+        """Add a duration [s]."""
+        self._counts[adapter][bisect.bisect_left(_BOUNDS, seconds)] += 1
+        self._sums[adapter] += seconds
+
+    def lines(self, name: str) -> list[str]:
+        """Return the series; buckets are cumulative."""
+        lines = [f"# TYPE {name} histogram"]
+        for adapter, counts in list(self._counts.items()):
+            label, total = f'adapter="{_escape(adapter)}"', 0
+            for bound, count in zip((*_BOUNDS, "+Inf"), list(counts), strict=True):
+                total += count
+                lines.append(f'{name}_bucket{{{label},le="{bound}"}} {total}')
+            lines.append(f"{name}_sum{{{label}}} {self._sums[adapter]:.6f}")
+            lines.append(f"{name}_count{{{label}}} {total}")
+        return lines
+
+
+def text(counts: Mapping[str, int], histograms: Mapping[str, Histogram]) -> str:
+    """Return all series of a server.
+
+    Args:
+        counts: of `PolicyServer`.
+        histograms: by what they measure, such as request_seconds.
+    """
+    lines = []
+    for name, value in list(counts.items()):
+        full = f"lorasp_jax_{name}" if name in _GAUGES else f"lorasp_jax_{name}_total"
+        lines += [f"# TYPE {full} {'gauge' if name in _GAUGES else 'counter'}", f"{full} {value}"]
+    for name, histogram in histograms.items():
+        lines += histogram.lines(f"lorasp_jax_{name}")
+    return "\n".join(lines) + "\n"
+
+
+def _escape(label: str) -> str:
+    return label.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
