@@ -129,6 +129,10 @@ def _prefix_model(model: "Backbone", once: bool) -> "Backbone":
     """Copy a model for the prefix, blocks unstacked so that an outer loop slices no weights."""
     model = nnx.merge(*nnx.split(model))
     for tower in (model.vision, model.language):
+        if isinstance(tower.blocks, nnx.List):  # a `SharedSampler`'s
+            for block in tower.blocks:
+                prepared.fuse_projections(block, copy_kernels=False)
+            continue
         if once or quantization.only_saves_memory(tower.blocks):
             tower.blocks = unstack(prepared.fuse_stack(tower.blocks))
             continue
@@ -143,7 +147,8 @@ def suffix_model(model: "Backbone") -> "Backbone":
     """Copy a model for the flow steps, with input-independent results precomputed."""
     model = nnx.merge(*nnx.split(model))
     del model.vision, model.language
-    model.action.blocks = unstack(model.action.blocks)
+    if not isinstance(model.action.blocks, nnx.List):
+        model.action.blocks = unstack(model.action.blocks)
     quantization.dequantize(model)
     for module in (model, *(module for _, module in nnx.iter_modules(model.action))):
         prepared.fuse_projections(module)

@@ -143,33 +143,68 @@ def load_policy(
         ValueError: there is no such folder, the run is not finished, its files are corrupt, there
             is no such dataset, or the base is missing or differs from the one used in training.
     """
-    folder = Path(folder)
-    metadata, path, is_full = _read_metadata(folder)
-    if dataset and dataset not in (known := datasets(metadata)):
-        names = ", ".join(known) or "all its datasets alike"
-        raise ValueError(f"the policy of {folder} acts for {names}, not for {dataset!r}")
-    try:
-        policy = metadata["policy"]
-        config = backbone.find(policy["backbone"]).from_dict(policy["config"])
-        source = folder / BASE if is_full else base or hub.resolve_portable(metadata["base"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} does not describe a policy") from error
-    if not source:
-        raise ValueError(f"the base of {folder} was randomly initialized and not saved")
-    try:
-        model = models.load(source, config)
-    except ValueError as error:
-        hint = "" if is_full else f"; pass base= if the base of {folder} has moved"
-        raise ValueError(f"{error}{hint}") from error
-    if not is_full:
-        model = native.load_adapters(folder, model, any_base=any_base)
-    model = quantized(model, metadata.get(QUANTIZED))
-    try:
-        if dataset:
-            policy = policy | policy["datasets"][dataset]
-        return Policy(model, _processor(policy, config, words))
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"{path} does not describe a policy") from error
+    recorded = RecordedPolicy.read(folder, base=base, dataset=dataset)
+    model = recorded.load_base()
+    if not recorded.is_full:
+        model = native.load_adapters(recorded.folder, model, any_base=any_base)
+    return Policy(quantized(model, recorded.quantized), recorded.processor(words))
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordedPolicy:
+    """What the files of a finished run say of its policy.
+
+    Attributes:
+        folder: of the run.
+        source: location of the base.
+        config: of the model.
+        is_full: whether the run trained its base, which is then in its folder.
+        quantized: how the base is quantized after loading, or None.
+        fields: what the processor is made of.
+    """
+
+    folder: Path
+    source: str | Path
+    config: Any
+    is_full: bool
+    quantized: Kind | None
+    fields: Mapping[str, Any] = dataclasses.field(repr=False)
+
+    @classmethod
+    def read(
+        cls, folder: str | os.PathLike[str], *, base: str = "", dataset: str = ""
+    ) -> "RecordedPolicy":
+        """Read a run's files; arguments and errors are those of `load_policy`."""
+        folder = Path(folder)
+        metadata, path, is_full = _read_metadata(folder)
+        if dataset and dataset not in (known := datasets(metadata)):
+            names = ", ".join(known) or "all its datasets alike"
+            raise ValueError(f"the policy of {folder} acts for {names}, not for {dataset!r}")
+        try:
+            policy = metadata["policy"]
+            config = backbone.find(policy["backbone"]).from_dict(policy["config"])
+            source = folder / BASE if is_full else base or hub.resolve_portable(metadata["base"])
+            policy = policy | (policy["datasets"][dataset] if dataset else {})
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{path} does not describe a policy") from error
+        if not source:
+            raise ValueError(f"the base of {folder} was randomly initialized and not saved")
+        return cls(folder, source, config, is_full, metadata.get(QUANTIZED), policy)
+
+    def load_base(self) -> Any:
+        """Load the base, not yet quantized."""
+        try:
+            return models.load(self.source, self.config)
+        except ValueError as error:
+            hint = "" if self.is_full else f"; pass base= if the base of {self.folder} has moved"
+            raise ValueError(f"{error}{hint}") from error
+
+    def processor(self, words: str = "") -> Processor:
+        """Make the processor; `words` is the location of the tokenizer, or "" as recorded."""
+        try:
+            return _processor(self.fields, self.config, words)
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"the files of {self.folder} do not describe a policy") from error
 
 
 def describe(folder: str | os.PathLike[str]) -> dict[str, Any]:
