@@ -58,10 +58,18 @@ class SharedSampler:
         sampler = Sampler.from_model(self._model(), once=True)
         return sampler.sample_actions(key, obs, **options)
 
+    def array(self, name: str) -> jax.Array:
+        """Return an array of the model by its name."""
+        pairs = zip(self.structure.names, self._leaves(), strict=True)
+        return next(array for known, array in pairs if known == name)
+
     def _model(self) -> Any:
-        base, own = iter(self.base), iter(self.own)
-        leaves = [next(own if mine else base) for mine in self.structure.own]
+        leaves = self._leaves()
         return nnx.merge(self.structure.graphdef, jax.tree.unflatten(self.structure.tree, leaves))
+
+    def _leaves(self) -> list[Any]:
+        base, own = iter(self.base), iter(self.own)
+        return [next(own if mine else base) for mine in self.structure.own]
 
 
 class SharedBase:
@@ -72,9 +80,7 @@ class SharedBase:
         fingerprints: of the weights before they were quantized, to compare with an adapter's.
     """
 
-    def __init__(
-        self, model: Any, quantize: Callable[[Any], Any] = lambda model: model
-    ) -> None:
+    def __init__(self, model: Any, quantize: Callable[[Any], Any] = lambda model: model) -> None:
         """Take the weights of a model.
 
         Args:

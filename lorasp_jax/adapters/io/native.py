@@ -148,7 +148,7 @@ def load_adapters(
 
 def read_adapters(
     folder: str | os.PathLike[str],
-    model: adaptation.Model,
+    model: nnx.Module,
     fingerprints: Mapping[str, str],
     *,
     any_base: bool = False,
@@ -225,7 +225,7 @@ def _adapt_as_saved(
 
 
 def _fitting_leaves(
-    model: adaptation.Model,
+    model: nnx.Module,
     methods: Mapping[str, Method],
     tensors: Mapping[str, np.ndarray],
     folder: pathlib.Path,

@@ -5,7 +5,7 @@ fixed sizes, compiled in advance; missing rows are copies of the first.
 
 A lone request never waits. After a batch, the worker waits until the clients of that batch have
 sent their next requests, at most `WAIT` seconds: clients that ask again at once, each as fast as it
-can, so share batches instead of taking turns.
+can, so share batches instead of taking turns. Every adapter has its own batches.
 """
 
 import asyncio
@@ -35,7 +35,7 @@ class PolicyFailure(RuntimeError):
 @dataclass(eq=False)
 class _Job:
     client: int
-    adapter: str
+    adapter: Any
     row: Any
     future: Future[tuple[np.ndarray, float]] = field(default_factory=Future)
 
@@ -54,11 +54,12 @@ class Batcher:
         self._queue: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         self._pending: list[_Job] = []
         self._awaited: set[int] = set()
+        self._last: Any = None  # adapter of the previous batch
         self._finished = 0.0
         self._thread = threading.Thread(target=self._work, name="policy", daemon=True)
         self._thread.start()
 
-    async def infer(self, client: int, adapter: str, row: Any) -> tuple[np.ndarray, float]:
+    async def infer(self, client: int, adapter: Any, row: Any) -> tuple[np.ndarray, float]:
         """Run one row, in a batch with others.
 
         Returns:
@@ -82,6 +83,7 @@ class Batcher:
             if batch:
                 self._run(batch)
                 self._awaited = {job.client for job in batch}
+                self._last = batch[0].adapter
                 self._finished = time.monotonic()
         for job in self._pending:
             job.future.cancel()
@@ -103,7 +105,8 @@ class Batcher:
         """Return how long to wait for a further job; None: as long as it takes."""
         if not self._pending:
             return None
-        if not self._awaited or len(self._pending) >= self._policy.sizes[-1]:
+        other = self._pending[0].adapter != self._last  # which no awaited request can join
+        if other or not self._awaited or len(self._pending) >= self._policy.sizes[-1]:
             return 0
         return max(0.0, self._finished + WAIT - time.monotonic())
 

@@ -17,7 +17,7 @@ import logging
 import socket
 import time
 from collections import Counter
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +29,7 @@ from websockets.http11 import Request as HttpRequest
 from websockets.http11 import Response
 
 import lorasp_jax
-from lorasp_jax.extras.serving import wire
+from lorasp_jax.extras.serving import posting, wire
 from lorasp_jax.extras.serving.batching import Batcher, PolicyFailure
 from lorasp_jax.extras.serving.requests import Request, parse
 
@@ -90,7 +90,7 @@ class PolicyServer:
         self.counts: Counter[str] = Counter(dict.fromkeys(names, 0))
         self._policy, self._token = policy, token
         self._batcher = Batcher(policy, self.counts)
-        self._metadata = wire.pack(describe(policy))
+        self._adapters = posting.Adapters(policy)
         self._clients = itertools.count()
 
     @contextlib.asynccontextmanager
@@ -105,6 +105,7 @@ class PolicyServer:
             max_size=wire.MAX_FRAME,
             max_queue=1,
             close_timeout=2,
+            create_connection=posting.Connection,
         ) as server:
             yield server
 
@@ -114,8 +115,12 @@ class PolicyServer:
 
     def _process_request(
         self, connection: ServerConnection, request: HttpRequest
-    ) -> Response | None:
+    ) -> Response | Awaitable[Response] | None:
         """Answer pages, and refuse connections without the token or beyond the limit."""
+        posted = connection.body if isinstance(connection, posting.Connection) else None
+        if posted is not None and request.path != "/adapters":
+            text = "POST is for /adapters\n"
+            return connection.respond(http.HTTPStatus.METHOD_NOT_ALLOWED, text)
         if request.path == "/healthz":
             return connection.respond(http.HTTPStatus.OK, "OK\n")
         given = request.headers.get("Authorization", "").removeprefix("Api-Key ")
@@ -124,17 +129,30 @@ class PolicyServer:
             return connection.respond(http.HTTPStatus.UNAUTHORIZED, text)
         if request.path == "/status":
             return connection.respond(http.HTTPStatus.OK, json.dumps(self.counts) + "\n")
+        if request.path == "/metrics":
+            return connection.respond(http.HTTPStatus.OK, self._policy.series())
+        if request.path == "/adapters":
+            return self._change_adapters(connection, posted)
         if self.counts["open_connections"] >= MAX_CLIENTS:
             text = f"this server has its maximum of {MAX_CLIENTS} connections\n"
             return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, text)
         return None
+
+    async def _change_adapters(self, connection: ServerConnection, body: bytes | None) -> Response:
+        """Answer a GET or POST of /adapters."""
+        if body is None:
+            return connection.respond(http.HTTPStatus.OK, self._adapters.listed())
+        if not self._token:
+            text = "adapters are changed only with a token: start the server with --token-file\n"
+            return connection.respond(http.HTTPStatus.FORBIDDEN, text)
+        return connection.respond(*await self._adapters.change(body))
 
     async def _handle(self, connection: ServerConnection) -> None:
         """Serve one connection until it closes."""
         client = ClientState(next(self._clients))
         self.counts.update(("connections", "open_connections"))
         try:
-            await connection.send(self._metadata)
+            await connection.send(wire.pack(describe(self._policy)))
             async for frame in connection:
                 await self._answer(connection, client, frame)
         except ConnectionClosed:
@@ -169,14 +187,11 @@ class PolicyServer:
         client.previous_ms = (time.perf_counter() - start) * 1e3
         self.counts["requests"] += 1
 
-    def _read(self, client: ClientState, frame: bytes) -> tuple[str, Any, int | None]:
-        """Return the adapter's name, the row and the number of action dimensions."""
+    def _read(self, client: ClientState, frame: bytes) -> tuple[Any, Any, int | None]:
+        """Return the adapter, the row and the number of action dimensions."""
         request = parse(wire.unpack(frame), self._policy.spec)
-        adapters = list(self._policy.instructions)
-        adapter = request.adapter or adapters[0]
-        if adapter not in adapters:
-            raise ValueError(f"adapter must be one of {', '.join(adapters)}, got {adapter!r}")
-        row = self._policy.prepare(*client.advance(request))
+        adapter = self._policy.route(request)
+        row = self._policy.prepare(adapter, *client.advance(request))
         return adapter, row, request.actions
 
     async def _refuse(self, connection: ServerConnection, sentence: str) -> None:
