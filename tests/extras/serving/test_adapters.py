@@ -215,7 +215,7 @@ def test_a_bundle_holds_the_base_once_and_acts_alike(served, runs, tmp_path, cap
     alone = exported.load(out / "pour")
     assert alone.instructions == TEXTS["pour"]
     (out / "base.safetensors").write_bytes(b"x" + (out / "base.safetensors").read_bytes()[1:])
-    with pytest.raises(ValueError, match="base.* is missing or damaged"):
+    with pytest.raises(ValueError, match=r"base.* is missing or damaged"):
         exported.load_bundle(out)
 
 

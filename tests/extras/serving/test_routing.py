@@ -143,5 +143,5 @@ def test_a_request_finds_its_adapter(mode, finished, tmp_path):
         assert route("open the pot") == "press"
         return
     assert route("open the pot") == "open"
-    with pytest.raises(ValueError, match="no adapter is for 'dance': .*; name the adapter"):
+    with pytest.raises(ValueError, match=r"no adapter is for 'dance': .*; name the adapter"):
         route("dance")
