@@ -46,16 +46,19 @@ class SharedSampler:
     Attributes:
         base: the base's arrays, which other samplers use too.
         own: the adapter's arrays, in host memory unless the caller moves them.
+        fuse: whether a call fuses the kernels of the flow steps with the adapter. Without, `own`
+            may differ between the rows of a `jax.vmap` that does not map `base`.
     """
 
     base: list[jax.Array]
     own: list[Any]
     structure: _Structure = dataclasses.field(metadata={"static": True})
     config: BackboneConfig = dataclasses.field(metadata={"static": True})
+    fuse: bool = dataclasses.field(default=True, metadata={"static": True})
 
     def sample_actions(self, key: jax.Array, obs: Observation, **options: Any) -> Any:
         """Sample action chunks; see `Sampler.sample_actions` for the arguments."""
-        sampler = Sampler.from_model(self._model(), once=True)
+        sampler = Sampler.from_model(self._model(), once=True, fuse=self.fuse)
         return sampler.sample_actions(key, obs, **options)
 
     def array(self, name: str) -> jax.Array:
@@ -91,6 +94,7 @@ class SharedBase:
         self.fingerprints = native.base_fingerprints(model)
         self._quantize = quantize
         self._bare = nnx.eval_shape(lambda: self.config.create(nnx.Rngs(0)))
+        self._shapes: dict[Any, Any] = {frozenset(): self._bare}
         self._structures: dict[Any, _Structure] = {}
         stacked = by_path(nnx.to_pure_dict(nnx.state(quantize(model))))
         self._arrays: dict[str, jax.Array] = {
@@ -112,7 +116,7 @@ class SharedBase:
     def read(self, folder: Any, *, any_base: bool = False) -> SharedSampler:
         """Attach the adapters of a folder; errors are those of `native.read_adapters`."""
         return self.attach(
-            *native.read_adapters(folder, self._bare, self.fingerprints, any_base=any_base)
+            *native.read_adapters(folder, self._adapted, self.fingerprints, any_base=any_base)
         )
 
     def attach(
@@ -139,12 +143,18 @@ class SharedBase:
         own = {n: np.asarray(a) for n, a in arrays.items() if base.get(n) is not a}
         return self.attach(adaptation.methods(model), own)
 
+    def _adapted(self, methods: Mapping[str, Method]) -> Any:
+        """Return the shapes of the adapted model."""
+        key = frozenset(methods.items())
+        if key not in self._shapes:
+            self._shapes[key] = native.abstract_adapted(self._bare, methods)
+        return self._shapes[key]
+
     def _structure(self, methods: Mapping[str, Method], own: Any) -> _Structure:
         """Return the structure of the adapted model, the same object for equal adapters."""
         key = frozenset(methods.items()), frozenset(own)
         if key not in self._structures:
-            adapted = native.abstract_adapted(self._bare, methods) if methods else self._bare
-            graphdef, state = nnx.split(adapted)
+            graphdef, state = nnx.split(self._adapted(methods))
             prepare = lambda state: unstacked(self._quantize(nnx.merge(graphdef, state)))  # noqa: E731
             graphdef, state = nnx.split(nnx.eval_shape(prepare, state))
             names = tuple(by_path(nnx.to_pure_dict(state)))

@@ -10,7 +10,7 @@ import json
 import os
 import pathlib
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -148,7 +148,7 @@ def load_adapters(
 
 def read_adapters(
     folder: str | os.PathLike[str],
-    model: nnx.Module,
+    adapted: Callable[[Mapping[str, Method]], nnx.Module],
     fingerprints: Mapping[str, str],
     *,
     any_base: bool = False,
@@ -157,7 +157,7 @@ def read_adapters(
 
     Args:
         folder: written by `save_adapters`.
-        model: the bare model, of shapes (`nnx.eval_shape`).
+        adapted: returns `abstract_adapted` of the model.
         fingerprints: from `base_fingerprints` of the model with its weights.
         any_base: whether to skip the base check; see `load_adapters`.
 
@@ -176,7 +176,7 @@ def read_adapters(
         if not description["weights"].keys() & fingerprints.keys():
             raise ValueError(f"{folder} has no fingerprints of its base; any_base=True loads it")
         _check_weights(fingerprints, description["weights"], folder)
-    expected = _fitting_leaves(model, methods, tensors, folder)
+    expected = _fitting_leaves(lambda: adapted(methods), methods, tensors, folder)
     return methods, {n: np.asarray(tensors[n], leaf.dtype) for n, leaf in expected.items()}
 
 
@@ -220,20 +220,20 @@ def _adapt_as_saved(
 
     Shapes are checked first, since a damaged or malicious file could request too much memory.
     """
-    _fitting_leaves(model, methods, tensors, folder, einsums)
+    adapted = lambda: abstract_adapted(model, methods, einsums)  # noqa: E731
+    _fitting_leaves(adapted, methods, tensors, folder)
     return _adapted(model, methods, einsums)
 
 
 def _fitting_leaves(
-    model: nnx.Module,
+    adapted: Callable[[], nnx.Module],
     methods: Mapping[str, Method],
     tensors: Mapping[str, np.ndarray],
     folder: pathlib.Path,
-    einsums: nnx_layers.Einsums = MappingProxyType({}),
 ) -> dict[str, Any]:
-    """Return `_matched_leaves` of the bare model when it is adapted."""
+    """Return `_matched_leaves` of the shapes of the adapted model."""
     with paths.naming("fit to the model the adapters in", folder):
-        adapters = adaptation.split(abstract_adapted(model, methods, einsums))[1]
+        adapters = adaptation.split(adapted())[1]
     return _matched_leaves(adapters, tensors, methods, folder)
 
 

@@ -128,7 +128,7 @@ class Swaps:
         rng = random.Random(self.seed)
         while any_alive():
             name = rng.choice(NAMES[1:])
-            version = rng.choice([*range(VERSIONS), None])
+            version = rng.choice([*range(VERSIONS), *range(VERSIONS), None])
             values = {"name": name, "path": self.paths.get((name, version))}
             present = self.swapped.spans[name][-1][0] is not None
             if version is None:
@@ -145,7 +145,7 @@ class Swaps:
                 used = sum(array.nbytes for array in jax.live_arrays())
                 resident = psutil.Process().memory_info().rss
                 self.memory.append((self.counts["answers"], used, resident))
-            time.sleep(0.01)
+            time.sleep(0.05)
 
 
 def swaps(source, folder, total, patch):
