@@ -34,8 +34,8 @@ class _Structure(NamedTuple):
     tree: Any
     names: tuple[str, ...]
     """Name of each array."""
-    own: tuple[bool, ...]
-    """Whether it is the adapter's."""
+    own: tuple[tuple[int, int | None] | None, ...]
+    """Its place among the adapter's arrays, and its layer in a stacked one; None: the base's."""
 
 
 @jax.tree_util.register_dataclass
@@ -45,7 +45,8 @@ class SharedSampler:
 
     Attributes:
         base: the base's arrays, which other samplers use too.
-        own: the adapter's arrays, in host memory unless the caller moves them.
+        own: the adapter's arrays, still stacked over layers: fewer arrays take less time to pass.
+            They are in host memory unless the caller moves them.
         fuse: whether a call fuses the kernels of the flow steps with the adapter. Without, `own`
             may differ between the rows of a `jax.vmap` that does not map `base`.
     """
@@ -71,8 +72,14 @@ class SharedSampler:
         return nnx.merge(self.structure.graphdef, jax.tree.unflatten(self.structure.tree, leaves))
 
     def _leaves(self) -> list[Any]:
-        base, own = iter(self.base), iter(self.own)
-        return [next(own if mine else base) for mine in self.structure.own]
+        base, leaves = iter(self.base), []
+        for place in self.structure.own:
+            if place is None:
+                leaves.append(next(base))
+            else:
+                array, layer = self.own[place[0]], place[1]
+                leaves.append(array if layer is None else array[layer])
+        return leaves
 
 
 class SharedBase:
@@ -129,13 +136,10 @@ class SharedBase:
             arrays: the adapter's, by name; stacked layers have leading axes. One with the name of
                 an array of the base replaces it.
         """
-        own = {n: a for name, array in arrays.items() for n, a in _by_layer(name, array).items()}
-        structure = self._structure(methods, own.keys())
-        pairs = list(zip(structure.names, structure.own, strict=True))
-        base = [self._arrays[name] for name, mine in pairs if not mine]
-        return SharedSampler(
-            base, [own[name] for name, mine in pairs if mine], structure, self.config
-        )
+        structure = self._structure(methods, arrays)
+        pairs = zip(structure.names, structure.own, strict=True)
+        base = [self._arrays[name] for name, place in pairs if place is None]
+        return SharedSampler(base, [*arrays.values()], structure, self.config)
 
     def attach_model(self, model: Any, bare: Any) -> SharedSampler:
         """Return a sampler for a model that was adapted from `bare`, from which this base is."""
@@ -150,16 +154,23 @@ class SharedBase:
             self._shapes[key] = native.abstract_adapted(self._bare, methods)
         return self._shapes[key]
 
-    def _structure(self, methods: Mapping[str, Method], own: Any) -> _Structure:
+    def _structure(
+        self, methods: Mapping[str, Method], arrays: Mapping[str, np.ndarray]
+    ) -> _Structure:
         """Return the structure of the adapted model, the same object for equal adapters."""
-        key = frozenset(methods.items()), frozenset(own)
+        key = frozenset(methods.items()), tuple(arrays)
         if key not in self._structures:
             graphdef, state = nnx.split(self._adapted(methods))
             prepare = lambda state: unstacked(self._quantize(nnx.merge(graphdef, state)))  # noqa: E731
             graphdef, state = nnx.split(nnx.eval_shape(prepare, state))
             names = tuple(by_path(nnx.to_pure_dict(state)))
-            mine = tuple(name in own for name in names)
-            self._structures[key] = _Structure(graphdef, jax.tree.structure(state), names, mine)
+            places: dict[str, tuple[int, int | None]] = {}
+            for k, (name, array) in enumerate(arrays.items()):
+                parts = _by_layer(name, array)
+                stacked = [*parts] != [name]
+                places |= {n: (k, i if stacked else None) for i, n in enumerate(parts)}
+            own = tuple(map(places.get, names))
+            self._structures[key] = _Structure(graphdef, jax.tree.structure(state), names, own)
         return self._structures[key]
 
 

@@ -206,7 +206,8 @@ def _names(policy: Policy, count: int) -> list[str]:
     if not isinstance(policy.model, SharedSampler):
         return numbered
     structure = policy.model.structure
-    base = [f"base/{n}" for n, own in zip(structure.names, structure.own, strict=True) if not own]
+    pairs = zip(structure.names, structure.own, strict=True)
+    base = [f"base/{name}" for name, own in pairs if own is None]
     return [*base, *numbered[len(base) :]]
 
 
