@@ -37,7 +37,10 @@ class Holder:
 
 
 def sizes(config: Any, rules: Any) -> tuple[int, int]:
-    """Return the memory of base and adapter [bytes], from shapes."""
+    """Return the memory of base and adapter [bytes], from shapes, as files hold them.
+
+    On a base, an adapter's factors have the dtype of the products: half as much in bf16.
+    """
     build = lambda: adapt(config.create(nnx.Rngs(0)), rules, rngs=nnx.Rngs(1))  # noqa: E731
     _, adapters, frozen = adaptation.split(nnx.eval_shape(build))
     total = lambda tree: sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(tree))  # noqa: E731

@@ -25,6 +25,9 @@ from lorasp_jax.peft import Method
 
 _STACK = "/blocks/"
 """In the name of an array that is stacked over layers."""
+_TOWERS = ("vision/", "language/", "action/")
+_FACTORS = ("lora_a", "lora_b", "u", "v")
+"""Names of the factors of a low-rank adapter."""
 
 
 class _Structure(NamedTuple):
@@ -136,6 +139,7 @@ class SharedBase:
             arrays: the adapter's, by name; stacked layers have leading axes. One with the name of
                 an array of the base replaces it.
         """
+        arrays = self._rounded(methods, arrays)
         structure = self._structure(methods, arrays)
         pairs = zip(structure.names, structure.own, strict=True)
         base = [self._arrays[name] for name, place in pairs if place is None]
@@ -146,6 +150,26 @@ class SharedBase:
         base, arrays = (by_path(nnx.to_pure_dict(nnx.state(each))) for each in (bare, model))
         own = {n: np.asarray(a) for n, a in arrays.items() if base.get(n) is not a}
         return self.attach(adaptation.methods(model), own)
+
+    def _rounded(
+        self, methods: Mapping[str, Method], arrays: Mapping[str, np.ndarray]
+    ) -> dict[str, np.ndarray]:
+        """Round the factors of low-rank adapters to the dtype in which a sampler multiplies them.
+
+        That of layers outside the towers is fp32.
+        """
+        names = {
+            name
+            for path, method in methods.items()
+            for name in arrays
+            if name.startswith(f"{path}/adapter/")
+            and path.startswith(_TOWERS)
+            and name.rpartition("/")[2] in _FACTORS
+            and method.is_low_rank_sum
+            and not method.down_in_fp32
+        }
+        dtype = jnp.dtype(self.config.dtype)
+        return {n: a.astype(dtype) if n in names else a for n, a in arrays.items()}
 
     def _adapted(self, methods: Mapping[str, Method]) -> Any:
         """Return the shapes of the adapted model."""
