@@ -113,15 +113,11 @@ class SharedBase:
             for name, part in _by_layer(whole, array).items()
         }
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of the base [bytes]."""
-        return sum(array.nbytes for array in self._arrays.values())
-
     def matches(self, fingerprints: Mapping[str, str]) -> bool:
         """Whether an adapter with these fingerprints was trained on this base."""
         common = self.fingerprints.keys() & fingerprints.keys()
-        return all(self.fingerprints[name] == fingerprints[name] for name in common)
+        same = all(self.fingerprints[name] == fingerprints[name] for name in common)
+        return bool(common) and same
 
     def read(self, folder: Any, *, any_base: bool = False) -> SharedSampler:
         """Attach the adapters of a folder; errors are those of `native.read_adapters`."""

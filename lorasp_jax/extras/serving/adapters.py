@@ -79,10 +79,14 @@ class Bases:
         if recorded.is_full:
             raise ValueError(f"{folder} trained its base, so it cannot share one")
         saved, kind = native.read_description(folder)["weights"], recorded.quantized
-        for config, quantization, base in self._bases:
-            same = (config, quantization) == (recorded.config, kind)
-            if same and (self._any_base or base.matches(saved)):
-                return base.read(folder, any_base=self._any_base)
+        if not saved and not self._any_base:
+            raise ValueError(f"{folder} has no fingerprints of its base: --any-base accepts it")
+        fitting = [b for config, q, b in self._bases if (config, q) == (recorded.config, kind)]
+        known = [base for base in fitting if base.matches(saved)]
+        if self._any_base and not load:
+            known = known or fitting
+        if known:
+            return known[0].read(folder, any_base=self._any_base)
         if not load:
             raise ValueError(
                 f"{folder} was trained on another base than those of this server, or with another "

@@ -277,7 +277,9 @@ def load_bundle(folder: str | os.PathLike[str]) -> dict[str, ExportedPolicy]:
     """
     reader, path = _Reader(), Path(folder) / BUNDLE
     try:
-        names = [name for name in json.loads(path.read_bytes()) if _NAME.fullmatch(name)]
+        names = json.loads(path.read_bytes())
+        if not names or not all(map(_NAME.fullmatch, names)):
+            raise ValueError
     except (OSError, ValueError, TypeError, RecursionError) as error:
         raise ValueError(f"{path} is missing or damaged: {_REMEDY}") from error
     return {name: reader.policy(Path(folder) / name) for name in names}

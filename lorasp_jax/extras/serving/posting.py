@@ -78,6 +78,8 @@ class Adapters:
             call, said = self._parse(body)
         except ValueError as error:
             return http.HTTPStatus.BAD_REQUEST, f"{error}\n"
+        if self._loading:  # a thread each would leave none to read requests
+            return http.HTTPStatus.CONFLICT, "another adapter is loading: try again later\n"
         task = asyncio.create_task(self._run(call, said))
         self._loading.add(task)
         task.add_done_callback(self._loading.discard)

@@ -166,8 +166,10 @@ class ServedPolicies:
             ValueError: there is no such adapter, or the instruction is not clearly of one.
         """
         prompt, known = request.prompt or self._prompt, self.instructions
-        if request.adapter or self._route == "name" or not prompt:
+        if request.adapter or self._route == "name":
             return self._find(request.adapter or self._default)
+        if not prompt:
+            raise ValueError("the request must contain a prompt, or name an adapter")
         if name := routing.exact(prompt, known):
             return self._find(name)
         said = f"{', '.join(known)} were trained for others"
