@@ -17,12 +17,12 @@ from lorasp_jax.models.checkpoints.native import by_path
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.shared_base import SharedBase
 from lorasp_jax.models.smolvla import SmolVLAConfig
-from lorasp_jax.peft import DoRA, FullFineTuning, LoRA, LoRASP, Method
+from lorasp_jax.peft import DoRA, FullFineTuning, LoRA, LoRASP
 from lorasp_jax.training.base import quantized
 from tests.cases import mostly_slow
 from tests.models.random_models import observation, random_backbone, with_noise
 
-METHODS: dict[str, list[tuple[str, Method | None]]] = {
+METHODS = {
     "LoRA, norms in full": [("norm$", FullFineTuning()), *presets.rules("openpi", LoRA(rank=4))],
     "LoRA-SP": presets.rules("expert-only", LoRASP(rank=8)),
     "DoRA": presets.rules("language", DoRA(rank=4)),
