@@ -39,9 +39,14 @@ class Waiting(ServedPolicies):
         self.spec, self._seconds = PolicySpec(names, image_size, 7, 50), seconds
         self.instructions = {"base": ()}
 
-    def prepare(self, request: Request, index: tuple[int, int]) -> np.ndarray:
+    def route(self, request: Request) -> str:
+        """Return the only adapter."""
+        del request
+        return "base"
+
+    def prepare(self, adapter: str, request: Request, index: tuple[int, int]) -> np.ndarray:
         """Return the state."""
-        del index
+        del adapter, index
         return request.state
 
     def run(self, adapter: str, rows: Sequence[np.ndarray]) -> np.ndarray:

@@ -2,6 +2,10 @@
 
 import argparse
 import re
+from pathlib import Path
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+"""Names that are also names of folders."""
 
 
 def positive(text: str) -> int:
@@ -30,3 +34,10 @@ def pair(text: str) -> tuple[str, str]:
     if not (name and equals and value):
         raise argparse.ArgumentTypeError(f"must be NAME=VALUE, got {text!r}")
     return name, value
+
+
+def named(text: str) -> tuple[str, str]:
+    """Parse [NAME=]PATH; without a name, the last part of the path is the name."""
+    if "=" not in text or Path(text).exists():  # a path may contain the character
+        return Path(text).name, text
+    return pair(text)

@@ -44,15 +44,16 @@ class Sampler:
     """Distinct adapter methods of the backbone."""
 
     @classmethod
-    def from_model(cls, model: "Backbone", *, once: bool = False) -> Self:
+    def from_model(cls, model: "Backbone", *, once: bool = False, fuse: bool = True) -> Self:
         """Create a sampler; the backbone is not modified.
 
         Args:
             model: the backbone.
             once: the sampler is used only once. The prefix then uses the kernels as they are:
                 copying them would take longer than it saves.
+            fuse: the flow steps use kernels fused with adapters, which copies them.
         """
-        models = (_prefix_model(model, once), suffix_model(model))
+        models = (_prefix_model(model, once), suffix_model(model, fuse=fuse))
         graphdefs, states = zip(*map(nnx.split, models), strict=True)
         weights, tree = jax.tree.flatten(states)
         methods = dict.fromkeys(adaptation.methods(model).values())
@@ -133,6 +134,10 @@ def _prefix_model(model: "Backbone", once: bool) -> "Backbone":
     """Copy a model for the prefix, blocks unstacked so that an outer loop slices no weights."""
     model = nnx.merge(*nnx.split(model))
     for tower in (model.vision, model.language):
+        if isinstance(tower.blocks, nnx.List):  # a `SharedSampler`'s
+            for block in tower.blocks:
+                prepared.fuse_projections(block, copy_kernels=False)
+            continue
         if once or quantization.only_saves_memory(tower.blocks):
             tower.blocks = unstack(prepared.fuse_stack(tower.blocks))
             continue
@@ -143,12 +148,13 @@ def _prefix_model(model: "Backbone", once: bool) -> "Backbone":
     return model
 
 
-def suffix_model(model: "Backbone") -> "Backbone":
+def suffix_model(model: "Backbone", *, fuse: bool = True) -> "Backbone":
     """Copy a model for the flow steps, with input-independent results precomputed."""
     model = nnx.merge(*nnx.split(model))
     del model.vision, model.language
-    model.action.blocks = unstack(model.action.blocks)
+    if not isinstance(model.action.blocks, nnx.List):
+        model.action.blocks = unstack(model.action.blocks)
     quantization.dequantize(model)
     for module in (model, *(module for _, module in nnx.iter_modules(model.action))):
-        prepared.fuse_projections(module)
+        prepared.fuse_projections(module, copy_kernels=fuse)
     return model

@@ -8,6 +8,7 @@ import jax
 
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.sampling import Sampler
+from lorasp_jax.models.shared_base import SharedSampler
 from lorasp_jax.models.transformer.layers import ModelAux
 from lorasp_jax.policies.processor import Processor, RawObservation
 
@@ -32,7 +33,7 @@ class Policy:
 
         Call it before a `jax.lax` loop, since XLA does not guarantee to hoist these computations.
         """
-        if isinstance(self.model, Sampler):
+        if isinstance(self.model, (Sampler, SharedSampler)):
             return self
         return dataclasses.replace(self, model=_sampler(self.model))
 

@@ -19,7 +19,6 @@ from lorasp_jax.adapters.io import native
 from lorasp_jax.base import hub
 from lorasp_jax.base.digest import digest
 from lorasp_jax.models import backbone
-from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.policies import tokenizer
 from lorasp_jax.policies.policy import Policy
@@ -146,43 +145,71 @@ def load_policy(
         ValueError: there is no such folder, the run is not finished, its files are corrupt, there
             is no such dataset, or the base is missing or differs from the one used in training.
     """
-    folder = Path(folder)
-    metadata, path, is_full = _read_metadata(folder)
-    if dataset and dataset not in (known := datasets(metadata)):
-        names = ", ".join(known) or "all its datasets alike"
-        raise ValueError(f"the policy of {folder} acts for {names}, not for {dataset!r}")
-    try:
-        policy = metadata["policy"]
-        if dataset:
-            policy = policy | policy["datasets"][dataset]
-        config = _config(policy)
-        source = folder / BASE if is_full else base or hub.resolve_portable(metadata["base"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} does not describe a policy") from error
-    kind = metadata.get(QUANTIZED)
-    model = _base(folder, source, config, is_full=is_full, to_host=bool(kind))
-    if not is_full:
-        model = native.load_adapters(folder, model, any_base=any_base)
-    graphdef, state = nnx.split(quantized(model, kind))
+    recorded = RecordedPolicy.read(folder, base=base, dataset=dataset)
+    model = recorded.load_base()
+    if not recorded.is_full:
+        model = native.load_adapters(recorded.folder, model, any_base=any_base)
+    graphdef, state = nnx.split(quantized(model, recorded.quantized))
     model = nnx.merge(graphdef, jax.tree.map(jnp.asarray, state))  # also adapters from the host
-    try:
-        return Policy(model, _processor(policy, config, words))
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"{path} does not describe a policy") from error
+    return Policy(model, recorded.processor(words))
 
 
-def _base(
-    folder: Path, source: Any, config: BackboneConfig, *, is_full: bool, to_host: bool
-) -> Backbone:
-    """Load the base of the run in `folder`; `is_full`: it is the trained one."""
-    if not source:
-        raise ValueError(f"the base of {folder} was randomly initialized and not saved")
-    try:
-        load = functools.partial(models.load, source, config)
-        return on_host(load) if to_host else load()
-    except ValueError as error:
-        hint = "" if is_full else f"; pass base= if the base of {folder} has moved"
-        raise ValueError(f"{error}{hint}") from error
+@dataclasses.dataclass(frozen=True)
+class RecordedPolicy:
+    """What the files of a finished run say of its policy.
+
+    Attributes:
+        folder: of the run.
+        source: location of the base.
+        config: of the model.
+        is_full: whether the run trained its base, which is then in its folder.
+        quantized: how the base is quantized after loading, or None.
+        fields: what the processor is made of.
+    """
+
+    folder: Path
+    source: str | Path
+    config: BackboneConfig
+    is_full: bool
+    quantized: Kind | None
+    fields: Mapping[str, Any] = dataclasses.field(repr=False)
+
+    @classmethod
+    def read(
+        cls, folder: str | os.PathLike[str], *, base: str = "", dataset: str = ""
+    ) -> "RecordedPolicy":
+        """Read a run's files; arguments and errors are those of `load_policy`."""
+        folder = Path(folder)
+        metadata, path, is_full = _read_metadata(folder)
+        if dataset and dataset not in (known := datasets(metadata)):
+            names = ", ".join(known) or "all its datasets alike"
+            raise ValueError(f"the policy of {folder} acts for {names}, not for {dataset!r}")
+        try:
+            policy = metadata["policy"]
+            policy = policy | (policy["datasets"][dataset] if dataset else {})
+            config = _config(policy)
+            source = folder / BASE if is_full else base or hub.resolve_portable(metadata["base"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{path} does not describe a policy") from error
+        if not source:
+            raise ValueError(f"the base of {folder} was randomly initialized and not saved")
+        return cls(folder, source, config, is_full, metadata.get(QUANTIZED), policy)
+
+    def load_base(self) -> Any:
+        """Load the base, not yet quantized; in host memory if it is to be."""
+        load = functools.partial(models.load, self.source, self.config)
+        try:
+            return on_host(load) if self.quantized else load()
+        except ValueError as error:
+            hint = "" if self.is_full else f"; pass base= if the base of {self.folder} has moved"
+            raise ValueError(f"{error}{hint}") from error
+
+    def processor(self, words: str = "") -> Processor:
+        """Make the processor; `words` is the location of the tokenizer, or "" as recorded."""
+        try:
+            return _processor(self.fields, self.config, words)
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"the files of {self.folder} do not describe a policy") from error
 
 
 def describe(folder: str | os.PathLike[str]) -> dict[str, Any]:

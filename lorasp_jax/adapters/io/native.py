@@ -10,7 +10,7 @@ import json
 import os
 import pathlib
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -126,14 +126,9 @@ def load_adapters(
             adapters do not fit the model.
     """
     folder = validate.folder(folder)
-    description = read_description(folder)
-    data, tensors = read_tensors(folder / TENSORS)
-    if description["sha256"] != hashlib.sha256(data).hexdigest():
-        raise ValueError(f"{folder / TENSORS} is damaged, or does not belong to {DESCRIPTION}")
+    description, saved_methods, tensors = _read(folder)
     if base is not None and description["base"] != base:
         raise ValueError(f"{folder} was trained on base {description['base']!r}, not {base!r}")
-    with paths.naming("load the methods in", folder):
-        saved_methods = {p: peft.from_settings(s) for p, s in description["methods"].items()}
     model_methods = {path: method.as_saved for path, method in adaptation.methods(model).items()}
     if not model_methods:
         model = _adapt_as_saved(model, saved_methods, tensors, folder, einsums)
@@ -143,11 +138,75 @@ def load_adapters(
         )
         raise ValueError(f"{folder} and the model have different adapters at {different[0]!r}")
     if not any_base:
-        _check_weights(model, description["weights"], folder)
+        common = {n: w for n, w in _frozen_weights(model).items() if n in description["weights"]}
+        _check_weights(digest.fingerprints(common), description["weights"], folder)
     graphdef, adapters, frozen = adaptation.split(model)
     expected = _matched_leaves(adapters, tensors, adaptation.methods(model), folder)
     values = [jnp.asarray(tensors[name], leaf.dtype) for name, leaf in expected.items()]
     return nnx.merge(graphdef, jax.tree.unflatten(jax.tree.structure(adapters), values), frozen)
+
+
+def read_adapters(
+    folder: str | os.PathLike[str],
+    adapted: Callable[[Mapping[str, Method]], nnx.Module],
+    fingerprints: Mapping[str, str],
+    *,
+    any_base: bool = False,
+) -> tuple[dict[str, Method], dict[str, np.ndarray]]:
+    """Read the adapters of a folder for a model whose weights are not at hand.
+
+    Args:
+        folder: written by `save_adapters`.
+        adapted: returns `abstract_adapted` of the model.
+        fingerprints: from `base_fingerprints` of the model with its weights.
+        any_base: whether to skip the base check; see `load_adapters`.
+
+    Returns:
+        The method of each adapted path, and the adapters' tensors by name.
+
+    Raises:
+        ValueError: as for `load_adapters`; the folder has no fingerprints of its base; or a method
+            splits kernels, which needs their values.
+    """
+    folder = validate.folder(folder)
+    description, methods, tensors = _read(folder)
+    if split := [path for path, method in methods.items() if method.splits_kernel]:
+        raise ValueError(f"{folder} splits the kernel {split[0]}, so it cannot share a base")
+    if not any_base:
+        if not description["weights"].keys() & fingerprints.keys():
+            raise ValueError(f"{folder} has no fingerprints of its base; any_base=True loads it")
+        _check_weights(fingerprints, description["weights"], folder)
+    expected = _fitting_leaves(lambda: adapted(methods), methods, tensors, folder)
+    return methods, {n: np.asarray(tensors[n], leaf.dtype) for n, leaf in expected.items()}
+
+
+def base_fingerprints(model: nnx.Module) -> dict[str, str]:
+    """Return the fingerprints of a base's weights, as `save_adapters` records them."""
+    return digest.fingerprints(_frozen_weights(model))
+
+
+def _read(
+    folder: pathlib.Path,
+) -> tuple[dict[str, Any], dict[str, Method], dict[str, np.ndarray]]:
+    """Return what a folder says of its adapters, their methods and tensors."""
+    description = read_description(folder)
+    data, tensors = read_tensors(folder / TENSORS)
+    if description["sha256"] != hashlib.sha256(data).hexdigest():
+        raise ValueError(f"{folder / TENSORS} is damaged, or does not belong to {DESCRIPTION}")
+    with paths.naming("load the methods in", folder):
+        methods = {p: peft.from_settings(s) for p, s in description["methods"].items()}
+    return description, methods, tensors
+
+
+def abstract_adapted(
+    model: adaptation.Model,
+    methods: Mapping[str, Method],
+    einsums: nnx_layers.Einsums = MappingProxyType({}),
+) -> adaptation.Model:
+    """Return the shapes of a bare model, itself of values or shapes, adapted by exact paths."""
+    graphdef, state = nnx.split(model)
+    adapt = lambda state: _adapted(nnx.merge(graphdef, state), methods, einsums)  # noqa: E731
+    return nnx.eval_shape(adapt, state)
 
 
 def _adapt_as_saved(
@@ -161,14 +220,30 @@ def _adapt_as_saved(
 
     Shapes are checked first, since a damaged or malicious file could request too much memory.
     """
+    adapted = lambda: abstract_adapted(model, methods, einsums)  # noqa: E731
+    _fitting_leaves(adapted, methods, tensors, folder)
+    return _adapted(model, methods, einsums)
+
+
+def _fitting_leaves(
+    adapted: Callable[[], nnx.Module],
+    methods: Mapping[str, Method],
+    tensors: Mapping[str, np.ndarray],
+    folder: pathlib.Path,
+) -> dict[str, Any]:
+    """Return `_matched_leaves` of the shapes of the adapted model."""
+    with paths.naming("fit to the model the adapters in", folder):
+        adapters = adaptation.split(adapted())[1]
+    return _matched_leaves(adapters, tensors, methods, folder)
+
+
+def _adapted(
+    model: adaptation.Model, methods: Mapping[str, Method], einsums: nnx_layers.Einsums
+) -> adaptation.Model:
     # FullFineTuning first, since an adapted layer may have fully fine-tuned parameters.
     order = sorted(methods, key=lambda path: not methods[path].trains_base)
     rules = [(f"^{re.escape(path)}$", methods[path]) for path in order]
-    adapt = lambda: adaptation.adapt(model, rules, rngs=nnx.Rngs(0), einsums=einsums)  # noqa: E731
-    with paths.naming("fit to the model the adapters in", folder):
-        adapters = adaptation.split(nnx.eval_shape(adapt))[1]
-    _matched_leaves(adapters, tensors, methods, folder)
-    return adapt()
+    return adaptation.adapt(model, rules, rngs=nnx.Rngs(0), einsums=einsums)
 
 
 def _frozen_weights(model: nnx.Module) -> dict[str, jax.Array]:
@@ -184,13 +259,14 @@ def _frozen_weights(model: nnx.Module) -> dict[str, jax.Array]:
     }
 
 
-def _check_weights(model: nnx.Module, saved: Mapping[str, str], folder: pathlib.Path) -> None:
-    """Raise ValueError if a base weight differs from the saved fingerprint."""
-    common = {n: leaf for n, leaf in _frozen_weights(model).items() if n in saved}
-    fingerprints = digest.fingerprints(common)
-    if changed := [name for name in fingerprints if fingerprints[name] != saved[name]]:
+def _check_weights(
+    found: Mapping[str, str], saved: Mapping[str, str], folder: pathlib.Path
+) -> None:
+    """Raise ValueError if a fingerprint of a base weight differs from the saved one."""
+    common = [name for name in found if name in saved]
+    if changed := [name for name in common if found[name] != saved[name]]:
         raise ValueError(
-            f"{folder} was trained on another base: {len(changed)} of {len(fingerprints)} arrays "
+            f"{folder} was trained on another base: {len(changed)} of {len(common)} arrays "
             f"differ, first {changed[0]!r}; any_base=True loads it anyway"
         )
 

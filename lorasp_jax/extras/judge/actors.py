@@ -91,9 +91,11 @@ class RunActor:
         if missing := [name for name in spec.cameras if name not in images]:
             raise ValueError(f"the policy needs the camera {missing[0]}: name it in the task")
         message = {"image": dict(images), "state": state, "prompt": instruction}
-        row = self._policy.prepare(self._parse(message, spec), (self._episode, self._calls))
+        request, index = self._parse(message, spec), (self._episode, self._calls)
+        adapter = self._policy.route(request)
+        row = self._policy.prepare(adapter, request, index)
         self._calls += 1
-        return self._policy.run("run", [row])[0]
+        return self._policy.run(adapter, [row])[0]
 
 
 Actor: TypeAlias = ServerActor | RunActor

@@ -11,13 +11,13 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from lorasp_jax.base.arguments import indices, pair, positive
+from lorasp_jax.base.arguments import indices, named, pair, positive
 from lorasp_jax.base.errors import run_command
 
 GRACE = 5.0
@@ -50,7 +50,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     add(
         "policy",
         nargs="+",
-        type=_named,
+        type=named,
         metavar="[NAME=]POLICY",
         help="folder of a finished run or an exported policy, or a published checkpoint (folder, "
         "hf://owner/name or gs://bucket/folder). Several runs: requests choose by NAME, the first "
@@ -75,6 +75,13 @@ def parser(program: str) -> argparse.ArgumentParser:
         help="whether chunks can continue the previous one, as learned in training or by guidance "
         "(default: %(default)s); see docs/latency.md",
     )
+    add("--adapters-on-device", type=positive, metavar="K", help="keep the weights of "
+        "K adapters on the device and the others in host memory, on one base (default: with "
+        "several adapters, all on the device)")  # fmt: skip
+    add("--route", choices=("name", "exact", "nearest"), default="name", help="which adapter "
+        "answers requests that name none: the first, the one trained with the instruction, or with "
+        "the nearest one; both refuse what is not clear (default: %(default)s)")  # fmt: skip
+    add("--any-base", action="store_true", help="accept adapters of another base than they record")
     add("--guidance", type=float, help="limit of the guidance (default: 10)")
     add("--base", default="", help="the run's base, if it has moved")
     add("--tokenizer", default="", help="the policy's tokenizer; runs record theirs")
@@ -142,7 +149,7 @@ async def _run(policy_server: Any, port: socket.socket, console: Console) -> boo
 def _load(options: argparse.Namespace, console: Console) -> Any:
     """Load and compile the policies, saying what takes long."""
     from lorasp_jax.base import compilation_cache as cache
-    from lorasp_jax.extras.serving.exported import is_exported
+    from lorasp_jax.extras.serving.exported import is_bundle, is_exported
     from lorasp_jax.extras.serving.served import ServedPolicies
 
     named, start = dict(options.policy), time.monotonic()
@@ -151,28 +158,37 @@ def _load(options: argparse.Namespace, console: Console) -> Any:
     cache.enable()
     seed = secrets.randbelow(2**31) if options.seed is None else options.seed
     _say(console, f"loading {', '.join(named.values())} with --seed {seed}")
-    policies = (_exported if all(map(is_exported, named.values())) else _compiled)(options, named)
-    settings = {"prompt": options.prompt, "execution": options.execution}
-    policy = ServedPolicies(policies, seed=seed, **settings)
+    exported = all(is_exported(path) or is_bundle(path) for path in named.values())
+    policies, load = (_exported if exported else _compiled)(options, named)
+    settings = {"prompt": options.prompt, "execution": options.execution, "route": options.route}
+    policy = ServedPolicies(policies, seed=seed, load=load, **settings)
     policy.warm_up(functools.partial(_say, console))
     _say(console, f"ready after {time.monotonic() - start:.0f} s")
     return policy
 
 
-def _exported(options: argparse.Namespace, named: dict[str, str]) -> dict[str, Any]:
+def _exported(options: argparse.Namespace, named: dict[str, str]) -> tuple[dict[str, Any], None]:
     """Load exported policies."""
-    from lorasp_jax.extras.serving.exported import load
+    from lorasp_jax.extras.serving.exported import is_bundle, load, load_bundle
 
-    settings = ("num_steps", "max_batch", "guidance", "base", "tokenizer", *CHECKPOINT_OPTIONS)
-    _refuse(options, settings, "has no effect on exported policies")
+    settings = ("num_steps", "max_batch", "guidance", "base", "tokenizer", "adapters_on_device")
+    _refuse(options, (*settings, *CHECKPOINT_OPTIONS), "has no effect on exported policies")
     if options.execution == "guided":
         raise ValueError("exported policies cannot be guided: use --execution naive or trained")
-    return {name: load(folder) for name, folder in named.items()}
+    if options.route == "nearest":
+        raise ValueError("exported policies understand only their instructions: use --route exact")
+    if any(map(is_bundle, named.values())):
+        if len(named) > 1:
+            raise ValueError("a folder of several exported policies is served alone")
+        return load_bundle(*named.values()), None
+    return {name: load(folder) for name, folder in named.items()}, None
 
 
-def _compiled(options: argparse.Namespace, named: dict[str, str]) -> dict[str, Any]:
-    """Load runs or a checkpoint."""
-    from lorasp_jax.extras.serving import loading
+def _compiled(
+    options: argparse.Namespace, named: dict[str, str]
+) -> tuple[dict[str, Any], Callable[[str], Any] | None]:
+    """Load runs or a checkpoint; return the policies, and what loads further ones, if anything."""
+    from lorasp_jax.extras.serving.adapters import OnDevice
     from lorasp_jax.extras.serving.policies import CompiledPolicy, batch_sizes
     from lorasp_jax.training.export import is_run
 
@@ -182,27 +198,67 @@ def _compiled(options: argparse.Namespace, named: dict[str, str]) -> dict[str, A
     settings = {name: value for name, value in given.items() if value is not None}
     if options.execution == "guided":
         settings["guidance"] = 10.0 if options.guidance is None else options.guidance
-    compiled = functools.partial(CompiledPolicy, **settings)
+    several = len(named) > 1 or bool(options.adapter)
+    share = several or options.adapters_on_device is not None
+    if options.route == "nearest" and not share:
+        raise ValueError("--route nearest is for several adapters")
+    place = OnDevice(options.adapters_on_device)
+    compiled = functools.partial(CompiledPolicy, **settings, place=place)
     if all(map(is_run, named.values())):
         others = [name for name in CHECKPOINT_OPTIONS if name != "dataset"]
         _refuse(options, others, "is for published checkpoints: runs record theirs")
-        where = {"base": options.base, "words": options.tokenizer, "dataset": options.dataset}
-        # One at a time, as the prepared weights are copies.
-        return {name: compiled(loading.load_run(run, **where)) for name, run in named.items()}
+        return _runs(options, named, compiled, share)
     if len(named) > 1:
         raise ValueError("several policies must all be finished runs, or all be exported")
     _refuse(options, ("base",), "is for runs")
+    return _checkpoint(options, next(iter(named.values())), compiled, share)
+
+
+def _runs(
+    options: argparse.Namespace,
+    named: dict[str, str],
+    compiled: Callable[[Any], Any],
+    share: bool,
+) -> tuple[dict[str, Any], Callable[[str], Any] | None]:
+    """Load runs, those of one base with only one copy of it if `share`."""
+    from lorasp_jax.extras.serving import loading
+    from lorasp_jax.extras.serving.adapters import Bases
+
+    where = {"base": options.base, "words": options.tokenizer, "dataset": options.dataset}
+    bases = Bases(any_base=options.any_base)
+
+    def load(run: str, *, start: bool = False) -> Any:
+        own = not share or (start and not bases.can_share(run))
+        model = None if own else functools.partial(bases.sampler, load=start)
+        return compiled(loading.load_run(run, **where, model=model, any_base=options.any_base))
+
+    # One at a time, as the prepared weights are copies.
+    return {n: load(run, start=True) for n, run in named.items()}, load if share else None
+
+
+def _checkpoint(
+    options: argparse.Namespace, where: str, compiled: Callable[[Any], Any], share: bool
+) -> tuple[dict[str, Any], Callable[[str], Any] | None]:
+    """Load a published checkpoint and its adapters."""
+    from lorasp_jax.extras.serving import loading
+
     names = ("tokenizer", "statistics", "dataset", "dtype", *UNSAID)
     chosen = {name: getattr(options, name) for name in names}
     if options.prompt_state:
         chosen["prompt_state"] = options.prompt_state == "yes"
     loaded = loading.load_checkpoint(
-        *named.values(),
+        where,
         **{name: value for name, value in chosen.items() if value is not None},
         cameras=dict(options.camera),
         adapters=dict(options.adapter),
+        any_base=options.any_base,
+        share=share,
     )
-    return {name: compiled(each) for name, each in loaded.items()}
+    first = loaded[loading.UNADAPTED]
+    policies = {name: compiled(each) for name, each in loaded.items()}
+    if not share:
+        return policies, None
+    return policies, lambda folder: compiled(first.with_adapters(folder, options.any_base))
 
 
 def _refuse(options: argparse.Namespace, names: Sequence[str], reason: str) -> None:
@@ -210,13 +266,6 @@ def _refuse(options: argparse.Namespace, names: Sequence[str], reason: str) -> N
     for name in names:
         if getattr(options, name) not in (None, "", []):
             raise ValueError(f"--{name.replace('_', '-')} {reason}")
-
-
-def _named(text: str) -> tuple[str, str]:
-    """Split NAME=POLICY; without a name, the last part of the path is the name."""
-    if "=" not in text or Path(text).exists():  # a path may contain the character
-        return Path(text).name, text
-    return pair(text)
 
 
 def _read_token(path: Path | None, console: Console) -> str:

@@ -5,7 +5,7 @@ fixed sizes, compiled in advance; missing rows are copies of the first.
 
 A lone request never waits. After a batch, the worker waits until the clients of that batch have
 sent their next requests, at most `WAIT` seconds: clients that ask again at once, each as fast as it
-can, so share batches instead of taking turns.
+can, so share batches instead of taking turns. Every adapter has its own batches.
 """
 
 import asyncio
@@ -40,7 +40,7 @@ class PolicyFailure(RuntimeError):
 @dataclass(eq=False)
 class _Job:
     client: int
-    adapter: str
+    adapter: Any
     row: Any
     future: Future[tuple[np.ndarray, float]] = field(default_factory=Future)
 
@@ -75,10 +75,11 @@ class Batcher:
         self._finished, self._begun = 0.0, 0.0
         self._running: list[_Job] = []
         self._closing = self._failed = False
+        self._last: Any = None  # adapter of the previous batch
         self._thread = threading.Thread(target=self._work, name="policy", daemon=True)
         self._thread.start()
 
-    async def infer(self, client: int, adapter: str, row: Any) -> tuple[np.ndarray, float]:
+    async def infer(self, client: int, adapter: Any, row: Any) -> tuple[np.ndarray, float]:
         """Run one row, in a batch with others.
 
         Returns:
@@ -129,6 +130,7 @@ class Batcher:
                 self._run(batch)
                 self._running = []
                 self._awaited = {job.client for job in batch}
+                self._last = batch[0].adapter
                 self._finished = time.monotonic()
 
     def _collect(self) -> bool:
@@ -148,7 +150,8 @@ class Batcher:
         """Return how long to wait for a further job; None: as long as it takes."""
         if not self._pending:
             return None
-        if not self._awaited or len(self._pending) >= self._policy.sizes[-1]:
+        other = self._pending[0].adapter != self._last  # which no awaited request can join
+        if other or not self._awaited or len(self._pending) >= self._policy.sizes[-1]:
             return 0
         return max(0.0, self._finished + WAIT - time.monotonic())
 
@@ -175,7 +178,7 @@ class Batcher:
                 job.fail("the policy failed: see the server's log")
             return
         milliseconds = (time.perf_counter() - start) * 1e3
-        self.seconds.observe(batch[0].adapter, milliseconds / 1e3)
+        self.seconds.observe(str(batch[0].adapter), milliseconds / 1e3)
         self._counts["batches"] += 1
         self._counts["batched_requests"] += len(batch)
         for job, chunk in zip(batch, actions, strict=False):

@@ -1,19 +1,21 @@
-"""Export a policy: `python -m lorasp_jax.extras.serving.export runs/NAME --out FOLDER`."""
+"""Export policies: `python -m lorasp_jax.extras.serving.export runs/NAME --out FOLDER`."""
 
 import argparse
+import functools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 
+from lorasp_jax.base.arguments import NAME, named
 from lorasp_jax.base.errors import run_command
 
 
 def main(
     arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.serving.export"
 ) -> int:
-    """Export a run; return the exit code, one of `lorasp_jax.base.errors`."""
+    """Export runs; return the exit code, one of `lorasp_jax.base.errors`."""
     options = parser(program).parse_args(arguments)
     return run_command(lambda: _export(options, Console()), Console(stderr=True))
 
@@ -22,11 +24,12 @@ def parser(program: str) -> argparse.ArgumentParser:
     """Return the argument parser of this command."""
     parser = argparse.ArgumentParser(
         prog=program,
-        description="Export the policy of a finished run as a folder that runs without this "
+        description="Export the policies of finished runs as a folder that runs without this "
         "package. See docs/serving.md.",
     )
     add = parser.add_argument
-    add("run", help="folder of a finished run")
+    add("run", nargs="+", type=named, metavar="[NAME=]RUN", help="folder of a finished run. "
+        "Of several runs, the base is stored once, and the first is the default")  # fmt: skip
     add("--out", type=Path, required=True, metavar="FOLDER", help="folder to create")
     add("--base", default="", help="the run's base, if it has moved")
     add("--tokenizer", default="", help="the policy's tokenizer, if it has moved")
@@ -39,22 +42,28 @@ def parser(program: str) -> argparse.ArgumentParser:
 def _export(options: argparse.Namespace, console: Console) -> None:
     import jax
 
+    runs = dict(options.run)
+    if len(runs) < len(options.run) or not all(map(NAME.fullmatch, runs)):
+        raise ValueError(f"the runs must have different names that match {NAME.pattern}: NAME=RUN")
     if options.out.exists():  # said before the run loads, which can take a minute
         raise ValueError(f"{options.out} already exists: choose another path")
     jax.config.update("jax_platforms", "cpu")
     from lorasp_jax.extras.serving import exporting, loading
+    from lorasp_jax.extras.serving.adapters import Bases
 
     where = {"base": options.base, "words": options.tokenizer, "dataset": options.dataset}
-    loaded = loading.load_run(options.run, **where)
-    exporting.write(
-        loaded.policy,
-        options.out,
-        continues=bool(loaded.continues),
-        num_steps=options.num_steps,
-        max_batch=options.max_batch,
-        metadata=loaded.metadata,
-    )
-    megabytes = sum(file.stat().st_size for file in options.out.iterdir()) / 1e6
+    settings = {"num_steps": options.num_steps, "max_batch": options.max_batch}
+    if len(runs) == 1:
+        loaded = loading.load_run(*runs.values(), **where)
+        settings |= {"continues": bool(loaded.continues), "metadata": loaded.metadata}
+        exporting.write(loaded.policy, options.out, **settings)
+    else:
+        bases, policies = Bases(), {}
+        for name, run in runs.items():
+            model = functools.partial(bases.sampler, load=not policies)
+            policies[name] = loading.load_run(run, **where, model=model)
+        exporting.write_bundle(policies, options.out, **settings)
+    megabytes = sum(file.stat().st_size for file in options.out.rglob("*")) / 1e6
     console.print(f"wrote {options.out}, {megabytes:.1f} MB", soft_wrap=True, highlight=False)
 
 

@@ -8,12 +8,17 @@ This file needs only JAX with flatbuffers, NumPy and safetensors. A copy of it w
     weights.safetensors    arrays that the programs take as an argument, in the order of their names
     act-B.bin              program of `jax.export` for B observations
     continue-B.bin         the same for chunks that continue the previous one
+
+A bundle is a folder of several such policies with one base: adapters.json has their names, the
+first is the default. Weights of the base and programs are beside their folders, and policy.json
+says which they use.
 """
 
 import functools
 import hashlib
 import json
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,9 +35,12 @@ FORMAT = 1
 PLATFORMS = ("cpu", "cuda")
 """Platforms that every program runs on."""
 DESCRIPTION = "policy.json"
+BUNDLE, BASE = "adapters.json", "base.safetensors"
 PROCESSOR, INSTRUCTIONS, WEIGHTS = "processor.json", "instructions.json", "weights.safetensors"
 ACT, CONTINUE = "act", "continue"
 """Kinds of programs."""
+_NAME = re.compile(r"\w[\w.-]*")
+"""Names of a bundle's policies and files, which are never paths to elsewhere."""
 _REMEDY = "copy the folder or export the policy again"
 
 
@@ -113,14 +121,13 @@ class ExportedPolicy:
     def __init__(
         self,
         description: Description,
-        programs: Mapping[tuple[str, int], export.Exported],
+        programs: Mapping[tuple[str, int], Any],
         weights: list[jax.Array],
         statistics: Any,
         tokens: Mapping[str, Mapping[str, Any]],
     ) -> None:
         self.description = description
-        jit = functools.partial(jax.jit, compiler_options=sampling_options())
-        self._programs = {name: jit(program.call) for name, program in programs.items()}
+        self._programs = dict(programs)
         self._weights, self._statistics, self._tokens = weights, statistics, tokens
 
     @property
@@ -253,43 +260,93 @@ def build_row(
 
 
 def load(folder: str | os.PathLike[str]) -> ExportedPolicy:
-    """Load an exported policy.
+    """Load an exported policy, which may be one of a bundle.
 
     Raises:
         ValueError: the folder contains none, a file is damaged or missing, or a newer version of
             JAX wrote it.
     """
-    folder = Path(folder)
-    values = _read_description(folder / DESCRIPTION)
-    if tuple(values["jax"]) > jax.__version_info__:
-        name = ".".join(map(str, values["jax"]))
-        raise ValueError(
-            f"{folder} was exported with JAX {name}, which JAX {jax.__version__} may not run: "
-            f"install JAX {name}, or export the policy again"
+    return _Reader().policy(Path(folder))
+
+
+def load_bundle(folder: str | os.PathLike[str]) -> dict[str, ExportedPolicy]:
+    """Load a bundle: policies by name, which share the base's arrays and programs.
+
+    Raises:
+        ValueError: as for `load`.
+    """
+    reader, path = _Reader(), Path(folder) / BUNDLE
+    try:
+        names = json.loads(path.read_bytes())
+        if not names or not all(map(_NAME.fullmatch, names)):
+            raise ValueError
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        raise ValueError(f"{path} is missing or damaged: {_REMEDY}") from error
+    return {name: reader.policy(Path(folder) / name) for name in names}
+
+
+class _Reader:
+    """Reads policies, and files that several of them use only once."""
+
+    def __init__(self) -> None:
+        self._digests = functools.cache(file_digest)
+        self._program = functools.cache(_program)
+        self._weights = functools.cache(_weights)
+
+    def policy(self, folder: Path) -> ExportedPolicy:
+        values = _read_description(folder / DESCRIPTION)
+        if tuple(values["jax"]) > jax.__version_info__:
+            name = ".".join(map(str, values["jax"]))
+            raise ValueError(
+                f"{folder} was exported with JAX {name}, which JAX {jax.__version__} may not run: "
+                f"install JAX {name}, or export the policy again"
+            )
+        fields, beside = values["policy"], values.get("beside", {})
+        description = Description(**fields | {"cameras": tuple(fields["cameras"])})
+        base = [BASE] if BASE in beside else []
+        paths = {n: folder / n for n in (*description.files, *base)}
+        paths |= {n: folder.parent / file for n, file in beside.items() if _NAME.fullmatch(file)}
+        for name, path in paths.items():
+            if not path.is_file() or self._digests(path) != values["files"].get(name):
+                raise ValueError(f"{path} is missing or damaged: {_REMEDY}")
+        arrays = (self._weights(paths[BASE]) if base else {}) | self._weights(paths[WEIGHTS])
+        return ExportedPolicy(
+            description,
+            {each: self._program(paths[program_file(*each)]) for each in description.programs},
+            [arrays[name] for name in values.get("weights", sorted(arrays))],
+            _statistics(folder / PROCESSOR),
+            _tokens(folder / INSTRUCTIONS),
         )
-    description = Description(**values["policy"] | {"cameras": tuple(values["policy"]["cameras"])})
-    for name in description.files:
-        path = folder / name
-        if not path.is_file() or file_digest(path) != values["files"].get(name):
-            raise ValueError(f"{path} is missing or damaged: {_REMEDY}")
-    with safetensors.safe_open(folder / WEIGHTS, framework="np") as file:
-        weights = [jnp.asarray(file.get_tensor(name)) for name in sorted(file.keys())]
-    statistics = json.loads((folder / PROCESSOR).read_bytes())["statistics"]
-    tokens = json.loads((folder / INSTRUCTIONS).read_bytes())
-    programs = {each: folder / program_file(*each) for each in description.programs}
-    return ExportedPolicy(
-        description,
-        {k: export.deserialize(bytearray(path.read_bytes())) for k, path in programs.items()},
-        weights,
-        {
-            kind: {name: jnp.array(values, jnp.float32) for name, values in by_name.items()}
-            for kind, by_name in statistics.items()
-        },
-        {
-            text: {"ids": np.array(row["ids"], np.int32), "mask": np.array(row["mask"], np.bool_)}
-            for text, row in tokens.items()
-        },
-    )
+
+
+def _program(path: Path) -> Any:
+    exported = export.deserialize(bytearray(path.read_bytes()))
+    return jax.jit(exported.call, compiler_options=sampling_options())
+
+
+def _weights(path: Path) -> dict[str, jax.Array]:
+    with safetensors.safe_open(path, framework="np") as file:
+        return {name: jnp.asarray(file.get_tensor(name)) for name in file.keys()}  # noqa: SIM118
+
+
+def _statistics(path: Path) -> dict[str, dict[str, jax.Array]]:
+    by_kind = json.loads(path.read_bytes())["statistics"]
+    return {
+        kind: {name: jnp.array(values, jnp.float32) for name, values in by_name.items()}
+        for kind, by_name in by_kind.items()
+    }
+
+
+def _tokens(path: Path) -> dict[str, dict[str, np.ndarray]]:
+    return {
+        text: {"ids": np.array(row["ids"], np.int32), "mask": np.array(row["mask"], np.bool_)}
+        for text, row in json.loads(path.read_bytes()).items()
+    }
+
+
+def is_bundle(folder: str | os.PathLike[str]) -> bool:
+    """Return whether a folder contains several exported policies of one base."""
+    return (Path(folder) / BUNDLE).is_file()
 
 
 def is_exported(folder: str | os.PathLike[str]) -> bool:

@@ -2,8 +2,8 @@
 
 import dataclasses
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,14 @@ from lorasp_jax.adapters.io import hugging_face
 from lorasp_jax.base import hub
 from lorasp_jax.extras.serving.checkpoint import Checkpoint, Unsaid
 from lorasp_jax.models.backbone import Backbone
+from lorasp_jax.models.shared_base import SharedBase
 from lorasp_jax.policies import statistics_files
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Tokenizer, load_tokenizer
 from lorasp_jax.training import export
+from lorasp_jax.training.export import RecordedPolicy
 from lorasp_jax.training.run_folder import CONFIG_FILE, read_json
 
 UNADAPTED = "base"
@@ -33,25 +35,47 @@ class Loaded:
         words: its tokenizer.
         continues: whether it was trained to continue chunks; None: its files do not say.
         metadata: what they say of its robot.
+        base: the base that its adapters share with others, if they do.
     """
 
     policy: Policy
     words: Tokenizer
     continues: bool | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
+    base: SharedBase | None = None
+
+    def with_adapters(self, folder: str, any_base: bool = False) -> "Loaded":
+        """Return this policy with other adapters on its shared base; see `load_adapters`."""
+        assert self.base is not None
+        model = self.base.read(folder, any_base=any_base)
+        return replace(self, policy=replace(self.policy, model=model))
 
 
-def load_run(folder: str, *, base: str = "", words: str = "", dataset: str = "") -> Loaded:
+def load_run(
+    folder: str,
+    *,
+    base: str = "",
+    words: str = "",
+    dataset: str = "",
+    any_base: bool = False,
+    model: Callable[[RecordedPolicy], Any] | None = None,
+) -> Loaded:
     """Load a finished run; arguments and errors are those of `load_policy`.
 
-    Says for which dataset's robot the policy acts if there is a choice.
+    With `model`, that function makes the model from what the run records. Says for which dataset's
+    robot the policy acts if there is a choice.
     """
     described = export.describe(folder)
-    policy = export.load_policy(folder, base=base, words=words, dataset=dataset)
     if known := export.datasets(described):
         chosen = dataset or described["policy"]["dataset"] or "all its datasets"
         others = f"--dataset chooses one of {', '.join(known)}"
         print(f"{folder} acts for {chosen}; {others}", file=sys.stderr)
+    if model is None:
+        where: Any = {"base": base, "words": words, "dataset": dataset}
+        policy = export.load_policy(folder, **where, any_base=any_base)
+    else:
+        said = RecordedPolicy.read(folder, base=base, dataset=dataset)
+        policy = Policy(model(said), said.processor(words))
     recorded = hub.resolve_portable(described["policy"]["tokenizer"])
     config = read_json(Path(folder) / CONFIG_FILE, {"optim": {}})
     return Loaded(
@@ -71,6 +95,8 @@ def load_checkpoint(
     dtype: str = "",
     cameras: Mapping[str, str] | None = None,
     adapters: Mapping[str, str] | None = None,
+    any_base: bool = False,
+    share: bool = False,
     **unsaid: Any,
 ) -> dict[str, Loaded]:
     """Load a published checkpoint, as `UNADAPTED` and with each of its adapters.
@@ -86,6 +112,8 @@ def load_checkpoint(
             files say, or the backbone's names.
         adapters: name -> folder of `save_adapters`, or LeRobot's of a PEFT adapter, which can also
             be a Hub repository.
+        any_base: accept adapters of another base; see `load_adapters`.
+        share: keep the base in memory once for all adapters; see `SharedBase`.
         unsaid: fields of `Unsaid`.
 
     Raises:
@@ -110,13 +138,20 @@ def load_checkpoint(
     processor = Processor.of(config, moments, prompts, **sizes, cameras=cameras)
     model = checkpoint.found.load(config)
     models = {UNADAPTED: model}
-    models |= {name: _adapted(path, model) for name, path in (adapters or {}).items()}
+    models |= {name: _adapted(path, model, any_base) for name, path in (adapters or {}).items()}
+    base = SharedBase(model) if share else None
+    if base:
+        models = {name: base.attach_model(each, model) for name, each in models.items()}
     pose = {"reset_pose": [*named.reset_pose]} if named and named.reset_pose else {}
-    return {n: Loaded(Policy(m, processor), words, metadata=pose) for n, m in models.items()}
+    return {
+        name: Loaded(Policy(each, processor), words, metadata=pose, base=base)
+        for name, each in models.items()
+    }
 
 
-def _adapted(where: str, model: Backbone) -> Backbone:
+def _adapted(where: str, model: Backbone, any_base: bool) -> Backbone:
     """Return the model with the adapters of a folder."""
     if hub.is_remote(where) or (Path(where) / hugging_face.CONFIG).exists():
+        print(f"{where} has no digest of its base: taking this checkpoint", file=sys.stderr)
         return lorasp_jax.load_peft(where, model, names=lorasp_jax.models.lerobot_names(model))
-    return lorasp_jax.load_adapters(where, model)
+    return lorasp_jax.load_adapters(where, model, any_base=any_base)

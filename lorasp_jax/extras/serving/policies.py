@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -13,7 +13,8 @@ from lorasp_jax.extras.serving.exported import Description, sampling_options
 from lorasp_jax.extras.serving.loading import Loaded
 from lorasp_jax.policies.policy import Observation, Policy
 from lorasp_jax.policies.processor import Processor
-from lorasp_jax.policies.prompt_table import Ids
+from lorasp_jax.policies.prompt_table import Ids, PromptTable
+from lorasp_jax.policies.tokenizer import Tokenizer
 
 FAR = 50.0
 """Normalized states beyond this are absurd, such as degrees in place of radians; our choice."""
@@ -25,7 +26,7 @@ class CompiledPolicy:
     """A policy with a program per batch size, which compiles when first used.
 
     Policies whose adapters have equal shapes share their programs. Each keeps its own copy of the
-    weights.
+    weights, unless its model is a `SharedSampler`.
     """
 
     def __init__(
@@ -35,6 +36,7 @@ class CompiledPolicy:
         num_steps: int = 10,
         max_batch: int = 8,
         guidance: float | None = None,
+        place: Callable[[Policy], Policy] = lambda policy: policy,
     ) -> None:
         """Prepare the policy's weights.
 
@@ -43,6 +45,7 @@ class CompiledPolicy:
             num_steps: Euler steps of the flow-matching sampler.
             max_batch: largest batch.
             guidance: β of guided execution, see `real_time_chunking.sample`; None: no guidance.
+            place: applied to the policy before each call, such as an `OnDevice`.
         """
         policy = loaded.policy
         self.description: Description = describe(
@@ -54,20 +57,29 @@ class CompiledPolicy:
         )
         self.instructions: tuple[str, ...] = policy.processor.prompts.instructions
         self.plausible: np.ndarray = plausible_states(policy.processor)
-        self._table, self._words = policy.processor.prompts, loaded.words
-        self._policy = without_prompts(policy)
+        self.policy: Policy = without_prompts(policy)
+        self._place = place
         self._guidance = None if guidance is None else np.float32(guidance)
-        self.tokens = functools.lru_cache(CACHED_PROMPTS)(self._tokenize)
+        # Not a method: a cycle of references would keep the weights of a policy that was unloaded.
+        self.tokens = _tokens(policy.processor.prompts, loaded.words)
 
     def run(self, batch: Mapping[str, Any]) -> np.ndarray:
         """Return actions f32 `[B, C, J+1]`; see `sample`."""
         steps = self.description.num_steps
-        return np.asarray(_program()(self._policy, batch, self._guidance, num_steps=steps))
+        return np.asarray(
+            _program()(self._place(self.policy), batch, self._guidance, num_steps=steps)
+        )
 
-    def _tokenize(self, instruction: str) -> dict[str, np.ndarray]:
-        """Return the tokens of an instruction as `ExportedPolicy.tokens` does."""
-        start = self._table.with_instructions(self._words, [instruction]).start
+
+def _tokens(table: PromptTable, words: Tokenizer) -> Callable[[str], dict[str, np.ndarray]]:
+    """Return a function that gives the tokens of an instruction as `ExportedPolicy.tokens` does."""
+
+    @functools.lru_cache(CACHED_PROMPTS)
+    def tokens(instruction: str) -> dict[str, np.ndarray]:
+        start = table.with_instructions(words, [instruction]).start
         return {"ids": np.asarray(start.ids[0]), "mask": np.asarray(start.mask[0])}
+
+    return tokens
 
 
 @functools.cache

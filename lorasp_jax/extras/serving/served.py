@@ -4,21 +4,45 @@ import dataclasses
 import functools
 import itertools
 import logging
+import threading
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import jax
 import numpy as np
 
+from lorasp_jax.base.arguments import NAME
+from lorasp_jax.extras.serving import routing
+from lorasp_jax.extras.serving.adapters import embed
 from lorasp_jax.extras.serving.exported import ExportedPolicy, PolicyInterface, build_row
-from lorasp_jax.extras.serving.policies import CompiledPolicy
+from lorasp_jax.extras.serving.policies import CACHED_PROMPTS, CompiledPolicy
 from lorasp_jax.extras.serving.requests import PolicySpec, Request
 
 _log = logging.getLogger(__name__)
 
 
+@dataclass(eq=False)
+class Adapter:
+    """A policy under the name by which requests choose it; requests keep theirs if it is replaced.
+
+    Attributes:
+        name: its name.
+        policy: the policy.
+        warned: whether the log was told of an absurd state.
+    """
+
+    name: str
+    policy: CompiledPolicy | ExportedPolicy
+    warned: bool = False
+
+    def __str__(self) -> str:
+        """Return the name."""
+        return self.name
+
+
 class ServedPolicies:
-    """Policies of one robot by adapter name.
+    """Policies of one robot by adapter name, which may change while requests are answered.
 
     The noise of the flow depends only on the server's seed and on the numbers of the connection and
     of the request on it, so the n-th connection to a server can be repeated exactly. Neither a
@@ -28,8 +52,6 @@ class ServedPolicies:
     Attributes:
         spec: what requests must have, and what is returned.
         metadata: what the first policy's run says of its robot.
-        instructions: adapters that a request may choose, the default first, and the instructions
-            that each was trained with.
         sizes: batch sizes, ascending.
     """
 
@@ -40,6 +62,8 @@ class ServedPolicies:
         prompt: str = "",
         seed: int = 0,
         execution: str = "naive",
+        route: str = "name",
+        load: Callable[[str], CompiledPolicy] | None = None,
     ) -> None:
         """Check that the policies fit; `warm_up` compiles.
 
@@ -50,84 +74,167 @@ class ServedPolicies:
             seed: of the flow's noise.
             execution: "naive", or "trained" or "guided" to continue chunks, see docs/latency.md.
                 Exported policies cannot be guided.
+            route: one of `routing.MODES`; "nearest" needs policies on a `SharedBase`.
+            load: loads another adapter from a path, for `put`; None: adapters do not change.
 
         Raises:
             ValueError: the policies need different observations or are of different robots, or
                 cannot continue chunks as `execution` demands.
         """
-        self._policies, self._prompt, self._warned = dict(policies), prompt, set()
+        self._prompt, self._route, self._load = prompt, route, load
         self.spec: PolicySpec = _common_spec(policies, execution)
         self.metadata: dict[str, Any] = dict(next(iter(policies.values())).description.metadata)
-        self.instructions: dict[str, tuple[str, ...]] = {
-            name: policy.instructions for name, policy in policies.items()
-        }
+        self._adapters = {name: Adapter(name, policy) for name, policy in policies.items()}
+        self._default = next(iter(policies))
+        self._change = threading.Lock()
         sizes = [set(policy.description.batch_sizes) for policy in policies.values()]
         self.sizes: tuple[int, ...] = tuple(sorted(set.intersection(*sizes)))
         draw = jax.vmap(functools.partial(draw_noise, jax.random.key(seed)), (0, None))
         self._draw = jax.jit(draw, static_argnums=1)
+        self._embed = functools.lru_cache(CACHED_PROMPTS)(self._embedding)
+
+    @property
+    def instructions(self) -> dict[str, tuple[str, ...]]:
+        """Adapters that a request may choose, the default first, and their instructions."""
+        return {name: each.policy.instructions for name, each in self._adapters.items()}
+
+    @property
+    def adapters(self) -> list[Adapter]:
+        """The present adapters, the default first."""
+        return [*self._adapters.values()]
 
     def warm_up(self, say: Callable[[str], None] = lambda _: None) -> None:
         """Compile and run every program; `say` is told of each before it starts."""
+        programs = list(itertools.product(self.adapters, self.sizes))
+        for number, (adapter, size) in enumerate(programs, start=1):
+            say(f"compiling {adapter.name}, batch {size} ({number} of {len(programs)})")
+            self._try_out(adapter, size)
+
+    def _try_out(self, adapter: Adapter, size: int) -> None:
+        """Run a batch twice, which compiles the program if no other adapter has the same."""
         spec = self.spec
         picture = np.zeros((spec.image_size, spec.image_size, 3), np.uint8)
         images, state = dict.fromkeys(spec.cameras, picture), np.zeros(spec.state_dim, np.float32)
-        self._warned = {*self._policies}  # not of these zeros
-        programs = list(itertools.product(self._policies, self.sizes))
-        for number, (adapter, size) in enumerate(programs, start=1):
-            say(f"compiling {adapter}, batch {size} ({number} of {len(programs)})")
-            prompt = (self._prompt, *self.instructions[adapter], "press the button")
-            request = Request(images, state, next(filter(None, prompt)), adapter)
-            for _ in range(2):
-                self.run(adapter, [self.prepare(request, (0, 0))] * size)
-        self._warned = set()
+        prompt = (self._prompt, *adapter.policy.instructions, "press the button")
+        request = Request(images, state, next(filter(None, prompt)))
+        for _ in range(2):
+            self.run(adapter, [self._row(adapter, request, (0, 0))] * size)
 
-    def prepare(self, request: Request, index: tuple[int, int]) -> dict[str, Any]:
+    def put(self, name: str, path: str) -> None:
+        """Load an adapter and serve it from the next batch on, in place of one of the same name.
+
+        It is compiled and tried out first, while others answer.
+
+        Raises:
+            ValueError: adapters do not change, the name is unsuitable, or the adapter cannot be
+                loaded or served with the others.
+        """
+        if self._load is None:
+            raise ValueError(
+                "the policies of this server have weights of their own: start it with several "
+                "runs of one base, or with --adapters-on-device"
+            )
+        if not NAME.fullmatch(name):
+            raise ValueError(f"name must match {NAME.pattern}, got {name[:80]!r}")
+        with self._change:  # one at a time
+            adapter, first = Adapter(name, self._load(path)), self._adapters[self._default]
+            _common_spec({first.name: first.policy, name: adapter.policy}, self.spec.execution)
+            for size in self.sizes:
+                self._try_out(adapter, size)
+            self._adapters = self._adapters | {name: adapter}
+
+    def remove(self, name: str) -> None:
+        """Serve an adapter no longer; requests that chose it are still answered.
+
+        Raises:
+            ValueError: there is no such adapter, or it is the default.
+        """
+        with self._change:
+            if name == self._default:
+                raise ValueError(f"{name} answers requests that name no adapter: replace it")
+            self._find(name)
+            self._adapters = {n: each for n, each in self._adapters.items() if n != name}
+
+    def _find(self, name: str) -> Adapter:
+        adapters = self._adapters
+        if name not in adapters:
+            raise ValueError(f"adapter must be one of {', '.join(adapters)}, got {name!r}")
+        return adapters[name]
+
+    def route(self, request: Request) -> Adapter:
+        """Return the adapter that a request names, or else the one of its instruction.
+
+        Raises:
+            ValueError: there is no such adapter, or the instruction is not clearly of one.
+        """
+        prompt, known = request.prompt or self._prompt, self.instructions
+        if request.adapter or self._route == "name":
+            return self._find(request.adapter or self._default)
+        if not prompt:
+            raise ValueError("the request must contain a prompt, or name an adapter")
+        if name := routing.exact(prompt, known):
+            return self._find(name)
+        said = f"{', '.join(known)} were trained for others"
+        if self._route == "nearest":
+            name, said = routing.nearest(prompt, known, self._embed)
+        if not name:
+            raise ValueError(f"no adapter is for {prompt!r}: {said}; name the adapter")
+        return self._find(name)
+
+    def _embedding(self, text: str) -> np.ndarray:
+        policy = self._adapters[self._default].policy
+        tokens = policy.tokens(text)
+        return embed(policy.policy, tokens["ids"][tokens["mask"]])
+
+    def prepare(self, adapter: Adapter, request: Request, index: tuple[int, int]) -> dict[str, Any]:
         """Convert a request to a row of a batch.
 
         Args:
+            adapter: from `route`.
             request: a request.
             index: numbers of the connection and of the request on it, for the flow's noise.
 
         Raises:
             ValueError: there is no instruction, or the policy does not know it.
         """
-        adapter, execution = request.adapter or next(iter(self._policies)), self.spec.execution
-        known = self.instructions[adapter]
+        self._warn(adapter, request.state)
+        return self._row(adapter, request, index)
+
+    def _row(self, adapter: Adapter, request: Request, index: tuple[int, int]) -> dict[str, Any]:
+        execution, known = self.spec.execution, adapter.policy.instructions
         prompt = request.prompt or self._prompt or (known[0] if len(known) == 1 else "")
         if not prompt:
             raise ValueError("the request must contain a prompt")
-        self._warn(adapter, request.state)
         rest = None
         if execution != "naive":
             rest = np.zeros((0, self.spec.action_length), np.float32)
             if request.executed is not None and request.previous is not None:
                 rest = request.previous[request.executed :]
-        tokens = self._policies[adapter].tokens(prompt)
+        tokens = adapter.policy.tokens(prompt)
         row = build_row(self.spec, request.images, request.state, tokens, rest, request.delay)
         if rest is not None and execution == "guided":
             row["overlap"] = np.array(len(rest), np.int32)
         return {**row, "index": np.array(index, np.int32)}
 
-    def _warn(self, adapter: str, state: np.ndarray) -> None:
+    def _warn(self, adapter: Adapter, state: np.ndarray) -> None:
         """Tell the log once of a state that no demonstration can have had."""
-        bounds = getattr(self._policies[adapter], "plausible", None)  # exported ones have none
-        if adapter in self._warned or bounds is None:
+        bounds = getattr(adapter.policy, "plausible", None)  # exported ones have none
+        if adapter.warned or bounds is None:
             return
         if (beyond := (state < bounds[0]) | (state > bounds[1])).any():
-            self._warned.add(adapter)
+            adapter.warned = True
             number = int(beyond.argmax())
             _log.warning(
                 "number %d of a state is %g, but %g to %g would be plausible: check its unit",
                 *(number, state[number], *bounds[:, number]),
             )
 
-    def run(self, adapter: str, rows: Sequence[dict[str, Any]]) -> np.ndarray:
+    def run(self, adapter: Adapter, rows: Sequence[dict[str, Any]]) -> np.ndarray:
         """Return actions f32 `[B, C, J+1]`; B is one of `sizes`."""
-        policy = self._policies[adapter]
         batch = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
-        shape = (policy.description.chunk, policy.description.action_dim)
-        noise = self._draw(batch.pop("index"), shape)
-        return policy.run({**batch, "noise": noise})
+        description = adapter.policy.description
+        noise = self._draw(batch.pop("index"), (description.chunk, description.action_dim))
+        return adapter.policy.run({**batch, "noise": noise})
 
 
 def draw_noise(key: jax.Array, index: jax.Array, shape: tuple[int, ...]) -> jax.Array:

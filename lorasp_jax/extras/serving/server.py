@@ -17,7 +17,7 @@ import logging
 import socket
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import AsyncIterator, Awaitable, Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +29,7 @@ from websockets.http11 import Request as HttpRequest
 from websockets.http11 import Response
 
 import lorasp_jax
-from lorasp_jax.extras.serving import metrics, wire
+from lorasp_jax.extras.serving import metrics, posting, wire
 from lorasp_jax.extras.serving.batching import Batcher, PolicyFailure
 from lorasp_jax.extras.serving.requests import MAX_VALUES, Request, parse
 
@@ -95,7 +95,7 @@ class PolicyServer:
         self.counts: Counter[str] = Counter(dict.fromkeys(names, 0))
         self._policy, self._token = policy, token
         self._batcher = Batcher(policy, self.counts)
-        self._metadata = wire.pack(describe(policy))
+        self._adapters = posting.Adapters(policy)
         self._clients, self._warned = itertools.count(), set[str]()
 
     @contextlib.asynccontextmanager
@@ -110,6 +110,7 @@ class PolicyServer:
             max_size=wire.MAX_FRAME,
             max_queue=1,
             close_timeout=2,
+            create_connection=posting.Connection,
         ) as server:
             yield server
 
@@ -119,8 +120,12 @@ class PolicyServer:
 
     def _process_request(
         self, connection: ServerConnection, request: HttpRequest
-    ) -> Response | None:
+    ) -> Response | Awaitable[Response] | None:
         """Answer pages, and refuse connections without the token or beyond the limit."""
+        posted = connection.body if isinstance(connection, posting.Connection) else None
+        if posted is not None and request.path != "/adapters":
+            text = "POST is for /adapters\n"
+            return connection.respond(http.HTTPStatus.METHOD_NOT_ALLOWED, text)
         if request.path == "/healthz":
             problem = self._batcher.problem()
             status = http.HTTPStatus.SERVICE_UNAVAILABLE if problem else http.HTTPStatus.OK
@@ -137,6 +142,8 @@ class PolicyServer:
             del page.headers["Content-Type"]
             page.headers["Content-Type"] = metrics.CONTENT_TYPE
             return page
+        if request.path == "/adapters":
+            return self._change_adapters(connection, posted)
         return None
 
     def _refusal(self, request: HttpRequest) -> tuple[http.HTTPStatus, str] | None:
@@ -148,11 +155,20 @@ class PolicyServer:
         if self._token and not hmac.compare_digest(given.encode(), self._token.encode()):
             text = "this server requires a token: Authorization: Api-Key TOKEN"
             return http.HTTPStatus.UNAUTHORIZED, text
-        is_page = request.path in ("/status", "/metrics")
+        is_page = request.path in ("/status", "/metrics", "/adapters")
         if not is_page and self.counts["open_connections"] >= self._max_clients:
             text = f"this server has its maximum of {self._max_clients} connections"
             return http.HTTPStatus.SERVICE_UNAVAILABLE, text
         return None
+
+    async def _change_adapters(self, connection: ServerConnection, body: bytes | None) -> Response:
+        """Answer a GET or POST of /adapters."""
+        if body is None:
+            return connection.respond(http.HTTPStatus.OK, self._adapters.listed())
+        if not self._token:
+            text = "adapters are changed only with a token: start the server with --token-file\n"
+            return connection.respond(http.HTTPStatus.FORBIDDEN, text)
+        return connection.respond(*await self._adapters.change(body))
 
     async def _handle(self, connection: ServerConnection) -> None:
         """Serve one connection until it closes."""
@@ -160,7 +176,7 @@ class PolicyServer:
         self.counts.update(("connections", "open_connections"))
         _log.info("client %d connected from %s", client.number, _peer(connection))
         try:
-            await connection.send(self._metadata)
+            await connection.send(wire.pack(describe(self._policy)))
             async for frame in connection:
                 await self._answer(connection, client, frame)
         except ConnectionClosed:
@@ -194,18 +210,15 @@ class PolicyServer:
         }
         await connection.send(wire.pack(reply))
         client.previous_ms = (time.perf_counter() - start) * 1e3
-        self._seconds.observe(adapter, client.previous_ms / 1e3)
+        self._seconds.observe(str(adapter), client.previous_ms / 1e3)
         self.counts["requests"] += 1
 
-    def _read(self, client: ClientState, frame: bytes) -> tuple[str, Any, int | None]:
-        """Return the adapter's name, the row and the number of action dimensions."""
+    def _read(self, client: ClientState, frame: bytes) -> tuple[Any, Any, int | None]:
+        """Return the adapter, the row and the number of action dimensions."""
         request = parse(wire.unpack(frame, max_values=MAX_VALUES), self._policy.spec)
         self._warn(request.unknown)
-        adapters = list(self._policy.instructions)
-        adapter = request.adapter or adapters[0]
-        if adapter not in adapters:
-            raise ValueError(f"adapter must be one of {', '.join(adapters)}, got {adapter!r}")
-        row = self._policy.prepare(*client.advance(request))
+        adapter = self._policy.route(request)
+        row = self._policy.prepare(adapter, *client.advance(request))
         return adapter, row, request.actions
 
     def _warn(self, keys: Iterable[str]) -> None:

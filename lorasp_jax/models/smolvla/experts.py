@@ -119,8 +119,11 @@ class ActionExpert(nnx.Module):
             cross-attention layers, and the adapters' aux.
         """
         even, odd = (jax.tree.map(lambda a, i=i: a[i::2], cache) for i in (0, 1))
+        pairs = self.blocks
         _, (cross, aux) = scan_depth(
-            self.blocks.cross_layer,
+            nnx.List([pair.cross_layer for pair in pairs])
+            if isinstance(pairs, nnx.List)  # from `unstack`
+            else pairs.cross_layer,
             lambda block, valid, cache: (valid, block.project_cache(cache, valid)),
             valid,
             odd,

@@ -15,7 +15,7 @@ ARM_STEP = np.array([0.03, 0, 0, 0, 0, 0, 0])  # rad per action
 class Still(StandIn):
     """Answers with the state, so that the arm does not move."""
 
-    def prepare(self, request, index):
+    def prepare(self, adapter, request, index):
         self.last_request = request
         return request.state
 

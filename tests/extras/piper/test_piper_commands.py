@@ -92,10 +92,10 @@ def test_an_episode_may_end_with_an_open_question(tmp_path, capsys, limit):
 class Leaving(Still):
     """Refuses the request number `last`, from 0, after which the server closes the connection."""
 
-    def prepare(self, request, index):
+    def prepare(self, adapter, request, index):
         if index[1] == self.last:
             raise ValueError("the policy has left")
-        return super().prepare(request, index)
+        return super().prepare(adapter, request, index)
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,15 @@ class StandIn:
         self.batches, self.indices = [], []
         self.gate.set()
 
-    def prepare(self, request, index):
+    def route(self, request):
+        adapter = request.adapter or next(iter(self.instructions))
+        if adapter not in self.instructions:
+            known = ", ".join(self.instructions)
+            raise ValueError(f"adapter must be one of {known}, got {adapter!r}")
+        return adapter
+
+    def prepare(self, adapter, request, index):
+        del adapter
         self.last_request = request
         self.indices.append(index)
         first = request.images[self.spec.cameras[0]]

@@ -19,6 +19,7 @@ import lorasp_jax
 from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io import native
+from lorasp_jax.base.arguments import named
 from lorasp_jax.extras.serving import __main__ as command
 from lorasp_jax.extras.serving import loading
 from lorasp_jax.extras.serving.client import PolicyClient, PolicyError, ServerGone
@@ -111,10 +112,10 @@ def test_options_without_effect_are_refused(run, capsys):
 
 
 def test_names_of_policies(tmp_path):
-    assert command._named("runs/press") == ("press", "runs/press")
-    assert command._named("a=runs/press") == ("a", "runs/press")
+    assert named("runs/press") == ("press", "runs/press")
+    assert named("a=runs/press") == ("a", "runs/press")
     (tmp_path / "lr=0.1").mkdir()
-    assert command._named(str(tmp_path / "lr=0.1")) == ("lr=0.1", str(tmp_path / "lr=0.1"))
+    assert named(str(tmp_path / "lr=0.1")) == ("lr=0.1", str(tmp_path / "lr=0.1"))
 
 
 def test_without_a_seed_every_server_draws_one(run, capsys, monkeypatch):
@@ -127,7 +128,7 @@ def test_without_a_seed_every_server_draws_one(run, capsys, monkeypatch):
         seeds.append(seed)
         raise Stop
 
-    monkeypatch.setattr(command, "_compiled", lambda options, named: {})
+    monkeypatch.setattr(command, "_compiled", lambda options, named: ({}, None))
     monkeypatch.setattr("lorasp_jax.extras.serving.served.ServedPolicies", serve)
     for words in (["--seed", "0"], [], []):
         with pytest.raises(Stop):

@@ -23,6 +23,7 @@ from tests.extras.serving.stand_in import connect, observation, serving
 from tests.extras.serving.test_policies import (
     INSTRUCTIONS,
     STEPS,
+    actions,
     compiled,
     make_policy,
     reference,
@@ -91,25 +92,25 @@ def test_served_exports_act_like_served_runs(loaded, other_folder):
     assert served.instructions == expected.instructions
     assert (served.sizes, served.metadata) == ((1,), ROBOT)
     asked = request(served.spec, absent=["wrist"], adapter="other")
-    actions = [p.run("other", [p.prepare(asked, (2, 5))]) for p in (served, expected)]
-    np.testing.assert_allclose(*actions, atol=1e-5)
+    found = [actions(each, asked, index=(2, 5)) for each in (served, expected)]
+    np.testing.assert_allclose(*found, atol=1e-5)
     two = [request(served.spec), request(served.spec, 1, INSTRUCTIONS[0])]
-    both = served.run("base", [served.prepare(each, (0, 0)) for each in two])
-    alone = [expected.run("base", [expected.prepare(each, (0, 0))])[0] for each in two]
+    both = actions(served, *two)
+    alone = [actions(expected, each)[0] for each in two]
     np.testing.assert_allclose(both, alone, atol=1e-5)
 
 
 def test_served_exports_continue_chunks(loaded):
     served = ServedPolicies({"base": loaded}, execution="trained")
     first = request(served.spec)
-    previous = served.run("base", [served.prepare(first, (0, 0))])[0]
+    previous = actions(served, first)[0]
     naive = ServedPolicies({"base": loaded})
-    independent = naive.run("base", [naive.prepare(first, (0, 0))])[0]
+    independent = actions(naive, first)[0]
     np.testing.assert_allclose(previous, independent, atol=1e-5)
     second = dataclasses.replace(first, previous=previous, executed=1, delay=2)
-    actions = served.run("base", [served.prepare(second, (0, 1))])[0]
-    np.testing.assert_allclose(actions[:2], previous[1:3], atol=1e-5)
-    assert np.abs(actions[2] - independent[2]).max() > 1e-4
+    found = actions(served, second, index=(0, 1))[0]
+    np.testing.assert_allclose(found[:2], previous[1:3], atol=1e-5)
+    assert np.abs(found[2] - independent[2]).max() > 1e-4
 
 
 def load(*words):

@@ -21,6 +21,7 @@ from lorasp_jax.models.inputs import OPENPI
 from lorasp_jax.models.pi0 import Pi0Config
 from tests import ROOT
 from tests.extras.serving import openpi_requests
+from tests.extras.serving.test_policies import actions, prepared
 from tests.models.random_models import random_backbone
 
 GOLDEN = ROOT / "tests" / "golden"
@@ -91,7 +92,7 @@ def test_served_like_openpi(name, tmp_path, echo):
     served = ServedPolicies({"base": CompiledPolicy(loaded, max_batch=1)})
     cameras = 1 if "sim" in name else 2 if "towel" in name else 3
     message = openpi_requests.request(robot, number, cameras, prompt=not named.prompt)
-    row = served.prepare(requests.parse(message, served.spec), (0, 0))
+    row = prepared(served, requests.parse(message, served.spec))
     row.pop("index")
 
     expected = {key: EXPECTED[f"{name}/{key}"] for key in ("state", "targets", "actions")}
@@ -191,7 +192,7 @@ def test_a_default_prompt_and_the_pose_to_start_from_are_served(tmp_path, echo):
     assert said["cameras"] == ["cam_high", "cam_left_wrist", "cam_right_wrist"]
     request = requests.parse(openpi_requests.request("aloha", 0, prompt=False), served.spec)
     given = dataclasses.replace(request, prompt="fold the towel")
-    rows = [served.prepare(each, (0, 0)) for each in (request, given)]
+    rows = [prepared(served, each) for each in (request, given)]
     np.testing.assert_array_equal(rows[0]["ids"], rows[1]["ids"])
 
 
@@ -260,8 +261,7 @@ def test_a_network_of_relative_actions_is_served(weights, monkeypatch):
     message = openpi_requests.request("libero", 3) | {"prompt": "press the button"}
     answers = {}
     for name, policy in served.items():
-        row = policy.prepare(requests.parse(message, policy.spec), (0, 0))
-        answers[name] = policy.run("base", [row])[0]
+        answers[name] = actions(policy, requests.parse(message, policy.spec))[0]
     assert answers["named"].shape == (4, 7)
     added = np.broadcast_to(np.append(message["observation/state"][:6], 0), (4, 7))
     np.testing.assert_allclose(answers["named"] - answers["absolute"], added, atol=1e-6)

@@ -89,8 +89,12 @@ def noise_of(spec, connection=0, request=0):
 
 
 def actions(served, *requests, index=(0, 0)):
-    rows = [served.prepare(each, index) for each in requests]
-    return served.run(requests[0].adapter or "base", rows)
+    adapter = served.route(requests[0])
+    return served.run(adapter, [served.prepare(adapter, each, index) for each in requests])
+
+
+def prepared(served, sent):
+    return served.prepare(served.route(sent), sent, (0, 0))
 
 
 @pytest.fixture(scope="module")
@@ -173,14 +177,14 @@ def test_programs_are_shared_and_compiled_in_advance():
 
 def test_prompts(served):
     with pytest.raises(ValueError, match="must contain a prompt"):
-        served.prepare(request(served.spec, prompt=None), (0, 0))
+        prepared(served, request(served.spec, prompt=None))
     with pytest.raises(ValueError, match="ASCII"):
-        served.prepare(request(served.spec, prompt="鼠"), (0, 0))
+        prepared(served, request(served.spec, prompt="鼠"))
     single = compiled({"base": make_policy(instructions=("open the pot",))})
     default = compiled({"base": make_policy()}, prompt="open the pot")
-    expected = served.prepare(request(served.spec, prompt="open the pot"), (0, 0))["ids"]
+    expected = prepared(served, request(served.spec, prompt="open the pot"))["ids"]
     for each in (single, default):
-        found = each.prepare(request(served.spec, prompt=None), (0, 0))["ids"]
+        found = prepared(each, request(served.spec, prompt=None))["ids"]
         np.testing.assert_array_equal(found, expected)
     assert single.instructions == {"base": ("open the pot",)}
 
