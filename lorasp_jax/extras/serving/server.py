@@ -239,6 +239,7 @@ def describe(policy: "ServedPolicies") -> dict[str, Any]:
         "server": f"lorasp_jax {lorasp_jax.__version__}",
         "cameras": list(spec.cameras),
         "image_size": spec.image_size,
+        "encodings": ["raw", "jpeg"],
         "action_dim": spec.action_length,
         "action_horizon": spec.chunk,
         "adapters": list(policy.instructions),
