@@ -1,7 +1,6 @@
 """The policies of a server: runs, a checkpoint or exported policies of one robot."""
 
 import dataclasses
-import functools
 import itertools
 import logging
 from collections.abc import Callable, Mapping, Sequence
@@ -63,8 +62,9 @@ class ServedPolicies:
         }
         sizes = [set(policy.description.batch_sizes) for policy in policies.values()]
         self.sizes: tuple[int, ...] = tuple(sorted(set.intersection(*sizes)))
-        draw = jax.vmap(functools.partial(draw_noise, jax.random.key(seed)), (0, None))
-        self._draw = jax.jit(draw, static_argnums=1)
+        # The key is an argument, as a constant would make a program of its own for every seed.
+        self._key = jax.random.key(seed)
+        self._draw = jax.jit(jax.vmap(draw_noise, (None, 0, None)), static_argnums=2)
 
     def warm_up(self, say: Callable[[str], None] = lambda _: None) -> None:
         """Compile and run every program; `say` is told of each before it starts."""
@@ -126,7 +126,7 @@ class ServedPolicies:
         policy = self._policies[adapter]
         batch = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
         shape = (policy.description.chunk, policy.description.action_dim)
-        noise = self._draw(batch.pop("index"), shape)
+        noise = self._draw(self._key, batch.pop("index"), shape)
         return policy.run({**batch, "noise": noise})
 
 
