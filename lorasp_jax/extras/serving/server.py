@@ -113,6 +113,10 @@ class PolicyServer:
         ) as server:
             yield server
 
+    def problem(self) -> str | None:
+        """Say why the policy does not answer; None if it does, or has nothing to answer."""
+        return self._batcher.problem()
+
     def close(self, timeout: float | None = None) -> bool:
         """Stop the policy's thread; return False if it does not answer in time [s]."""
         return self._batcher.close(timeout)
@@ -122,7 +126,7 @@ class PolicyServer:
     ) -> Response | None:
         """Answer pages, and refuse connections without the token or beyond the limit."""
         if request.path == "/healthz":
-            problem = self._batcher.problem()
+            problem = self.problem()
             status = http.HTTPStatus.SERVICE_UNAVAILABLE if problem else http.HTTPStatus.OK
             return connection.respond(status, f"{problem or 'OK'}\n")
         if refusal := self._refusal(request):

@@ -10,7 +10,7 @@ from tests.extras.serving.test_policies import compiled, make_policy
 
 
 def test_servers_of_different_seeds_run_the_same_programs():
-    """A seed that is a constant of a program would let the compilation cache miss at every start."""
+    """If a seed were a constant of a program, every start would compile it."""
     policies = [compiled({"base": make_policy()}, seed=seed) for seed in (1, 2)]
     index = jax.ShapeDtypeStruct((1, 2), "int32")
     first, second = (each._draw.lower(each._key, index, (4, 7)).as_text() for each in policies)
