@@ -3,11 +3,25 @@
 import argparse
 import functools
 import json
+import socket
+import socketserver
+import threading
+import time
 
 import jax
+import numpy as np
 import pytest
 
-from benchmarks import compile_time, data, deployment, long_run, scaling, serving, small_cards
+from benchmarks import (
+    compile_time,
+    data,
+    deployment,
+    long_run,
+    pictures,
+    scaling,
+    serving,
+    small_cards,
+)
 from benchmarks.deployment import Case
 from lorasp_jax import peft
 from lorasp_jax.data.cache import Cache
@@ -179,3 +193,38 @@ def test_deployment():
     assert {row["change"] for row in rows[4:]} == {"", "separate", "graph", "cudnn"}
     assert rows[0]["ratio"] == 1
     assert all(row["ms"] > 0 for row in rows)
+
+
+def test_the_link_delays_and_throttles():
+    """12.5 kB at 1 Mbit/s take 100 ms, and 25 ms there and back each."""
+
+    class Echo(socketserver.BaseRequestHandler):
+        def handle(self):
+            while data := self.request.recv(4096):
+                self.request.sendall(data)
+
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Echo) as server:
+        server.daemon_threads = True
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        seconds = []
+        with (
+            pictures.Link(server.server_address[1], bits=1e6, round_trip=0.05) as link,
+            socket.create_connection(("127.0.0.1", link.port)) as client,
+        ):
+            for size in (1, 12_500):
+                start = time.monotonic()
+                client.sendall(bytes(size))
+                while size := size - len(client.recv(min(size, 4096))):
+                    pass
+                seconds.append(time.monotonic() - start)
+        server.shutdown()
+    assert seconds[0] >= 0.05
+    assert 0.15 <= seconds[1] < 2
+
+
+def test_jpeg_costs_fewer_bytes_and_some_time():
+    x = np.linspace(0, 255, 64).astype(np.uint8)
+    observation = {"image": {"side": np.broadcast_to(x[:, None, None], (64, 64, 3))}}
+    raw, small = (pictures.costs(observation, quality) for quality in (None, 90))
+    assert small["kB a call"] < raw["kB a call"] / 5
+    assert raw["encode ms"] == 0 < min(small.values())

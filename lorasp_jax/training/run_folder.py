@@ -12,10 +12,6 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
-from tensorboardX import summary
-from tensorboardX.event_file_writer import EventsWriter
-from tensorboardX.proto.event_pb2 import Event, SessionLog
-from tensorboardX.proto.summary_pb2 import Summary
 
 from envs.scene.ranges import Randomization
 from lorasp_jax.base.digest import verify_digest, with_digest
@@ -231,7 +227,8 @@ def _differences(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -
 class MetricsLog:
     """Appends scalars to `metrics.jsonl` and to TensorBoard event files.
 
-    Only the first process writes.
+    Only the first process writes. It alone imports tensorboardX, which imports PyTorch where that
+    is installed: 3 s of which readers of a run folder, such as a server, have nothing.
     """
 
     def __init__(self, folder: Path, start_step: int = 0) -> None:
@@ -240,6 +237,9 @@ class MetricsLog:
         self._writes = processes.is_first()
         if not self._writes:
             return
+        from tensorboardX.event_file_writer import EventsWriter
+        from tensorboardX.proto.event_pb2 import SessionLog
+
         rows = [row for row in read_metrics(folder) if row["step"] <= start_step]
         write_text(self.path, "".join(map(_line, rows)))
         board = folder / "tensorboard"
@@ -262,6 +262,9 @@ class MetricsLog:
         """
         if not self._writes:
             return
+        from tensorboardX import summary
+        from tensorboardX.proto.summary_pb2 import Summary
+
         values = {name: value for name, value in values.items() if math.isfinite(value)}
         with self.path.open("a") as file:
             file.write(_line({"step": step, **values}))
@@ -273,6 +276,8 @@ class MetricsLog:
         self._add(step, summary=Summary(value=[value for s in summaries for value in s.value]))
 
     def _add(self, step: int, **content: Any) -> None:
+        from tensorboardX.proto.event_pb2 import Event
+
         self._board.write_event(Event(wall_time=time.time(), step=step, **content))
         self._board.flush()
 

@@ -34,6 +34,8 @@ def add_shared(parser: argparse.ArgumentParser) -> None:
         "default: one of the task's")  # fmt: skip
     add("--patience", type=float, default=2.0, metavar="S", help="longest time to wait for an "
         "answer [s] (default: %(default)s)")  # fmt: skip
+    add("--jpeg", type=int, metavar="QUALITY", help="send pictures as JPEG of this quality, 1 to "
+        "100, for slow links; default: as they are")  # fmt: skip
     add = parser.add_argument_group("execution").add_argument
     add("--episodes", type=positive, default=1, help="default: %(default)s")
     add("--record", type=Path, metavar="FOLDER", help="add the successful episodes to an RLDS "

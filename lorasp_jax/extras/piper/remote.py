@@ -95,12 +95,13 @@ def policy(options: argparse.Namespace) -> Iterator[Server]:
     Raises:
         ServerGone: there is no server.
         OSError: the token cannot be read.
-        ValueError: the policy is of another robot or of another size, or its period is not the
-            one given.
+        ValueError: the policy is of another robot or of another size, or the server does not read
+            JPEG.
     """
     token = options.token_file.read_text().strip() if options.token_file else ""
     say = functools.partial(print, flush=True)
-    with PolicyClient(options.server, token=token, wait=_WAIT, say=say) as client:
+    settings = {"token": token, "wait": _WAIT, "jpeg": options.jpeg, "say": say}
+    with PolicyClient(options.server, **settings) as client:
         try:
             json_values.check(client.metadata, _SCHEMA, nulls=True)
         except ValueError as error:

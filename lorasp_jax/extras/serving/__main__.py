@@ -19,6 +19,7 @@ from rich.console import Console
 
 from lorasp_jax.base.arguments import indices, named, pair, positive
 from lorasp_jax.base.errors import run_command
+from lorasp_jax.extras.serving import manager
 
 GRACE = 5.0
 """Time that the policy has for its last answer [s]; a container is killed 10 s after SIGTERM."""
@@ -129,7 +130,8 @@ def _serve(options: argparse.Namespace, console: Console) -> None:
 async def _run(policy_server: Any, port: socket.socket, console: Console) -> bool:
     """Serve until SIGINT or SIGTERM; return whether the policy then still answered.
 
-    A second signal ends the process by the system, whatever hangs.
+    A service manager is told when clients can connect, and that the policy answers. A second
+    signal ends the process by the system, whatever hangs.
     """
     stop, loop = asyncio.Event(), asyncio.get_running_loop()
     for number in _SIGNALS:
@@ -138,7 +140,11 @@ async def _run(policy_server: Any, port: socket.socket, console: Console) -> boo
         host, number = port.getsockname()[:2]
         host = f"[{host}]" if ":" in host else host
         _say(console, f"listening on ws://{host}:{number}")
+        manager.notify("READY=1")
+        watch = asyncio.create_task(manager.watch(policy_server.problem))
         await stop.wait()
+        watch.cancel()
+        manager.notify("STOPPING=1")
         for number in _SIGNALS:
             loop.remove_signal_handler(number)
             signal.signal(number, signal.SIG_DFL)
@@ -275,7 +281,9 @@ def _read_token(path: Path | None, console: Console) -> str:
     with contextlib.suppress(FileExistsError), open(path, "x", opener=_privately) as file:
         file.write(secrets.token_urlsafe() + "\n")
         _say(console, f"wrote a fresh token to {path}")
-    if path.stat().st_mode & 0o077:
+    # systemd guards its credentials by access lists, whose mask is where a group's rights would be.
+    guarded = str(path.parent) == os.environ.get("CREDENTIALS_DIRECTORY")
+    if path.stat().st_mode & 0o077 and not guarded:
         try:
             path.chmod(0o600)
             _say(console, f"{path} was open to other users, and is so no more (mode 0600)")

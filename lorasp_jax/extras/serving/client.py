@@ -5,7 +5,7 @@
         reply = policy.infer({"image": {"side": ..., "wrist": ...}, "state": ..., "prompt": "..."})
         reply["actions"]  # [C, J+1]
 
-Needs only NumPy, msgpack and websockets. Works with openpi's servers too.
+Needs only NumPy, msgpack and websockets, and Pillow for JPEG. Works with openpi's servers too.
 """
 
 import asyncio
@@ -59,6 +59,7 @@ class PolicyClient:
         token: str = "",
         timeout: float = 10.0,
         wait: float = 0.0,
+        jpeg: int | None = None,
         say: Callable[[str], None] = lambda _: None,
     ) -> None:
         """Connect to a server.
@@ -70,13 +71,18 @@ class PolicyClient:
             timeout: how long to wait for the connection and for each reply [s].
             wait: how long to try again if there is no server yet, its name is not known yet, or it
                 or a proxy says that it is not ready (502, 503, 504) [s].
+            jpeg: quality, 1 to 100, of pictures that are sent as JPEG; None: as they are.
             say: told why it waits, once for each reason.
 
         Raises:
+            ValueError: the quality is out of range, or the server does not read JPEG.
             ServerGone: there is no server at this address, it requires another token, or its
                 certificate is not trusted.
         """
+        if jpeg is not None and not 1 <= jpeg <= 100:
+            raise ValueError(f"the quality of JPEG must be 1 to 100, got {jpeg}")
         self.address: str = address
+        self._jpeg = jpeg
         self._timeout, self._reset = timeout, False
         self._closing = threading.Lock()
         self._options: dict[str, Any] = {
@@ -94,6 +100,9 @@ class PolicyClient:
         try:
             self._socket = self._run(self._connect(wait, say))
             self.metadata: dict[str, Any] = self._exchange(None, timeout)
+            encodings = self.metadata.get("encodings")
+            if jpeg is not None and not (isinstance(encodings, list) and "jpeg" in encodings):
+                raise ValueError(f"{address} does not read JPEG: send pictures as they are")
         except BaseException:
             self.close()
             raise
@@ -112,8 +121,13 @@ class PolicyClient:
                 or its reply is malformed.
             ServerGone: the connection is lost, or no reply came in time. The connection is closed,
                 since a late reply could be mistaken for the next one.
+            ValueError: a picture that is to be sent as JPEG is none.
             TypeError: the observation contains something else than numbers, text and arrays.
         """
+        if self._jpeg is not None:
+            from lorasp_jax.extras.serving.jpeg import compress
+
+            observation = compress(observation, self._jpeg)
         frame = wire.pack({**observation, "reset": True} if self._reset else observation)
         try:
             reply = self._exchange(frame, self._timeout if timeout is None else timeout)

@@ -30,7 +30,7 @@ def to_square(
     Raises:
         ValueError: wrong dtype, shape or values; the message names the picture.
     """
-    picture = _to_uint8(name, _to_height_width_channels(name, picture))
+    picture = to_uint8(name, picture)
     height, width = picture.shape[:2]
     if height == width == size:
         return picture
@@ -41,6 +41,18 @@ def to_square(
     result = np.zeros((size, size, 3), np.uint8)
     result[top : top + inner[0], left : left + inner[1]] = _resize(picture, inner, antialias)
     return result
+
+
+def to_uint8(name: str, picture: Any) -> np.ndarray:
+    """Return a picture as uint8 `[H, W, 3]`; arguments and errors are those of `to_square`."""
+    picture = _to_height_width_channels(name, picture)
+    if picture.dtype == np.uint8:
+        return picture
+    if picture.dtype.kind != "f":
+        raise ValueError(f"{name} must be uint8, or float in [0, 1], got {picture.dtype}")
+    if not (picture.min() >= 0 and picture.max() <= 1):  # also false if a value is NaN
+        raise ValueError(f"the values of {name} must be finite and in [0, 1]")
+    return (picture * 255).astype(np.uint8)  # truncates, as openpi does (policies/libero_policy.py)
 
 
 def _to_height_width_channels(name: str, picture: Any) -> np.ndarray:
@@ -55,16 +67,6 @@ def _to_height_width_channels(name: str, picture: Any) -> np.ndarray:
             f"the sides of {name} must be 1 to {MAX_SIDE} pixels, got {picture.shape[:2]}"
         )
     return picture
-
-
-def _to_uint8(name: str, picture: np.ndarray) -> np.ndarray:
-    if picture.dtype == np.uint8:
-        return picture
-    if picture.dtype.kind != "f":
-        raise ValueError(f"{name} must be uint8, or float in [0, 1], got {picture.dtype}")
-    if not (picture.min() >= 0 and picture.max() <= 1):  # also false if a value is NaN
-        raise ValueError(f"the values of {name} must be finite and in [0, 1]")
-    return (picture * 255).astype(np.uint8)  # truncates, as openpi does (policies/libero_policy.py)
 
 
 def _resize(picture: np.ndarray, shape: tuple[int, int], antialias: bool) -> np.ndarray:

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from lorasp_jax.extras.serving import jpeg
 from lorasp_jax.extras.serving.exported import PolicyInterface
 from lorasp_jax.extras.serving.pictures import to_square
 
@@ -194,6 +195,8 @@ def _images(message: Mapping[str, Any], form: Form, spec: PolicySpec) -> dict[st
     images = {}
     for number, (camera, key) in enumerate(zip(spec.cameras, keys, strict=False)):
         picture = _lookup(message, key)
+        if isinstance(picture, bytes):
+            picture = jpeg.decode(key, picture)
         if picture is not None:
             images[camera] = to_square(
                 key, picture, spec.image_size, centred=spec.centred, antialias=spec.antialias

@@ -89,8 +89,9 @@ class ServedPolicies:
         self._change = threading.Lock()
         sizes = [set(policy.description.batch_sizes) for policy in policies.values()]
         self.sizes: tuple[int, ...] = tuple(sorted(set.intersection(*sizes)))
-        draw = jax.vmap(functools.partial(draw_noise, jax.random.key(seed)), (0, None))
-        self._draw = jax.jit(draw, static_argnums=1)
+        # The key is an argument, as a constant would make a program of its own for every seed.
+        self._key = jax.random.key(seed)
+        self._draw = jax.jit(jax.vmap(draw_noise, (None, 0, None)), static_argnums=2)
         self._embed = functools.lru_cache(CACHED_PROMPTS)(self._embedding)
 
     @property
@@ -233,7 +234,8 @@ class ServedPolicies:
         """Return actions f32 `[B, C, J+1]`; B is one of `sizes`."""
         batch = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
         description = adapter.policy.description
-        noise = self._draw(batch.pop("index"), (description.chunk, description.action_dim))
+        shape = description.chunk, description.action_dim
+        noise = self._draw(self._key, batch.pop("index"), shape)
         return adapter.policy.run({**batch, "noise": noise})
 
 

@@ -114,6 +114,10 @@ class PolicyServer:
         ) as server:
             yield server
 
+    def problem(self) -> str | None:
+        """Say why the policy does not answer; None if it does, or has nothing to answer."""
+        return self._batcher.problem()
+
     def close(self, timeout: float | None = None) -> bool:
         """Stop the policy's thread; return False if it does not answer in time [s]."""
         return self._batcher.close(timeout)
@@ -127,7 +131,7 @@ class PolicyServer:
             text = "POST is for /adapters\n"
             return connection.respond(http.HTTPStatus.METHOD_NOT_ALLOWED, text)
         if request.path == "/healthz":
-            problem = self._batcher.problem()
+            problem = self.problem()
             status = http.HTTPStatus.SERVICE_UNAVAILABLE if problem else http.HTTPStatus.OK
             return connection.respond(status, f"{problem or 'OK'}\n")
         if refusal := self._refusal(request):
@@ -252,6 +256,7 @@ def describe(policy: "ServedPolicies") -> dict[str, Any]:
         "server": f"lorasp_jax {lorasp_jax.__version__}",
         "cameras": list(spec.cameras),
         "image_size": spec.image_size,
+        "encodings": ["raw", "jpeg"],
         "action_dim": spec.action_length,
         "action_horizon": spec.chunk,
         "adapters": list(policy.instructions),

@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from unittest.mock import Mock
+from unittest.mock import Mock, patch
 
 import av
 import numpy as np
@@ -14,6 +14,7 @@ from lorasp_jax.extras.piper import remote
 from lorasp_jax.extras.piper.__main__ import main as real
 from lorasp_jax.extras.piper.fake import __main__ as faking
 from lorasp_jax.extras.piper.fake.__main__ import main as fake
+from lorasp_jax.extras.serving import jpeg
 from lorasp_jax.extras.serving.client import PolicyClient
 from tests.cases import mostly_slow
 from tests.extras.piper.piper_runs import Still
@@ -70,11 +71,15 @@ def test_the_command_line_chooses_task_and_image_size(shared_world, tmp_path):
 
 
 @pytest.mark.usefixtures("patient")
-@pytest.mark.parametrize("more", mostly_slow([[], ["--realtime"]], [[]]))
+@pytest.mark.parametrize(
+    "more", mostly_slow([["--jpeg", "90"], [], ["--realtime"]], [["--jpeg", "90"]])
+)
 def test_a_served_policy_on_the_fake_arm(server, tmp_path, capsys, limit, more):
     limit(1.0)
     words = ["--server", server.address, "--log", str(tmp_path / "log"), *more]
-    assert fake([*words, "--latency", "0.1", "--thinking", "0.1"]) == 0
+    with patch.object(jpeg, "decode", wraps=jpeg.decode) as decode:
+        assert fake([*words, "--latency", "0.1", "--thinking", "0.1"]) == 0
+    assert decode.called == ("--jpeg" in more)
     assert "episode 0: failure\n" in capsys.readouterr().out
     assert server.policy.last_request.images["wrist"].shape == (16, 16, 3)
     assert server.policy.last_request.prompt
