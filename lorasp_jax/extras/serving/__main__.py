@@ -34,7 +34,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     """Return the argument parser of this command."""
     parser = argparse.ArgumentParser(
         prog=program,
-        description="Serve a policy over websockets, in openpi's protocol.",
+        description="Serve a policy over websockets, in openpi's protocol or vla-eval's.",
         epilog="Pages on the same port: /healthz and /status. See docs/serving.md.",
     )
     add = parser.add_argument
@@ -64,6 +64,8 @@ def parser(program: str) -> argparse.ArgumentParser:
         "(default: %(default)s); see docs/latency.md",
     )
     add("--guidance", type=float, help="limit of the guidance (default: 10)")
+    add("--vla-eval", type=positive, metavar="N", help="answer vla-eval's protocol, executing N "
+        "actions of each chunk; it knows no token, so only on 127.0.0.1")  # fmt: skip
     add("--base", default="", help="the run's base, if it has moved")
     add("--tokenizer", default="", help="the policy's tokenizer; runs record theirs")
     _add_checkpoint_options(parser.add_argument_group("published checkpoints"))
@@ -94,10 +96,18 @@ def _serve(options: argparse.Namespace, console: Console) -> None:
     from lorasp_jax.extras.serving import server
 
     token = _read_token(options.token_file)
+    if options.vla_eval:
+        from lorasp_jax.extras.serving import vla_eval  # before what takes long
+
+        _refuse(options, ("token_file",), "has no effect with --vla-eval")
+        with server.bind(options.host, options.port) as port:
+            policy_server = vla_eval.VlaEvalServer(_load(options, console), options.vla_eval)
+            asyncio.run(_run(policy_server, port, console))
+        return
     with server.bind(options.host, options.port, token=token) as port:  # before what takes long
-        policy = _load(options, console)
-        policy_server = server.PolicyServer(policy, token=token)
+        policy_server = server.PolicyServer(_load(options, console), token=token)
         asyncio.run(_run(policy_server, port, console))
+    policy_server.close()
 
 
 async def _run(policy_server: Any, port: socket.socket, console: Console) -> None:
@@ -105,13 +115,12 @@ async def _run(policy_server: Any, port: socket.socket, console: Console) -> Non
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    host, number = port.getsockname()[:2]
+    host = f"[{host}]" if ":" in host else host
     async with policy_server.listen(port):
-        host, number = port.getsockname()[:2]
-        host = f"[{host}]" if ":" in host else host
         _say(console, f"listening on ws://{host}:{number}")
         await stop.wait()
         _say(console, "closing connections")
-    policy_server.close()
 
 
 def _load(options: argparse.Namespace, console: Console) -> Any:
