@@ -13,7 +13,7 @@ import dataclasses
 from typing import Any, ClassVar
 
 import jax
-import numpy as np
+import jax.numpy as jnp
 from vla_eval.benchmarks.base import StepBenchmark, StepResult
 from vla_eval.specs import IMAGE_RGB, LANGUAGE, STATE_JOINT, DimSpec
 
@@ -88,7 +88,7 @@ class SimulatedTasks(StepBenchmark):
         """
         if "actions" not in action:
             raise ValueError(f"the server must send actions, got {', '.join(action) or 'nothing'}")
-        target = np.asarray(action["actions"], np.float32)
+        target = jnp.asarray(action["actions"], jnp.float32)
         state = self._env.step(self._last_result.obs, target[None])
         info = {"success": bool(state.info["success"][0])}
         return StepResult(state, float(state.reward[0]), bool(state.done[0]), info)

@@ -137,7 +137,7 @@ class Batcher:
                 job.future.set_exception(PolicyFailure(message))
 
 
-def padded(rows: Sequence[Any], sizes: Sequence[int]) -> list[Any]:
+def padded(rows: list[Any], sizes: Sequence[int]) -> list[Any]:
     """Append copies of the first row up to the next of the ascending batch sizes."""
     size = next(size for size in sizes if size >= len(rows))
-    return [*rows, *rows[:1] * (size - len(rows))]
+    return rows + rows[:1] * (size - len(rows))
