@@ -44,7 +44,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     """Return the argument parser of this command."""
     parser = argparse.ArgumentParser(
         prog=program,
-        description="Serve a policy over websockets, in openpi's protocol.",
+        description="Serve a policy over websockets, in openpi's protocol or vla-eval's.",
         epilog="Pages on the same port: /healthz, /status and /metrics. See docs/serving.md.",
     )
     add = parser.add_argument
@@ -84,6 +84,8 @@ def parser(program: str) -> argparse.ArgumentParser:
         "the nearest one; both refuse what is not clear (default: %(default)s)")  # fmt: skip
     add("--any-base", action="store_true", help="accept adapters of another base than they record")
     add("--guidance", type=float, help="limit of the guidance (default: 10)")
+    add("--vla-eval", type=positive, metavar="N", help="answer vla-eval's protocol, executing N "
+        "actions of each chunk; it knows no token, so only on 127.0.0.1")  # fmt: skip
     add("--base", default="", help="the run's base, if it has moved")
     add("--tokenizer", default="", help="the policy's tokenizer; runs record theirs")
     _add_checkpoint_options(parser.add_argument_group("published checkpoints"))
@@ -115,10 +117,18 @@ def _serve(options: argparse.Namespace, console: Console) -> None:
 
     logging.basicConfig(format="%(asctime)s %(message)s")
     logging.getLogger("lorasp_jax.extras.serving").setLevel(logging.INFO)
+    if options.vla_eval:
+        from lorasp_jax.extras.serving import vla_eval  # before what takes long
+
+        _refuse(options, ("token_file",), "has no effect with --vla-eval")
     token = _read_token(options.token_file, console)
     with server.bind(options.host, options.port, token=token) as port:  # before what takes long
-        policy = _load(options, console)
-        policy_server = server.PolicyServer(policy, token=token, max_clients=options.max_clients)
+        policy: Any = _load(options, console)
+        if options.vla_eval:
+            policy_server: Any = vla_eval.VlaEvalServer(policy, options.vla_eval)
+        else:
+            limit = options.max_clients
+            policy_server = server.PolicyServer(policy, token=token, max_clients=limit)
         answers = asyncio.run(_run(policy_server, port, console))
     if not answers:
         from lorasp_jax.training.distributed import processes
@@ -136,9 +146,9 @@ async def _run(policy_server: Any, port: socket.socket, console: Console) -> boo
     stop, loop = asyncio.Event(), asyncio.get_running_loop()
     for number in _SIGNALS:
         loop.add_signal_handler(number, stop.set)
+    host, number = port.getsockname()[:2]  # now, as a server may open the port itself
+    host = f"[{host}]" if ":" in host else host
     async with policy_server.listen(port):
-        host, number = port.getsockname()[:2]
-        host = f"[{host}]" if ":" in host else host
         _say(console, f"listening on ws://{host}:{number}")
         manager.notify("READY=1")
         watch = asyncio.create_task(manager.watch(policy_server.problem))

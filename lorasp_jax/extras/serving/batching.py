@@ -15,6 +15,7 @@ import queue
 import threading
 import time
 from collections import Counter
+from collections.abc import Sequence
 from concurrent.futures import Future, InvalidStateError
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -164,9 +165,7 @@ class Batcher:
         return [job for job in batch if job.future.set_running_or_notify_cancel()]
 
     def _run(self, batch: list[_Job]) -> None:
-        size = next(size for size in self._policy.sizes if size >= len(batch))
-        rows = [job.row for job in batch]
-        rows += rows[:1] * (size - len(rows))
+        rows = padded([job.row for job in batch], self._policy.sizes)
         start = time.perf_counter()
         try:
             actions = self._policy.run(batch[0].adapter, rows)
@@ -186,3 +185,9 @@ class Batcher:
                 job.answer(chunk, milliseconds)
             else:
                 job.fail("the policy returned actions that are not finite")
+
+
+def padded(rows: list[Any], sizes: Sequence[int]) -> list[Any]:
+    """Append copies of the first row up to the next of the ascending batch sizes."""
+    size = next(size for size in sizes if size >= len(rows))
+    return rows + rows[:1] * (size - len(rows))
