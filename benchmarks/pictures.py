@@ -146,6 +146,7 @@ class Closed:
     def run(self, seed: int, quality: int | None) -> np.ndarray:
         """Return the success of each world, bool `[W]`."""
         state, env, spec = self._reset(jax.random.key(seed)), self._env, self._served.spec
+        adapter = self._served.adapters[0]
         prompts = [env.instructions[row] for row in np.asarray(state.info["instruction"])]
         for call in range(-(-env.max_steps // EXECUTE)):
             seen = jax.tree.map(np.asarray, self._observe(state))
@@ -156,8 +157,8 @@ class Closed:
                 if quality:
                     message = jpeg.compress(message, quality)
                 index = seed * len(prompts) + world, call
-                rows.append(self._served.prepare(requests.parse(message, spec), index))
-            chunk = self._served.run(UNADAPTED, rows)
+                rows.append(self._served.prepare(adapter, requests.parse(message, spec), index))
+            chunk = self._served.run(adapter, rows)
             state = self._act(state, jnp.moveaxis(chunk[:, :EXECUTE], 1, 0))
             if np.asarray(state.done).all():
                 break

@@ -143,7 +143,7 @@ def test_a_later_chunk_that_is_too_short_is_refused_and_the_arm_goes_to_rest(ben
 @pytest.mark.usefixtures("near_rest")
 def test_a_server_that_dies_in_mid_chunk(bench):
     policy = StandIn()
-    policy.prepare = lambda request, index: request.state
+    policy.prepare = lambda adapter, request, index: request.state
     with contextlib.ExitStack() as stack:
         client = PolicyClient(stack.enter_context(serving(policy)).address)
         run = Run(bench, Server(client))

@@ -216,9 +216,7 @@ def test_a_state_that_no_demonstration_had_is_logged_once(caplog):
     served = compiled({"a": make_policy()}, max_batch=1)
     spec = served.spec
     for unit in (1.0, 1.0, 60.0, 60.0):  # radians, then degrees
-        served.prepare(
-            dataclasses.replace(request(spec), state=np.full(7, unit, np.float32)), (0, 0)
-        )
+        prepared(served, dataclasses.replace(request(spec), state=np.full(7, unit, np.float32)))
         assert len(caplog.records) == (unit > 1)
     assert "a state is 60, but" in caplog.text
     caplog.clear()
