@@ -16,7 +16,7 @@ from lorasp_jax.extras.piper.arm import NoArm, PiperArm
 from lorasp_jax.extras.piper.asking import InThread
 from lorasp_jax.extras.piper.cameras import Look, open_cameras
 from lorasp_jax.extras.piper.clock import RealClock
-from lorasp_jax.extras.piper.keys import Keys
+from lorasp_jax.extras.piper.keys import Keyboard
 from lorasp_jax.extras.piper.log import Log
 from lorasp_jax.extras.piper.recording import Recording
 from lorasp_jax.extras.piper.safety import Unsafe
@@ -26,7 +26,7 @@ from lorasp_jax.extras.piper.teaching import Lesson
 HELD = 3
 """Exit code after a problem in which the arm held."""
 KEYS = "sfaq"
-"""Keys of a person's verdict on an episode, which also end it."""
+"""Keyboard of a person's verdict on an episode, which also end it."""
 QUESTION = "success (s), failure (f), again (a) or quit (q)?"
 
 
@@ -77,7 +77,7 @@ class Rig(NamedTuple):
     server: remote.Server | None
     recorder: Recording | None
     log: Log | None
-    keys: Keys
+    keys: Keyboard
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -107,7 +107,7 @@ def _run(options: argparse.Namespace) -> int:
         if not (options.dry_run or options.teach == "leader"):
             arm.enable(shared.limits(options))
         log = stack.enter_context(contextlib.closing(shared.open_log(options))) if server else None
-        keys = stack.enter_context(Keys())
+        keys = stack.enter_context(Keyboard())
         return _episodes(options, Rig(arm, look, server, recorder, log, keys), prompts, seconds)
 
 

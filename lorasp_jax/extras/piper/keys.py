@@ -15,7 +15,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.
 """Those that end or suspend a program, and so must stop the arm."""
 
 
-class Keys:
+class Keyboard:
     """The keys that a person presses; use it as a context, which gives the terminal back.
 
     Attributes:

@@ -19,7 +19,7 @@ from lorasp_jax.extras.piper.__main__ import main as real
 from lorasp_jax.extras.piper.arm import PiperArm
 from lorasp_jax.extras.piper.fake.firmware import FakePiper
 from lorasp_jax.extras.piper.fake.timing import RealTime
-from lorasp_jax.extras.piper.keys import SIGNALS, Keys
+from lorasp_jax.extras.piper.keys import SIGNALS, Keyboard
 from lorasp_jax.extras.piper.recording import Recording
 from lorasp_jax.extras.piper.session import Session
 from tests.extras.piper.benches import channel
@@ -52,7 +52,7 @@ def linked(monkeypatch, film, world, patient):
     return ["--camera", f"side={film}", "--camera", f"wrist={film}", "--task", "press"]
 
 
-class Script(Keys):
+class Script(Keyboard):
     """Answers questions with the keys of a script."""
 
     def __init__(self, keys):
@@ -77,7 +77,7 @@ class Script(Keys):
 def press_keys(monkeypatch):
     def script(during, after):
         keys = Script(after)
-        monkeypatch.setattr(command, "Keys", lambda: keys)
+        monkeypatch.setattr(command, "Keyboard", lambda: keys)
         pending = [*during]
         keys.pressed = lambda seconds=0.0: pending.pop(0) if pending else ""
         return keys
@@ -190,7 +190,7 @@ def terminal(monkeypatch):
 
 def test_keys_come_without_enter_and_the_terminal_is_given_back(terminal):
     before = termios.tcgetattr(sys.stdin)
-    with Keys() as keys:
+    with Keyboard() as keys:
         assert keys.pressed() == ""
         terminal.write(b"xs")
         assert keys.ask("?", "sf") == "s"
@@ -202,7 +202,7 @@ def test_keys_come_without_enter_and_the_terminal_is_given_back(terminal):
 def test_in_the_background_the_terminal_is_left_alone(terminal, monkeypatch):
     monkeypatch.setattr(os, "tcgetpgrp", lambda _: -1)
     monkeypatch.setattr("tty.setcbreak", Mock(side_effect=AssertionError("suspended")))
-    with Keys() as keys:
+    with Keyboard() as keys:
         assert keys.ended
         terminal.write(b"s")
         assert keys.pressed() == ""
@@ -211,7 +211,7 @@ def test_in_the_background_the_terminal_is_left_alone(terminal, monkeypatch):
 def test_without_a_terminal_nobody_answers(monkeypatch):
     with open(os.devnull) as null:
         monkeypatch.setattr(sys, "stdin", null)
-        with Keys() as keys, pytest.raises(EOFError):
+        with Keyboard() as keys, pytest.raises(EOFError):
             keys.ask("?", "s")
         assert keys.ended
         assert keys.pressed() == ""
@@ -223,7 +223,7 @@ def test_an_episode_that_nobody_judges_is_not_lost(number, tmp_path, capsys, ter
     recorder = Recording(tmp_path / "data", prompt="press it", **ways)
     recorder.step({"side": np.zeros((16, 16, 3), np.uint8)}, np.ones(7), np.ones(7))
     handlers = {each: signal.getsignal(each) for each in SIGNALS}
-    rig = command.Rig(None, None, None, recorder, None, Keys())
+    rig = command.Rig(None, None, None, recorder, None, Keyboard())
 
     def interrupt(*_):
         signal.raise_signal(number)
