@@ -30,7 +30,7 @@ def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:
 def _stages(view: View) -> dict[str, jax.Array]:
     left, right = (pick_place.stages(view, name) for name in _BASKETS)
     is_left = view.apart("grape", _BASKETS[0]) < view.apart("grape", _BASKETS[1])
-    return jax.tree.map(lambda x, y: jnp.where(is_left, x, y), left, right)
+    return {name: jnp.where(is_left, left[name], right[name]) for name in left}  # in order
 
 
 def _waypoints(layout: Layout) -> Waypoints:

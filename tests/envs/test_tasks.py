@@ -48,6 +48,11 @@ RANGES = {  # body -> lowest and highest x, y [m]
         "grape": ((0.30, -0.18), (0.42, 0.02)),
         "basket": ((0.325, 0.12), (0.395, 0.19)),
     },
+    "two_baskets": {
+        "grape": ((0.31, -0.03), (0.41, 0.03)),
+        "left_basket": ((0.33, 0.135), (0.39, 0.175)),
+        "right_basket": ((0.33, -0.175), (0.39, -0.135)),
+    },
 }
 
 
@@ -91,7 +96,7 @@ def test_few_contacts_are_computed(scene):
         for i in range(geoms)
         for j in range(i)
     )
-    assert 0 < pairs <= 32
+    assert 0 < pairs <= 36
     colliding = (con[0] > 0) | (con[1] > 0)
     kinds = {mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_SPHERE}
     kinds |= {mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CAPSULE}

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from lorasp_jax.models import flow_matching, real_time_chunking
+from lorasp_jax.models.flow_matching import Times
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
 from tests.models.random_models import observation, random_backbone
@@ -156,7 +157,9 @@ def test_times_of_training():
 
     @jax.jit
     def draw(key, data):
-        without, (noise, times) = (flow_matching.draw(key, data, d) for d in (0, 3))
+        without, (noise, times) = (
+            flow_matching.draw(key, data, Times(max_delay=d)) for d in (0, 3)
+        )
         return without, noise, times, flow_matching.interpolate(noise, data, times)[0]
 
     (noise, time), same_noise, times, x_t = jax.device_get(draw(jax.random.key(0), data))

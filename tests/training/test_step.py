@@ -13,6 +13,7 @@ from flax import nnx
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.data.batches import Batch, flatten, sample_batch
 from lorasp_jax.models import flow_matching
+from lorasp_jax.models.flow_matching import Times
 from lorasp_jax.peft import Aux, LoRA
 from lorasp_jax.training.step import active_ranks, gradients, init_state, train_step
 from tests.models.random_models import with_noise
@@ -80,9 +81,9 @@ def test_given_actions_do_not_count_in_the_loss(small):
     graphdef, adapters, frozen, batch = small
     key, weights = jax.random.key(1), dict.fromkeys(("spectral", "balance", "z"), 0.0)
     gradient = jax.jit(gradients, static_argnums=(2, 6, 7))
-    arguments = adapters, frozen, graphdef, batch, key, weights
-    whole, metrics = gradient(*arguments, 1, 2)
-    noise, time = flow_matching.draw(key, batch.actions, 2)
+    arguments, times = (adapters, frozen, graphdef, batch, key, weights), Times(max_delay=2)
+    whole, metrics = gradient(*arguments, 1, times)
+    noise, time = flow_matching.draw(key, batch.actions, times)
     options = {"action_mask": batch.action_mask, "noise": noise, "flow_time": time}
     model = nnx.merge(graphdef, adapters, frozen)
     per_element, _ = jax.jit(model.loss)(key, batch.observation, batch.actions, **options)
@@ -90,7 +91,7 @@ def test_given_actions_do_not_count_in_the_loss(small):
     assert 0 < counts.sum() < batch.action_mask.sum()
     assert per_element[np.asarray(batch.action_mask) & ~counts].max() > 0.1
     np.testing.assert_allclose(metrics["task"], per_element[counts].mean(), rtol=1e-5)
-    parts, found = gradient(*arguments, 4, 2)
+    parts, found = gradient(*arguments, 4, times)
     np.testing.assert_allclose(found["task"], metrics["task"], rtol=1e-5)
     for name, value in leaves(whole).items():
         np.testing.assert_allclose(leaves(parts)[name], value, atol=1e-4 * np.abs(value).max())

@@ -133,7 +133,7 @@ def _serve(options: argparse.Namespace, console: Console) -> None:
     if not answers:
         from lorasp_jax.training.distributed import processes
 
-        _say(console, f"the policy has not answered within {GRACE:g} s: ended without it")
+        _say(console, f"the policy has not answered within {GRACE:g} s, or loads: ended without it")
         processes.exit_all(1)  # a thread that hangs cannot be stopped
 
 
@@ -244,7 +244,7 @@ def _runs(
     bases = Bases(any_base=options.any_base)
 
     def load(run: str, *, start: bool = False) -> Any:
-        own = not share or (start and not bases.can_share(run))
+        own = not share or (start and not bases.can_share(run, options.base))
         model = None if own else functools.partial(bases.sampler, load=start)
         return compiled(loading.load_run(run, **where, model=model, any_base=options.any_base))
 

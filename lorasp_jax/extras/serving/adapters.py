@@ -62,7 +62,7 @@ class Bases:
     def __init__(self, *, any_base: bool = False) -> None:
         """Start without a base; `any_base` accepts adapters of another, see `load_adapters`."""
         self._any_base = any_base
-        self._bases: list[tuple[Any, str | None, SharedBase]] = []
+        self._bases: list[tuple[Any, str | None, str, SharedBase]] = []
 
     def sampler(self, recorded: RecordedPolicy, *, load: bool = True) -> SharedSampler:
         """Return a sampler for a run.
@@ -78,13 +78,17 @@ class Bases:
         folder = recorded.folder
         if recorded.is_full:
             raise ValueError(f"{folder} trained its base, so it cannot share one")
-        saved, kind = native.read_description(folder)["weights"], recorded.quantized
+        description, kind = native.read_description(folder), recorded.quantized
+        saved, digest = description["weights"], description["base"]
         if not saved and not self._any_base:
             raise ValueError(f"{folder} has no fingerprints of its base: --any-base accepts it")
-        fitting = [b for config, q, b in self._bases if (config, q) == (recorded.config, kind)]
-        known = [base for base in fitting if base.matches(saved)]
+        fitting = [
+            (d, b) for config, q, d, b in self._bases if (config, q) == (recorded.config, kind)
+        ]
+        # Quantized kernels have no fingerprints of their own.
+        known = [b for d, b in fitting if b.matches(saved) and (not kind or d == digest)]
         if self._any_base and not load:
-            known = known or fitting
+            known = known or [base for _, base in fitting]
         if known:
             return known[0].read(folder, any_base=self._any_base)
         if not load:
@@ -93,19 +97,24 @@ class Bases:
                 "config: serve it on its own"
             )
         base = SharedBase(recorded.load_base(), functools.partial(quantized, kind=kind))
-        self._bases.append((recorded.config, kind, base))
+        self._bases.append((recorded.config, kind, digest, base))
         return base.read(folder, any_base=self._any_base)
 
     @staticmethod
-    def can_share(run: str) -> bool:
+    def can_share(run: str, base: str = "") -> bool:
         """Whether the adapters of a run leave its base as it is; says so if they do not."""
-        recorded = RecordedPolicy.read(run)
+        recorded = RecordedPolicy.read(run, base=base)
         settings = {} if recorded.is_full else native.read_description(recorded.folder)["methods"]
         methods = map(peft.from_settings, settings.values())
         changes = recorded.is_full or any(method.splits_kernel for method in methods)
         if changes:
             print(f"{run} changes its base, so it has a copy of its own", file=sys.stderr)
         return not changes
+
+
+def is_shared(policy: Any) -> bool:
+    """Whether a served policy has its weights from a shared base."""
+    return isinstance(getattr(getattr(policy, "policy", None), "model", None), SharedSampler)
 
 
 def embed(policy: Policy, ids: np.ndarray) -> np.ndarray:

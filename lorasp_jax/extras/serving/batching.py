@@ -98,8 +98,9 @@ class Batcher:
 
     def problem(self) -> str | None:
         """Say why the policy does not answer; None if it does, or has nothing to answer."""
+        running = self._running  # first: a batch may begin in between
         seconds = time.monotonic() - self._begun
-        if self._running and seconds > HUNG:
+        if running and seconds > HUNG:
             return f"the policy has not answered for {seconds:.0f} s"
         if not self._thread.is_alive():
             return "the policy's thread has ended"

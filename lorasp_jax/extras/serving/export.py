@@ -43,7 +43,8 @@ def _export(options: argparse.Namespace, console: Console) -> None:
     import jax
 
     runs = dict(options.run)
-    if len(runs) < len(options.run) or not all(map(NAME.fullmatch, runs)):
+    named = len(runs) == 1 or all(map(NAME.fullmatch, runs))
+    if len(runs) < len(options.run) or not named:
         raise ValueError(f"the runs must have different names that match {NAME.pattern}: NAME=RUN")
     if options.out.exists():  # said before the run loads, which can take a minute
         raise ValueError(f"{options.out} already exists: choose another path")

@@ -9,7 +9,9 @@ import http
 import json
 import logging
 import re
+import threading
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any
 
 from websockets.asyncio.server import ServerConnection
@@ -57,6 +59,21 @@ class Connection(ServerConnection):
         super().data_received(b"GET " + head + b"\r\n")
 
 
+async def _in_daemon(call: Callable[[], None]) -> None:
+    """Call a function in a thread that does not keep the process alive."""
+    future: Future[None] = Future()
+    future.set_running_or_notify_cancel()  # nobody cancels it
+
+    def run() -> None:
+        try:
+            future.set_result(call())
+        except BaseException as error:  # for who awaits it
+            future.set_exception(error)
+
+    threading.Thread(target=run, name="adapter", daemon=True).start()
+    await asyncio.wrap_future(future)
+
+
 class Adapters:
     """Loads and unloads adapters as POST /adapters says."""
 
@@ -65,6 +82,11 @@ class Adapters:
         self._policy = policy
         self._loading: set[asyncio.Task[http.HTTPStatus]] = set()
         self._last = ""
+
+    @property
+    def is_loading(self) -> bool:
+        """Whether an adapter is being loaded or unloaded."""
+        return bool(self._loading)
 
     def listed(self) -> str:
         """Return the adapters as JSON, and how the last change ended."""
@@ -91,7 +113,7 @@ class Adapters:
     async def _run(self, call: Callable[[], None], said: str) -> http.HTTPStatus:
         """Change the adapters in another thread, and remember how it ended."""
         try:
-            await asyncio.to_thread(call)
+            await _in_daemon(call)
         except ValueError as error:
             self._last = str(error)
             return http.HTTPStatus.BAD_REQUEST

@@ -14,7 +14,7 @@ import numpy as np
 
 from lorasp_jax.base.arguments import NAME
 from lorasp_jax.extras.serving import routing
-from lorasp_jax.extras.serving.adapters import embed
+from lorasp_jax.extras.serving.adapters import embed, is_shared
 from lorasp_jax.extras.serving.exported import ExportedPolicy, PolicyInterface, build_row
 from lorasp_jax.extras.serving.policies import CACHED_PROMPTS, CompiledPolicy
 from lorasp_jax.extras.serving.requests import PolicySpec, Request
@@ -139,7 +139,8 @@ class ServedPolicies:
             raise ValueError(f"name must match {NAME.pattern}, got {name[:80]!r}")
         with self._change:  # one at a time
             adapter, first = Adapter(name, self._load(path)), self._adapters[self._default]
-            _common_spec({first.name: first.policy, name: adapter.policy}, self.spec.execution)
+            present = f"the present {first.name}"
+            _common_spec({present: first.policy, name: adapter.policy}, self.spec.execution)
             for size in self.sizes:
                 self._try_out(adapter, size)
             self._adapters = self._adapters | {name: adapter}
@@ -183,7 +184,9 @@ class ServedPolicies:
         return self._find(name)
 
     def _embedding(self, text: str) -> np.ndarray:
-        policy = self._adapters[self._default].policy
+        policy = next((each.policy for each in self.adapters if is_shared(each.policy)), None)
+        if policy is None:
+            raise ValueError("--route nearest needs policies that share a base")
         tokens = policy.tokens(text)
         return embed(policy.policy, tokens["ids"][tokens["mask"]])
 

@@ -119,8 +119,8 @@ class PolicyServer:
         return self._batcher.problem()
 
     def close(self, timeout: float | None = None) -> bool:
-        """Stop the policy's thread; return False if it does not answer in time [s]."""
-        return self._batcher.close(timeout)
+        """Stop the policy's thread; return False if it does not answer in time [s], or loads."""
+        return self._batcher.close(timeout) and not self._adapters.is_loading
 
     def _process_request(
         self, connection: ServerConnection, request: HttpRequest

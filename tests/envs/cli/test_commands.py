@@ -186,7 +186,7 @@ def test_several_tasks_resume(tmp_path, run, monkeypatch):
     for folder in done:
         assert f"{folder} is already complete" in output
         assert folder.stat() == before[folder]
-    assert sorted(os.listdir(out)) == ["open_pot", "pick_place", "pour", "press"]
+    assert sorted(os.listdir(out)) == ["open_pot", "pick_place", "pour", "press", "two_baskets"]
     run(COLLECT, "--out", tmp_path / "press")
     assert_equal(rlds.read(tmp_path / "press"), rlds.read(out / "press"))
     code, output = run(text, "--out", out, "--seed", 1)
