@@ -3,10 +3,13 @@
 import contextlib
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from types import FrameType
 
+from lorasp_jax.base.signals import handled
+
+_NUMBERS = signal.SIGINT, signal.SIGTERM
 _MESSAGE = b"stopping at the next log step; another signal stops immediately\n"
 
 
@@ -31,24 +34,12 @@ def deferred() -> Iterator[Stop]:
         stop.requested = True
         os.write(1, _MESSAGE)  # print is not reentrant: it would raise inside another print
 
-    with _handlers(handle):
+    with handled(_NUMBERS, handle):
         yield stop
 
 
 @contextlib.contextmanager
 def sigterm_as_interrupt() -> Iterator[None]:
     """Inside this block SIGTERM raises KeyboardInterrupt, like Ctrl-C."""
-    with _handlers(signal.default_int_handler):
+    with handled(_NUMBERS, signal.default_int_handler):
         yield
-
-
-@contextlib.contextmanager
-def _handlers(handle: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    """Install `handle` for both signals and restore the previous handlers afterwards."""
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    previous = [signal.signal(number, handle) for number in numbers]
-    try:
-        yield
-    finally:
-        for number, handler in zip(numbers, previous, strict=True):
-            signal.signal(number, handler)

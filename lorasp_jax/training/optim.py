@@ -5,6 +5,7 @@ from collections.abc import Collection
 import optax
 
 from lorasp_jax.config import AuxiliaryConfig, OptimConfig
+from lorasp_jax.models.flow_matching import Times
 from lorasp_jax.peft import AdaLoRA, Method
 from lorasp_jax.peft.auxiliary import AUXILIARY_WEIGHTS
 
@@ -36,6 +37,11 @@ def make_optimizer(
     for method in dict.fromkeys(methods):
         optimizer = method.transform(optimizer, config.steps)
     return optax.chain(optax.clip_by_global_norm(config.clip_norm), optimizer)
+
+
+def flow_times(config: OptimConfig) -> Times:
+    """Return how a run samples its flow times."""
+    return Times(config.time_shape, config.rtc_max_delay)
 
 
 def auxiliary_weights(config: AuxiliaryConfig, steps: int) -> dict[str, optax.Schedule]:

@@ -12,14 +12,13 @@ import jax.numpy as jnp
 from lorasp_jax.base import messages
 from lorasp_jax.data.augmentation import augment
 from lorasp_jax.data.batches import RawBatch, encode
-from lorasp_jax.models.flow_matching import Times
 from lorasp_jax.policies.processor import Processor
 from lorasp_jax.training import compilation
 from lorasp_jax.training.batches import Batches
 from lorasp_jax.training.cost.speed import Speed
 from lorasp_jax.training.demonstrations import in_thread
 from lorasp_jax.training.distributed import mesh as meshes
-from lorasp_jax.training.optim import auxiliary_weights
+from lorasp_jax.training.optim import auxiliary_weights, flow_times
 from lorasp_jax.training.random_streams import StepKeys
 from lorasp_jax.training.run import Run
 from lorasp_jax.training.step import TrainState, train_step
@@ -54,7 +53,7 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
         parts=optim.accumulate,
         ema=optim.ema,
         spike=optim.spike,
-        times=Times(optim.time_shape, optim.rtc_max_delay),
+        times=flow_times(optim),
     )
 
     def body(state: TrainState, raw: RawBatch, frozen: Frozen, key: jax.Array) -> Any:

@@ -8,9 +8,9 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.evaluation.figure_style import STYLE
 from lorasp_jax.extras.study import Study, page, statistics
+from lorasp_jax.extras.study import figure as figures
 from lorasp_jax.extras.study.statistics import Estimate
 from lorasp_jax.extras.study.study import Results
 
@@ -100,7 +100,7 @@ def _task_table(results: Results, backbone: str) -> str:
     return page.table([*head, f"success at n = {STEPS[-1]} [%]"], rows)
 
 
-@mpl.rc_context(STYLE | {"svg.hashsalt": "flow_steps"})
+@mpl.rc_context(STYLE)
 def _figure(results: Results, path: Path) -> None:
     """Draw success against the number of steps: a panel per backbone and kind of task."""
     figure = Figure(figsize=(9.6, 2.9), layout="constrained")
@@ -111,23 +111,12 @@ def _figure(results: Results, path: Path) -> None:
         for title, tasks in (("four tasks", TASKS[:4]), ("two baskets", TASKS[4:]))
     ]
     for axis, (backbone, title, tasks) in zip(axes, panels, strict=True):
-        for policy, label in POLICIES.items():
-            estimates = [_estimate(results, backbone, policy, n, tasks) for n in STEPS]
-            value, low, high = (
-                [100 * x for x in column] for column in zip(*estimates, strict=True)
-            )
-            color = COLORS[policy]
-            axis.plot(STEPS, value, color=color, marker="o", ms=3, label=label)
-            axis.fill_between(STEPS, low, high, color=color, alpha=0.12, lw=0)
+        curves = {
+            label: (COLORS[name], [_estimate(results, backbone, name, n, tasks) for n in STEPS])
+            for name, label in POLICIES.items()
+        }
+        figures.panel(axis, STEPS, curves)
         axis.set_title(f"{BACKBONES[backbone]}, {title}", loc="left")
-        axis.set_xscale("log")
-        axis.set_xticks(STEPS, [str(n) for n in STEPS], minor=False)
-        axis.minorticks_off()
         axis.set_xlabel("flow steps")
-        axis.set_ylim(0, 100)
     axes[0].set_ylabel("success [%]")
-    handles, labels = axes[0].get_legend_handles_labels()
-    options: Any = {"loc": "outside upper center", "ncols": len(labels), "frameon": False}
-    figure.legend(handles, labels, **options)
-    with atomic_file(path) as unfinished:
-        figure.savefig(unfinished, format="svg", metadata={"Date": None})
+    figures.write(figure, path, "flow_steps")

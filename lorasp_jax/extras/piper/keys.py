@@ -8,8 +8,9 @@ import sys
 import termios
 import time
 import tty
-from collections.abc import Iterator
 from typing import Any, Self
+
+from lorasp_jax.base.signals import handled
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 """Those that end or suspend a program, and so must stop the arm."""
@@ -61,7 +62,7 @@ class Keyboard:
         """
         print(question, flush=True)
         end = None if seconds is None else time.monotonic() + seconds
-        with _raising():
+        with handled(SIGNALS, _end):  # signals end the question, not what may be written after it
             while not self.ended:
                 key = self.pressed(None if end is None else max(0.0, end - time.monotonic()))
                 if key and key in keys:
@@ -69,17 +70,6 @@ class Keyboard:
                 if end is not None and time.monotonic() >= end:
                     return ""
         raise EOFError("there is no terminal")
-
-
-@contextlib.contextmanager
-def _raising() -> Iterator[None]:
-    """Let signals end a question, not what may be written after it."""
-    before = [signal.signal(number, _end) for number in SIGNALS]
-    try:
-        yield
-    finally:
-        for number, handler in zip(SIGNALS, before, strict=True):
-            signal.signal(number, handler)
 
 
 def _end(number: int, _: Any) -> None:

@@ -12,6 +12,7 @@ from lorasp_jax.adapters.io import hugging_face
 from lorasp_jax.base import hub
 from lorasp_jax.extras.serving.checkpoint import Checkpoint, Unsaid
 from lorasp_jax.models.backbone import Backbone
+from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.shared_base import SharedBase
 from lorasp_jax.policies import statistics_files
 from lorasp_jax.policies.policy import Policy
@@ -124,18 +125,8 @@ def load_checkpoint(
     config, named = checkpoint.config, checkpoint.named
     if dtype:
         config = dataclasses.replace(config, dtype=dtype, param_dtype=dtype)
-    moments = statistics_files.read(
-        statistics or checkpoint.found.folder, dataset=dataset, default=checkpoint.dataset
-    )
-    joints, length = checkpoint.lengths(moments)
-    words = load_tokenizer(tokenizer or checkpoint.tokenizer)
-    # The instructions come with the requests; without a default, this one measures the table.
-    prompt = named.prompt if named else ""
-    prompts = PromptTable.of(words, [prompt or "press the button"], config, num_joints=joints)
-    prompts = dataclasses.replace(prompts, instructions=(prompt,) if prompt else ())
-    cameras = cameras or checkpoint.cameras or None
-    sizes: Any = {"num_joints": joints, "action_length": length}
-    processor = Processor.of(config, moments, prompts, **sizes, cameras=cameras)
+    given = {"tokenizer": tokenizer, "statistics": statistics, "dataset": dataset}
+    processor, words = _processor(checkpoint, config, **given, cameras=cameras)
     model = checkpoint.found.load(config)
     models = {UNADAPTED: model}
     models |= {name: _adapted(path, model, any_base) for name, path in (adapters or {}).items()}
@@ -147,6 +138,30 @@ def load_checkpoint(
         name: Loaded(Policy(each, processor), words, metadata=pose, base=base)
         for name, each in models.items()
     }
+
+
+def _processor(
+    checkpoint: Checkpoint,
+    config: BackboneConfig,
+    *,
+    tokenizer: str,
+    statistics: str,
+    dataset: str,
+    cameras: Mapping[str, str] | None,
+) -> tuple[Processor, Tokenizer]:
+    """Return the processor of a checkpoint and its tokenizer; see `load_checkpoint`."""
+    moments = statistics_files.read(
+        statistics or checkpoint.found.folder, dataset=dataset, default=checkpoint.dataset
+    )
+    joints, length = checkpoint.lengths(moments)
+    words = load_tokenizer(tokenizer or checkpoint.tokenizer)
+    # The instructions come with the requests; without a default, this one measures the table.
+    prompt = checkpoint.named.prompt if checkpoint.named else ""
+    prompts = PromptTable.of(words, [prompt or "press the button"], config, num_joints=joints)
+    prompts = dataclasses.replace(prompts, instructions=(prompt,) if prompt else ())
+    cameras = cameras or checkpoint.cameras or None
+    sizes: Any = {"num_joints": joints, "action_length": length}
+    return Processor.of(config, moments, prompts, **sizes, cameras=cameras), words
 
 
 def _adapted(where: str, model: Backbone, any_base: bool) -> Backbone:

@@ -21,14 +21,13 @@ from lorasp_jax.config import VALIDATION_WINDOWS, Config
 from lorasp_jax.data.batches import Batch, nbytes
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
-from lorasp_jax.models.flow_matching import Times
 from lorasp_jax.models.observation import abstract_observation
 from lorasp_jax.models.sampling import Sampler, suffix_model
 from lorasp_jax.training import rules
 from lorasp_jax.training.base import quantized
 from lorasp_jax.training.cost import flops
 from lorasp_jax.training.distributed import mesh as meshes
-from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
+from lorasp_jax.training.optim import auxiliary_weights, flow_times, make_optimizer
 from lorasp_jax.training.step import Metrics, init_state, loss_fn
 
 HEADROOM = 1.05
@@ -219,8 +218,7 @@ def abstract_step(
     weights: Any = dict.fromkeys(auxiliary_weights(config.auxiliary, 1), 0.0)
 
     def loss(adapters: Any, frozen: Any, batch: Batch) -> tuple[jax.Array, Metrics]:
-        key, optim = jax.random.key(0), config.optim
-        times = Times(optim.time_shape, optim.rtc_max_delay)
+        key, times = jax.random.key(0), flow_times(config.optim)
         return loss_fn(adapters, frozen, graphdef, batch, key, weights, times=times)
 
     return loss, (adapters, frozen, abstract_batch(backbone, batch_size))
