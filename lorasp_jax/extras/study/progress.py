@@ -20,6 +20,7 @@ from lorasp_jax.training.run_folder import CONFIG_FILE, changed_settings, read_j
 CELL_FILE, FAILED_FILE = "cell.json", "failed.txt"
 SCHEMA: records.Schema = {
     "config": records.CONFIG,
+    "provenance?": {str: str},
     "outcomes": {str: str},
     "before?": {str: str},
     "active_rank?": {str: float},

@@ -14,6 +14,7 @@ from lorasp_jax.base import compilation_cache as cache
 from lorasp_jax.evaluation import metrics
 from lorasp_jax.evaluation.callback import Evaluation
 from lorasp_jax.extras.study.held_out import held_out_demonstrations, shared_demonstrations
+from lorasp_jax.extras.study.provenance import provenance
 from lorasp_jax.extras.study.runner import Job
 from lorasp_jax.extras.study.study import Cell, Derived
 from lorasp_jax.training import loop, records, setup
@@ -82,7 +83,7 @@ def _finish(job: Job, run: Run, source: lorasp_jax.policies.Policy | None) -> di
         with run.timed("measure"):
             episodes = held_out_demonstrations(job.study_folder, run.config)
             found |= job.measure(run, episodes, source)
-    return {**found, "seconds": dict(run.seconds)}
+    return {**found, "provenance": provenance(), "seconds": dict(run.seconds)}
 
 
 def _simulated(run: Run) -> dict[str, Any]:

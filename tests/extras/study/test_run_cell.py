@@ -16,6 +16,7 @@ from envs.scene.ranges import Randomization
 from lorasp_jax.config import AugmentConfig
 from lorasp_jax.extras.study import held_out, results, run_cell
 from lorasp_jax.extras.study.held_out import EPISODES, SEED
+from lorasp_jax.extras.study.provenance import provenance
 from lorasp_jax.extras.study.runner import Job
 from lorasp_jax.extras.study.study import Cell
 from lorasp_jax.training.run import Run
@@ -71,6 +72,7 @@ def test_what_a_study_measures_and_how_a_cell_is_evaluated(tmp_path, monkeypatch
     cell = Cell("a", CONFIG, evaluate=lambda run: {"outcomes": {"press": "01"}})
     found = run_cell.run_cell(Job(cell, CONFIG, tmp_path, {}, measure if measured else None))
     assert found.pop("seconds").keys() >= {"evaluate", "total"}
+    assert found.pop("provenance") == provenance()
     expected = {"measures": [{"press": 1}, None]} if measured else {}
     assert found == {"outcomes": {"press": "01"}} | expected
     assert [type(callback).__name__ for callback in callbacks] == ["Export"]
