@@ -61,7 +61,8 @@ def test_it_reaches_each_target_within_a_control_step(follower, bench, monkeypat
     assert len(commands) == round(0.5 / PERIOD)
     np.testing.assert_allclose(commands[-1], target, atol=5e-3)
     speeds = np.diff(np.array(commands), axis=0)[:, 0] / PERIOD
-    assert speeds.max() < 1.3 * 0.3  # 0.03 rad in 0.1 s, as even as it can be
+    assert speeds.max() <= 1.0 + 1e-9  # while it makes up for the start
+    np.testing.assert_allclose(speeds[-40:], 0.3, atol=1e-6)  # 0.03 rad in 0.1 s, evenly
     follower.run(0.5)
     np.testing.assert_allclose(follower.pose(), target, atol=0.02)  # it holds the last one
     assert bench.fake.unsafe == []
@@ -100,7 +101,6 @@ def test_after_a_fault_it_holds_for_good(follower, bench, fault, word):
     target = moving(follower, bench)
     for name, value in fault.items():
         setattr(bench.fake.faults, name, value)
-    bench.clock._patience = 0
     follower.follow(target + STEP)
     follower.run(0.5)
     for name in fault:
@@ -119,6 +119,7 @@ def test_it_runs_in_a_thread_until_it_is_stopped(module, bench, monkeypatch):
     clock = RealTime(bench.fake)
     bench.arm._clock = clock
     clock.start(bench.arm)
+    clock.wait_until(clock.now() + 0.3)  # until each kind of frame has come by this clock
     try:
         follower = module.Follower(bench.arm, LIMITS, clock, 0.1)
         thread = threading.Thread(target=follower.run)

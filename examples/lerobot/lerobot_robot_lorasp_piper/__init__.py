@@ -58,19 +58,7 @@ class LoraspExpertConfig(TeleoperatorConfig):
     """The scripted expert, for a fake PiPER in the same process."""
 
 
-class _Uncalibrated:
-    """What LeRobot asks of all devices, and these do not have."""
-
-    is_calibrated = True
-
-    def calibrate(self) -> None:
-        """Do nothing: the firmware knows its zeros."""
-
-    def configure(self) -> None:
-        """Do nothing."""
-
-
-class LoraspPiper(_Uncalibrated, Robot):
+class LoraspPiper(Robot):
     """A real PiPER, commanded 200 times a second by a thread of its own."""
 
     config_class: Any = LoraspPiperConfig
@@ -94,6 +82,17 @@ class LoraspPiper(_Uncalibrated, Robot):
     def action_features(self) -> dict[str, type]:
         """Return joint -> float."""
         return dict.fromkeys(JOINTS, float)
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Return True: the firmware knows its zeros."""
+        return True
+
+    def calibrate(self) -> None:
+        """Do nothing."""
+
+    def configure(self) -> None:
+        """Do nothing."""
 
     @property
     def is_connected(self) -> bool:
@@ -194,7 +193,7 @@ class LoraspFakePiper(LoraspPiper):
         logging.info("%s in layout %d %s solved", self.config.task, self.config.seed, success)
 
 
-class LoraspExpert(_Uncalibrated, Teleoperator):
+class LoraspExpert(Teleoperator):
     """Demonstrates a task once."""
 
     config_class, name = LoraspExpertConfig, "lorasp_expert"
@@ -205,6 +204,8 @@ class LoraspExpert(_Uncalibrated, Teleoperator):
         self._expert: Demonstrator | None = None
 
     action_features = LoraspPiper.action_features
+    is_calibrated, calibrate = LoraspPiper.is_calibrated, LoraspPiper.calibrate
+    configure = LoraspPiper.configure
 
     @property
     def feedback_features(self) -> dict[str, type]:
