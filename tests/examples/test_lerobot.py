@@ -113,6 +113,18 @@ def test_after_a_fault_it_holds_for_good(follower, bench, fault, word):
     np.testing.assert_array_equal(follower._governor.pose, held)
 
 
+def test_an_error_of_its_thread_is_told(follower, bench, monkeypatch):
+    moving(follower, bench)
+    with monkeypatch.context() as patch:
+        patch.setattr(bench.arm, "read", lambda: next(iter(())))
+        with pytest.raises(StopIteration):
+            follower.run()
+    with pytest.raises(Unsafe, match="StopIteration"):
+        follower.pose()
+    follower.settle()
+    assert not follower._governor.velocity.any()
+
+
 def test_it_runs_in_a_thread_until_it_is_stopped(module, bench, monkeypatch):
     monkeypatch.setattr(safety, "MAX_AGE", 60.0)  # a busy machine pauses threads
     monkeypatch.setattr(safety, "MAX_DRIVER_AGE", 60.0)

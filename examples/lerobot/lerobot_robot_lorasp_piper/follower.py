@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from lorasp_jax.base.errors import describe_any
 from lorasp_jax.extras.piper.arm import PiperArm
 from lorasp_jax.extras.piper.clock import Clock
 from lorasp_jax.extras.piper.interpolation import Path
@@ -64,10 +65,14 @@ class Follower:
         """Command the arm for some time, or until `stop`."""
         due = self._clock.now()
         end = due + seconds - PERIOD / 2
-        while self._clock.now() < end and not self._stopped:
-            self._tick()
-            due = max(due, self._clock.now() - PERIOD) + PERIOD
-            self._clock.wait_until(due)
+        try:
+            while self._clock.now() < end and not self._stopped:
+                self._tick()
+                due = max(due, self._clock.now() - PERIOD) + PERIOD
+                self._clock.wait_until(due)
+        except BaseException as error:  # in a thread, nobody else would hear of it
+            self.problem = describe_any(error)
+            raise
 
     def stop(self) -> None:
         """End `run`."""
