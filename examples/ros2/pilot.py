@@ -205,7 +205,7 @@ def connect(parameter: Callable[[str, Any], Any]) -> tuple[Server, dict[str, str
 
     Raises:
         ArgumentTypeError: a camera is not of the form NAME=TOPIC.
-        ValueError: a camera or the prompt is missing, or the policy is of another size.
+        ValueError: a camera or the prompt is missing, or the policy is of another robot or size.
         OSError: the token cannot be read, or there is no server.
     """
     defaults = Settings((), "")
@@ -219,6 +219,9 @@ def connect(parameter: Callable[[str, Any], Any]) -> tuple[Server, dict[str, str
     told = server.metadata
     if missing := [name for name in told.get("cameras") or () if name not in topics]:
         raise ValueError(f"the policy needs the camera {missing[0]}: add '{missing[0]}=TOPIC'")
+    robot = parameter("robot", "piper")
+    if (other := told.get("robot") or robot) != robot:
+        raise ValueError(f"the policy is of the robot {other}, not of {robot}: see parameter robot")
     if (size := told.get("action_dim") or len(joints)) != len(joints):
         raise ValueError(f"the policy's actions have {size} numbers, but there are {joints}")
     dt = parameter("control_dt", 0.0) or told.get("control_dt") or defaults.control_dt

@@ -187,6 +187,13 @@ def test_the_node_takes_what_the_server_says(core, server):
         core.connect((parameters | {"cameras": cameras[:1]}).get)
     with pytest.raises(ValueError, match="prompt"):
         core.connect((parameters | {"prompt": ""}).get)
+    server.policy.metadata["robot"] = "panda"
+    with pytest.raises(ValueError, match="panda"):
+        core.connect(parameters.get)
+    assert core.connect((parameters | {"robot": "panda"}).get)
+    with pytest.raises(ValueError, match="panda"):
+        core.connect((parameters | {"robot": "piper"}).get)
+    server.policy.metadata.clear()
     with pytest.raises(ValueError, match="7 numbers"):
         core.connect((parameters | {"joints": ["joint1"]}).get)
     with pytest.raises(ServerGone):
