@@ -11,7 +11,8 @@ from lorasp_jax import peft
 from tests import ROOT, test_imports
 
 PAGES = sorted([*ROOT.glob("docs/*.md"), *ROOT.glob("docs/methods/*.md")])
-OTHERS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("studies/*/README.md"))]
+OTHERS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+OTHERS += [*sorted(ROOT.glob("studies/*/README.md")), *sorted(ROOT.glob("examples/*/README.md"))]
 """Pages whose links and files are checked, but not their examples."""
 WITHOUT_EXAMPLES = {"runs", "launch", "benchmarks", "architecture", "libero", "deployment"}
 """Reference pages, and some of commands alone."""

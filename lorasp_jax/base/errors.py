@@ -86,6 +86,12 @@ def describe(error: Exception, remedy: str = "") -> str | None:
     return f"{prefix}{error.strerror}{remedy if error.errno in DISK_FULL else ''}"
 
 
+def describe_any(error: BaseException) -> str:
+    """Describe an error on one line, a bug with its type."""
+    known = describe(error) if isinstance(error, Exception) else None
+    return known or f"{type(error).__name__}: {one_line(error)}"
+
+
 def missing_group(error: ModuleNotFoundError) -> str | None:
     """Say how to install an optional dependency; return None if the module is not one."""
     module = (error.name or "").partition(".")[0]

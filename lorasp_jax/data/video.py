@@ -24,6 +24,9 @@ _TOLERANCE = 0.25
 """Tolerance of a frame's time, in frame periods. It is small enough to tell adjacent frames apart,
 and to notice a wrong frame rate within a few frames."""
 
+_ONE_THREAD: dict[str, Any] = {"threads": 1} if int(av.__version__.partition(".")[0]) >= 17 else {}
+"""For conversions, which have threads of their own only since PyAV 17; LeRobot wants PyAV 15."""
+
 
 class VideoReader:
     """A video file, decoded sequentially; consecutive reads decode each frame only once.
@@ -78,7 +81,7 @@ class VideoReader:
             if abs(frame.time - expected) > tolerance:
                 raise ValueError(f"{self.path} does not have {fps:g} fps at {expected:.3f} s")
             if number % every == 0:
-                rgb = self._reformatter.reformat(frame, format="rgb24", threads=1)
+                rgb = self._reformatter.reformat(frame, format="rgb24", **_ONE_THREAD)
                 image = downscale(rgb.to_ndarray(), image_size)
                 if not number:  # preallocate: stacking a list would double the memory
                     shape = (-(-length // every), *image.shape)

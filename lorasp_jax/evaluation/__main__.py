@@ -4,6 +4,7 @@ import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.markup import escape
@@ -11,6 +12,9 @@ from rich.table import Table
 
 from lorasp_jax.base.errors import run_command
 from lorasp_jax.data.__main__ import add_keys, keys_of
+
+if TYPE_CHECKING:
+    from lorasp_jax.data.source import Source
 
 
 def main(arguments: Sequence[str], program: str = "lorasp-jax evaluate") -> int:
@@ -56,7 +60,7 @@ def evaluate(options: argparse.Namespace, console: Console) -> None:
     cache.enable()
     source = open_source(options.data, keys_of(options, options.data))
     described = export.describe(options.run)
-    _check_period(options, source.control_dt, described["control_dt"])
+    _check_period(options, source, described["control_dt"])
     acts_for = options.dataset or described.get("policy", {}).get("dataset", "")
     numbers = options.episodes or held_out.episodes_of(source, acts_for)
     if wrong := [number for number in numbers if not 0 <= number < len(source)]:
@@ -84,16 +88,26 @@ def evaluate(options: argparse.Namespace, console: Console) -> None:
         console.print(f"picture: {path}", soft_wrap=True, highlight=False, markup=False)
 
 
-def _check_period(options: argparse.Namespace, recorded: float, trained: float) -> None:
+def _check_period(options: argparse.Namespace, source: "Source", trained: float) -> None:
     """Raise ValueError unless the dataset has the period [s] of the run."""
+    from lorasp_jax.data import dataset_file
+    from lorasp_jax.data.lerobot import LeRobot
     from lorasp_jax.data.source import same_period
 
-    if not same_period(recorded, trained):
-        remedy = "pass --every N to keep every N-th frame"
-        raise ValueError(
-            f"{options.data} has a control period of {recorded:.4g} s, but {options.run} was "
-            f"trained with {trained:.4g} s: {remedy if recorded < trained else 'record more often'}"
-        )
+    recorded = source.control_dt
+    if same_period(recorded, trained):
+        return
+    remedy = "pass --every N to keep every N-th frame"
+    if recorded > trained:
+        remedy = "record more often"
+    elif not isinstance(source, LeRobot):
+        remedy = "only LeRobot datasets can be read at a longer one; convert yours with --every N"
+    elif dataset_file.is_file(options.data):
+        remedy = f"write every = N into {options.data} to keep every N-th frame"
+    raise ValueError(
+        f"{options.data} has a control period of {recorded:.4g} s, but {options.run} was "
+        f"trained with {trained:.4g} s: {remedy}"
+    )
 
 
 def _table(

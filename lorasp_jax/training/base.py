@@ -43,17 +43,7 @@ def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str
     Raises:
         ValueError: the backbone or size is unknown, or the checkpoint does not match the config.
     """
-    options = config.model
-    model_config = sized(options.backbone, options.size)
-    model_config = dataclasses.replace(
-        model_config,
-        dtype=options.dtype,
-        param_dtype=options.param_dtype,
-        unroll=model_config.unroll if options.unroll is None else options.unroll,
-    )
-    if not (model_config.inputs.masks_missing or config.data.source):  # see `setup.build`
-        cameras = model_config.cameras[: len(envs.Env.cameras)]
-        model_config = dataclasses.replace(model_config, cameras=cameras)
+    options, model_config = config.model, _as_chosen(config)
     unseen = not options.source or (abstract and hub.is_remote(options.source))
     if unseen and (options.openpi_config or hub.BUCKET.fullmatch(options.source)):
         model_config = _as_trained(options, model_config)  # openpi's are in buckets
@@ -78,6 +68,22 @@ def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str
         make = functools.partial(_random, model_config, config.seed)
     model = on_host(make) if options.base_dtype else make()
     return model, models.weights_hash(model)
+
+
+def _as_chosen(config: Config) -> BackboneConfig:
+    """Return the backbone of the size and types that the settings say."""
+    options = config.model
+    model_config = sized(options.backbone, options.size)
+    model_config = dataclasses.replace(
+        model_config,
+        dtype=options.dtype,
+        param_dtype=options.param_dtype,
+        unroll=model_config.unroll if options.unroll is None else options.unroll,
+    )
+    if model_config.inputs.masks_missing or config.data.source:  # see `setup.build`
+        return model_config
+    cameras = model_config.cameras[: len(envs.Env.cameras)]
+    return dataclasses.replace(model_config, cameras=cameras)
 
 
 def _random(config: BackboneConfig, seed: int) -> Backbone:

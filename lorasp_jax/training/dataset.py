@@ -51,15 +51,7 @@ def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
             f"--control-dt {config.control_dt:g}: pass --control-dt {source.control_dt:.4g}, or "
             "keep every N-th step with python -m lorasp_jax.data convert --every N"
         )
-    if len(source.cameras) > (most := len(model.cameras)):
-        alike = "name those that show the same alike in dataset files, or " * bool(
-            parts_of(source)[1:]
-        )
-        raise ValueError(
-            f"{path} has cameras {', '.join(source.cameras)}, but the backbone accepts at most "
-            f"{most}: {alike}choose with --data.cameras, such as --data.cameras "
-            f"{' '.join([*source.cameras][:most])}"
-        )
+    _check_number_of_cameras(path, source, model)
     first = source.episode(0, ())
     if first.actions != "joint":
         raise ValueError(
@@ -76,6 +68,19 @@ def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
             "python -m lorasp_jax.data convert --state-numbers and --action-numbers"
         ) from error
     return source
+
+
+def _check_number_of_cameras(path: str, source: Source, model: BackboneConfig) -> None:
+    """Raise ValueError if there are more cameras than the backbone takes."""
+    if len(source.cameras) > (most := len(model.cameras)):
+        alike = "name those that show the same alike in dataset files, or " * bool(
+            parts_of(source)[1:]
+        )
+        raise ValueError(
+            f"{path} has cameras {', '.join(source.cameras)}, but the backbone accepts at most "
+            f"{most}: {alike}choose with --data.cameras, such as --data.cameras "
+            f"{' '.join([*source.cameras][:most])}"
+        )
 
 
 def _check_parts(data: DataConfig, model: BackboneConfig, parts: Sequence[Part]) -> None:

@@ -6,7 +6,7 @@ import io
 import pytest
 from rich.console import Console
 
-from lorasp_jax.base.errors import INTERRUPTED, REFUSED, run_command
+from lorasp_jax.base.errors import INTERRUPTED, REFUSED, describe_any, run_command
 
 
 def end(command, **options):
@@ -37,6 +37,12 @@ def test_bad_input_is_reported_on_one_line():
 def test_a_bug_is_raised():
     with pytest.raises(KeyError):
         end(fail(KeyError("task")))
+
+
+def test_any_error_has_a_line_and_a_bug_its_type():
+    assert describe_any(ValueError("no such\ntask")) == "no such task"
+    assert describe_any(KeyError("task")) == "KeyError: 'task'"
+    assert describe_any(KeyboardInterrupt("8 of\n10")) == "KeyboardInterrupt: 8 of 10"
 
 
 def test_an_interruption_says_what_is_left():

@@ -316,6 +316,15 @@ def test_evaluate_on_another_dataset(recorded, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(export, "describe", lambda _: {"control_dt": 0.2})
     assert main(arguments) == 2
     assert "--every" in capsys.readouterr().err
+    file = tmp_path / "others.toml"
+    file.write_text(f'path = "{golden("v21")}"')
+    assert main([run, "--data", str(file)]) == 2
+    printed = capsys.readouterr().err
+    assert "every = N" in printed
+    assert "--every" not in printed  # which is refused beside a file
+    file.write_text(f'path = "{golden("v21")}"\nevery = 2')
+    assert main([run, "--data", str(file), "--out", str(tmp_path / "out"), "--episodes", "9"]) == 2
+    assert "0 to 3" in capsys.readouterr().err  # the period fits
     monkeypatch.setattr(export, "describe", lambda _: {"control_dt": 0.05})
     assert main(arguments) == 2
     assert "more often" in capsys.readouterr().err

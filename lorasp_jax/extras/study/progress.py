@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lorasp_jax.base.errors import describe
+from lorasp_jax.base.errors import describe_any
 from lorasp_jax.base.writing import TEMPORARY_SUFFIX, write_text
 from lorasp_jax.config import Config
 from lorasp_jax.extras.study.study import Cell, Derived, Study
@@ -77,7 +77,7 @@ def read(study: Study, folder: Path) -> dict[str, Status]:
         try:
             statuses[cell.name] = _status(cell, folder / cell.name, known, statuses, run_config)
         except ValueError as error:
-            statuses[cell.name] = Status(CellState.DAMAGED, str(describe(error)))
+            statuses[cell.name] = Status(CellState.DAMAGED, describe_any(error))
     return statuses
 
 
@@ -111,7 +111,7 @@ def _status(
     try:
         config = _config(cell, others, run_config)
     except Exception as error:  # the study's function may raise anything
-        return Status(CellState.FAILED, f"its config cannot be made: {one_line(error)}")
+        return Status(CellState.FAILED, f"its config cannot be made: {describe_any(error)}")
     if result:
         changed = changed_settings(result["config"], describe_config(cell, config))
     else:
@@ -180,12 +180,6 @@ def tidy(folder: Path) -> None:
     """Delete what a finished cell no longer needs: checkpoints and TensorBoard's events."""
     for name in ("checkpoints", "tensorboard"):
         shutil.rmtree(folder / name, ignore_errors=True)
-
-
-def one_line(error: BaseException) -> str:
-    """Describe any error on one line."""
-    known = describe(error) if isinstance(error, Exception) else None
-    return known or f"{type(error).__name__}: {' '.join(str(error).split())[:500]}"
 
 
 def _failure(folder: Path) -> str:

@@ -16,6 +16,7 @@ from typing import Any
 
 import filelock
 
+from lorasp_jax.base.errors import describe_any
 from lorasp_jax.base.locks import acquire
 from lorasp_jax.config import Config
 from lorasp_jax.extras.study import progress
@@ -133,8 +134,8 @@ def run_one(job: Job, run_cell: RunCell, say: Say) -> None:
         settings = progress.describe_config(job.cell, job.config)
         write_json(job.folder / progress.CELL_FILE, {"config": settings, **result})
     except Exception as error:
-        progress.record_failure(job.folder, progress.one_line(error), traceback.format_exc())
-        say(f"{job.cell.name}: failed: {progress.one_line(error)}")
+        progress.record_failure(job.folder, describe_any(error), traceback.format_exc())
+        say(f"{job.cell.name}: failed: {describe_any(error)}")
     else:
         progress.tidy(job.folder)
         say(_summary(job.cell.name, result))

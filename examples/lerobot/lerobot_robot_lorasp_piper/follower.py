@@ -1,0 +1,100 @@
+"""A PiPER that follows targets one at a time, within the limits of `safety`; without LeRobot."""
+
+import math
+
+import numpy as np
+
+from lorasp_jax.base.errors import describe_any
+from lorasp_jax.extras.piper.arm import PiperArm
+from lorasp_jax.extras.piper.clock import Clock
+from lorasp_jax.extras.piper.interpolation import Path
+from lorasp_jax.extras.piper.safety import (
+    CAN_CONTROL,
+    MAX_AGE,
+    Governor,
+    Limits,
+    Unsafe,
+    check_chunk,
+    fault,
+)
+from lorasp_jax.extras.piper.session import PERIOD
+
+
+class Follower:
+    """Moves an arm to a target within a control step, as the simulator interpolates.
+
+    After the last target, the arm holds it. After a problem, it brakes and holds for good: an arm
+    that does not follow gives no demonstration.
+
+    Attributes:
+        problem: why the arm holds, in a sentence; None while it does not.
+    """
+
+    def __init__(self, arm: PiperArm, limits: Limits, clock: Clock, control_dt: float) -> None:
+        """Take an arm whose drivers are on; it stays where it is."""
+        self._arm, self._limits, self._clock, self._dt = arm, limits, clock, control_dt
+        self.problem: str | None = None
+        self._stopped, self._governor = False, Governor(limits, PERIOD)
+        self._governor.start(arm.read().pose)
+        self._way = Path(self._governor.pose, self._governor.pose[None], control_dt), clock.now()
+
+    def pose(self) -> np.ndarray:
+        """Return the measured pose [7]: joints [rad], gripper opening [m].
+
+        Raises:
+            Unsafe: the arm holds because of a problem.
+        """
+        if self.problem:
+            raise Unsafe(self.problem)
+        return self._arm.read().pose
+
+    def follow(self, target: np.ndarray) -> np.ndarray:
+        """Begin to move to a target [7]; return it as clipped to the limits.
+
+        Raises:
+            Unsafe: it is not finite, or the arm holds because of a problem.
+        """
+        if self.problem:
+            raise Unsafe(self.problem)
+        target = np.clip(check_chunk(target[None]), self._limits.lower, self._limits.upper)
+        now, (path, since) = self._clock.now(), self._way
+        self._way = Path(path.target(now - since), target, self._dt), now
+        return target[0]
+
+    def run(self, seconds: float = math.inf) -> None:
+        """Command the arm for some time, or until `stop`."""
+        due = self._clock.now()
+        end = due + seconds - PERIOD / 2
+        try:
+            while self._clock.now() < end and not self._stopped:
+                self._tick()
+                due = max(due, self._clock.now() - PERIOD) + PERIOD
+                self._clock.wait_until(due)
+        except BaseException as error:  # in a thread, nobody else would hear of it
+            self.problem = describe_any(error)
+            raise
+
+    def stop(self) -> None:
+        """End `run`."""
+        self._stopped = True
+
+    def settle(self) -> None:
+        """Brake; the arm then holds its last target."""
+        self.problem = self.problem or "the arm was told to hold"
+        while self._governor.velocity.any():
+            self._tick()
+            self._clock.wait_until(self._clock.now() + PERIOD)
+
+    def _tick(self) -> None:
+        reading, now = self._arm.read(), self._clock.now()
+        if not self.problem and (problem := fault(reading, self._limits)):
+            if reading.age <= MAX_AGE and (reading.arm_status or not reading.enabled):
+                self._governor.start(reading.pose)  # it may stand still already
+            self.problem = problem
+        path, since = self._way
+        if self.problem:
+            command = self._governor.brake()
+        else:
+            command = self._governor.step(path.target(now + PERIOD - since))
+        if reading.ctrl_mode == CAN_CONTROL:  # else a person or another program has the arm
+            self._arm.command(command)
