@@ -58,7 +58,7 @@ class CompiledPolicy:
         self.instructions: tuple[str, ...] = policy.processor.prompts.instructions
         self.plausible: np.ndarray = plausible_states(policy.processor)
         self.policy: Policy = without_prompts(policy)
-        self._place = place
+        self.place = place
         self._guidance = None if guidance is None else np.float32(guidance)
         # Not a method: a cycle of references would keep the weights of a policy that was unloaded.
         self.tokens = _tokens(policy.processor.prompts, loaded.words)
@@ -67,7 +67,7 @@ class CompiledPolicy:
         """Return actions f32 `[B, C, J+1]`; see `sample`."""
         steps = self.description.num_steps
         return np.asarray(
-            _program()(self._place(self.policy), batch, self._guidance, num_steps=steps)
+            _program()(self.place(self.policy), batch, self._guidance, num_steps=steps)
         )
 
 
