@@ -25,7 +25,7 @@ MOST, MOST_WITH_PICTURES = 512, 32
 """Length of the queue beyond which messages, and pictures, are dropped."""
 GRACE = 10.0
 """Time for what is queued at the end, and for files to be completed [s]."""
-_TIMINGS = ("policy_timing", "server_timing", "active_rank")  # of a reply
+_TIMINGS = ("policy_timing", "server_timing")  # of a reply
 
 
 class Viewer:

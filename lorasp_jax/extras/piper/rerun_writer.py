@@ -19,6 +19,7 @@ from lorasp_jax.extras.serving import wire
 INSTALL = 'pip install "lorasp_jax[rerun]"'
 _ADDRESS = re.compile(r"rerun(\+https?)?://\[?(?P<host>[^/\s]+?)\]?:(?P<port>\d+)/proxy")
 _NAMES = ("joint_1", "joint_2", "joint_3", "joint_4", "joint_5", "joint_6", "gripper")
+_COLORS = {"measured": (40, 160, 80), "commanded": (240, 150, 40), "predicted": (110, 150, 220)}
 _TICKS = 25  # poses that are sent at once
 _JPEG_QUALITY = 80
 _CONNECTING, _WRITING = 2.0, 5.0  # s to wait for a viewer, and for what was logged
@@ -118,6 +119,7 @@ class Writer:
         self._asked: float | None = None
         self._cameras: list[str] = []
         self._said = ""
+        self._known: set[str] = set()
 
     def _say(self, text: str, level: str) -> None:
         """Log a sentence, unless it was the last one."""
@@ -156,12 +158,13 @@ class Writer:
             self._asked = None
 
     def _reply(self, reply: dict[str, dict[str, float]]) -> None:
-        """Log a server's timings, how long a request waited there, and active ranks."""
-        roots = {"server_timing": "latency_ms/server", "policy_timing": "latency_ms/policy"}
+        """Log a server's timings, and how long a request waited there."""
         for part, numbers in reply.items():
             for name, value in numbers.items():
-                self._scalar(f"{roots.get(part, part)}/{name.removesuffix('_ms')}", value)
-        whole, policy = (reply.get(part, {}).get("infer_ms") for part in roots)
+                root = f"latency_ms/{part.removesuffix('_timing')}"
+                self._scalar(f"{root}/{name.removesuffix('_ms')}", value)
+        parts = ("server_timing", "policy_timing")
+        whole, policy = (reply.get(part, {}).get("infer_ms") for part in parts)
         if whole is not None and policy is not None:
             self._scalar("latency_ms/server/waiting", whole - policy)
 
@@ -179,6 +182,11 @@ class Writer:
         self._ticks = []
 
     def _columns(self, path: str, times: np.ndarray, values: np.ndarray, parts: Any = None) -> None:
+        kind = next((kind for kind in _COLORS if f"/{kind}" in path), None)
+        if path not in self._known and kind:
+            self._known.add(path)
+            style = self._rerun.SeriesLines(colors=[_COLORS[kind]], names=[kind])
+            self._stream.log(path, style, static=True)
         column = self._rerun.Scalars.columns(scalars=np.asarray(values, float))
         when = [self._rerun.TimeColumn("time", duration=times)]
         self._stream.send_columns(path, when, column.partition(parts) if parts else column)
@@ -189,12 +197,17 @@ class Writer:
     def _blueprint(self) -> Any:
         """Return a layout: pictures and events, the joints, and what takes time."""
         views = self._rerun.blueprint
+        legends = [views.PlotLegend(visible=name == self._joints[0]) for name in self._joints]
+        joints = [
+            views.TimeSeriesView(origin=name, plot_legend=legend)
+            for name, legend in zip(self._joints, legends, strict=True)
+        ]
         pictures = [views.Spatial2DView(origin=f"camera/{name}") for name in self._cameras]
-        others = ("latency_ms", "steps", "active_rank")
+        others = ("latency_ms", "steps")
         return views.Blueprint(
             views.Horizontal(
                 views.Vertical(*pictures, views.TextLogView(origin="events")),
-                views.Grid(*(views.TimeSeriesView(origin=name) for name in self._joints)),
+                views.Grid(*joints),
                 views.Vertical(*(views.TimeSeriesView(origin=name) for name in others)),
                 column_shares=[1, 2, 1],
             ),

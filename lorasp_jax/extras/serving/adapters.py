@@ -117,12 +117,6 @@ def is_shared(policy: Any) -> bool:
     return isinstance(getattr(getattr(policy, "policy", None), "model", None), SharedSampler)
 
 
-def where(policy: Any) -> str:
-    """Return where a served policy's own weights are, in words."""
-    kept = is_shared(policy) and policy.policy.model.own and isinstance(policy.place, OnDevice)
-    return "in host memory" if kept and policy.policy not in policy.place else "on the device"
-
-
 def embed(policy: Policy, ids: np.ndarray) -> np.ndarray:
     """Return the mean embedding f32 `[D]` of token ids in a shared base."""
     table = policy.model.array("language/embedding")

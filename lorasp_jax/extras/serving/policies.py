@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lorasp_jax.extras.serving.adapters import OnDevice, is_shared
 from lorasp_jax.extras.serving.exported import Description, sampling_options
 from lorasp_jax.extras.serving.loading import Loaded
 from lorasp_jax.policies.policy import Observation, Policy
@@ -58,16 +59,22 @@ class CompiledPolicy:
         self.instructions: tuple[str, ...] = policy.processor.prompts.instructions
         self.plausible: np.ndarray = plausible_states(policy.processor)
         self.policy: Policy = without_prompts(policy)
-        self.place = place
+        self._place = place
         self._guidance = None if guidance is None else np.float32(guidance)
         # Not a method: a cycle of references would keep the weights of a policy that was unloaded.
         self.tokens = _tokens(policy.processor.prompts, loaded.words)
+
+    @property
+    def where(self) -> str:
+        """Where its weights, of an adapter on a shared base its own, are."""
+        moves = is_shared(self) and self.policy.model.own and isinstance(self._place, OnDevice)
+        return "in host memory" if moves and self.policy not in self._place else "on the device"
 
     def run(self, batch: Mapping[str, Any]) -> np.ndarray:
         """Return actions f32 `[B, C, J+1]`; see `sample`."""
         steps = self.description.num_steps
         return np.asarray(
-            _program()(self.place(self.policy), batch, self._guidance, num_steps=steps)
+            _program()(self._place(self.policy), batch, self._guidance, num_steps=steps)
         )
 
 

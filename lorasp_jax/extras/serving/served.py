@@ -14,7 +14,7 @@ import numpy as np
 
 from lorasp_jax.base.arguments import NAME
 from lorasp_jax.extras.serving import routing
-from lorasp_jax.extras.serving.adapters import embed, is_shared, where
+from lorasp_jax.extras.serving.adapters import embed, is_shared
 from lorasp_jax.extras.serving.exported import ExportedPolicy, PolicyInterface, build_row
 from lorasp_jax.extras.serving.policies import CACHED_PROMPTS, CompiledPolicy
 from lorasp_jax.extras.serving.requests import PolicySpec, Request
@@ -107,7 +107,8 @@ class ServedPolicies:
     @property
     def places(self) -> dict[str, str]:
         """Where the weights of each adapter are, in words."""
-        return {name: where(each.policy) for name, each in self._adapters.items()}
+        on = "on the device"  # exported ones do not move
+        return {name: getattr(each.policy, "where", on) for name, each in self._adapters.items()}
 
     def warm_up(self, say: Callable[[str], None] = lambda _: None) -> None:
         """Compile and run every program; `say` is told of each before it starts."""

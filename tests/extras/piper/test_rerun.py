@@ -5,6 +5,8 @@ import io
 import json
 import resource
 import socket
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -131,6 +133,35 @@ def test_a_killed_client_leaves_a_complete_recording(tmp_path, capsys):
     assert capsys.readouterr().out == "ready\n"
     times, values = line(read(tmp_path / "episode-0000.rrd")["gripper/commanded"])
     assert (times.tolist(), values.tolist()) == ([0.5], [1.0])
+
+
+def listens(number):
+    with socket.socket() as client:
+        return client.connect_ex(("127.0.0.1", number)) == 0
+
+
+@needs_rerun
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")  # of the viewer's, while it writes
+def test_a_viewer_gets_what_is_sent_to_its_address(tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as port:
+        number = port.getsockname()[1]
+    words = ["--save", str(tmp_path / "all.rrd"), "--bind", "127.0.0.1", "--port", str(number)]
+    with subprocess.Popen([sys.executable, "-m", "rerun", *words]) as process:
+        try:
+            end = time.monotonic() + 60
+            while not listens(number):
+                assert time.monotonic() < end
+                time.sleep(0.1)
+            viewer = Viewer(f"rerun+http://127.0.0.1:{number}/proxy", 0.1)
+            viewer.line(3.0, episode=0)
+            viewer.line(3.25, **TICK)
+            viewer.close()
+            while "gripper/commanded" not in (rows := read(tmp_path / "all.rrd")):
+                assert time.monotonic() < end
+                time.sleep(0.1)
+        finally:
+            process.terminate()
+    assert line(rows["gripper/commanded"]) == ([0.25], [1.0])
 
 
 @needs_rerun
