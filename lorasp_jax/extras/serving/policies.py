@@ -67,8 +67,9 @@ class CompiledPolicy:
     @property
     def where(self) -> str:
         """Where its weights, of an adapter on a shared base its own, are."""
-        moves = is_shared(self) and self.policy.model.own and isinstance(self._place, OnDevice)
-        return "in host memory" if moves and self.policy not in self._place else "on the device"
+        place, moves = self._place, is_shared(self) and bool(self.policy.model.own)
+        away = moves and isinstance(place, OnDevice) and self.policy not in place
+        return "in host memory" if away else "on the device"
 
     def run(self, batch: Mapping[str, Any]) -> np.ndarray:
         """Return actions f32 `[B, C, J+1]`; see `sample`."""

@@ -4,7 +4,9 @@ import base64
 import contextlib
 import itertools
 import json
+import os
 import shutil
+import signal
 import subprocess
 import tempfile
 from pathlib import Path
@@ -101,12 +103,13 @@ def browser():
     options = ("--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0")
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         command = [found, *options, f"--user-data-dir={folder}", "about:blank"]
-        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        group = {"start_new_session": True}  # what is installed may be a script that starts it
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **group) as process:
             assert process.stderr
             line = next(line for line in process.stderr if "DevTools listening on" in line)
             options = {"max_size": None, "proxy": None, "close_timeout": 1}
             with contextlib.ExitStack() as sockets:
-                sockets.callback(process.terminate)
+                sockets.callback(os.killpg, process.pid, signal.SIGKILL)
                 yield lambda: _tab(sockets.enter_context(connect(line.split()[-1], **options)))
 
 
