@@ -3,7 +3,9 @@
 import importlib.util
 import io
 import json
+import os
 import resource
+import signal
 import socket
 import subprocess
 import sys
@@ -146,7 +148,8 @@ def test_a_viewer_gets_what_is_sent_to_its_address(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as port:
         number = port.getsockname()[1]
     words = ["--save", str(tmp_path / "all.rrd"), "--bind", "127.0.0.1", "--port", str(number)]
-    with subprocess.Popen([sys.executable, "-m", "rerun", *words]) as process:
+    command = [sys.executable, "-m", "rerun", *words]
+    with subprocess.Popen(command, start_new_session=True) as process:  # it starts another one
         try:
             end = time.monotonic() + 60
             while not listens(number):
@@ -160,7 +163,7 @@ def test_a_viewer_gets_what_is_sent_to_its_address(tmp_path):
                 assert time.monotonic() < end
                 time.sleep(0.1)
         finally:
-            process.terminate()
+            os.killpg(process.pid, signal.SIGKILL)
     assert line(rows["gripper/commanded"]) == ([0.25], [1.0])
 
 
