@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from lorasp_jax.extras.piper import rerun_log
+from lorasp_jax.extras.piper.__main__ import main as real
 from lorasp_jax.extras.piper.fake.__main__ import main as fake
 from lorasp_jax.extras.piper.rerun_log import Viewer, WatchedLog
 from lorasp_jax.extras.piper.rerun_writer import joint_names, main
@@ -244,3 +245,10 @@ def test_replies_may_be_anything():
 def test_joints_have_names():
     assert joint_names(7) == [*(f"joint_{i}" for i in range(1, 7)), "gripper"]
     assert joint_names(14)[6:8] == ["arm_1/gripper", "arm_2/joint_1"]
+
+
+def test_lessons_are_not_shown(tmp_path, capsys):
+    words = ["--task", "press", "--teach", "hand", "--record", str(tmp_path / "data")]
+    assert real([*words, "--rerun", str(tmp_path / "films")]) == 2
+    assert "--rerun shows what a policy does" in capsys.readouterr().err
+    assert not (tmp_path / "films").exists()
