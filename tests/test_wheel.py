@@ -35,6 +35,7 @@ def test_contents(wheel):
     top_level = {name.partition("/")[0] for name in names}
     assert top_level == {"lorasp_jax", "envs", f"lorasp_jax-{lorasp_jax.__version__}.dist-info"}
     assert {"lorasp_jax/py.typed", "envs/py.typed"} <= names
+    assert "lorasp_jax/extras/serving/status.html" in names
     for folder in ("configs", "assets/pi0_nano", "assets/smolvla_nano"):
         files = {path.name for path in (ROOT / folder).iterdir() if path.is_file()}
         assert {f"lorasp_jax/{folder}/{name}" for name in files} <= names

@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from typing import Any, NamedTuple
 
 from rich.console import Console
@@ -87,6 +88,8 @@ def _run(options: argparse.Namespace) -> int:
         raise ValueError("pass --task or --prompt: the policy must be told what to do")
     if options.teach and not options.record:
         raise ValueError("--teach needs --record FOLDER")
+    if options.teach and options.rerun:
+        raise ValueError("--rerun shows what a policy does: leave it out with --teach")
     if options.record and options.dry_run:
         raise ValueError("--record has nothing to record in a --dry-run")
     shared.settings(options, prompts[0])
@@ -101,12 +104,12 @@ def _run(options: argparse.Namespace) -> int:
             server.warn(prompts)
         size = {"image_size": options.image_size}
         recorder = stack.enter_context(shared.recording(options, task, prompt=prompts[0], **size))
+        log = stack.enter_context(closing(shared.open_log(options, server))) if server else None
         arm: Any = _open(options)
         stack.callback(arm.close)
         arm.connect()
         if not (options.dry_run or options.teach == "leader"):
             arm.enable(shared.limits(options))
-        log = stack.enter_context(contextlib.closing(shared.open_log(options))) if server else None
         keys = stack.enter_context(Keyboard())
         return _episodes(options, Rig(arm, look, server, recorder, log, keys), prompts, seconds)
 
@@ -127,6 +130,8 @@ def _episodes(options: argparse.Namespace, rig: Rig, prompts: Sequence[str], sec
         prompt = prompts[(kept if rig.recorder else judged) % len(prompts)]
         before, work = work, _prepare(options, rig, prompt)
         shared.stop_on_signals(work)
+        if rig.log:
+            rig.log.line(RealClock().now(), episode=judged)
         if before and before.stopped:  # meanwhile
             break
         verdict = ""

@@ -15,6 +15,8 @@ from lorasp_jax.base.locks import locked
 from lorasp_jax.extras.piper.keys import SIGNALS
 from lorasp_jax.extras.piper.log import Log
 from lorasp_jax.extras.piper.recording import Recording
+from lorasp_jax.extras.piper.remote import Server
+from lorasp_jax.extras.piper.rerun_log import Viewer, WatchedLog
 from lorasp_jax.extras.piper.safety import Limits
 from lorasp_jax.extras.piper.session import Session
 from lorasp_jax.extras.piper.settings import Settings
@@ -46,6 +48,9 @@ def add_shared(parser: argparse.ArgumentParser) -> None:
     add("--control-dt", type=float, metavar="S", help="duration of an action [s]; default: the "
         "policy's, or 0.1")  # fmt: skip
     add("--log", type=Path, metavar="FOLDER", help="default: logs/piper-TIME")
+    add("--rerun", metavar="TARGET", help="show pictures, chunks, poses and latencies in Rerun: a "
+        "folder for a recording of each episode, or a viewer's address such as "
+        "rerun+http://127.0.0.1:9876/proxy")  # fmt: skip
     add = parser.add_argument_group("limits").add_argument
     add("--speed", type=float, default=1.0, help="of the joints [rad/s] (default: %(default)s)")
     add(
@@ -93,9 +98,15 @@ def motion(options: argparse.Namespace) -> dict[str, Any]:
     return {"speed": options.speed, "effort": options.effort, "zeros": options.zeros}
 
 
-def open_log(options: argparse.Namespace) -> Log:
-    """Open the log."""
-    return Log(options.log or Path("logs") / time.strftime("piper-%Y%m%d-%H%M%S"))
+def open_log(options: argparse.Namespace, server: Server | None) -> Log:
+    """Open the log, and what shows it."""
+    folder = options.log or Path("logs") / time.strftime("piper-%Y%m%d-%H%M%S")
+    if not options.rerun:
+        return Log(folder)
+    viewer = Viewer(options.rerun, period(options))
+    if server:
+        server.heard = viewer.reply
+    return WatchedLog(folder, viewer)
 
 
 @contextlib.contextmanager

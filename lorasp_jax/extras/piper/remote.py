@@ -4,7 +4,7 @@ import argparse
 import contextlib
 import functools
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ class Server:
 
     Attributes:
         ended: why the connection has ended, in a sentence; None while it has not.
+        heard: is told of every reply, in the thread that asks.
     """
 
     def __init__(self, client: PolicyClient, adapter: str = "") -> None:
@@ -39,6 +40,7 @@ class Server:
         self._client = client
         self._lock = threading.Lock()  # a question that nobody waits for any more may be open
         self.ended: str | None = None
+        self.heard: Callable[[dict[str, Any]], None] = lambda _: None
         self._size = client.metadata.get("image_size") or 0
         continues = (client.metadata.get("execution") or "naive") != "naive"
         self._unknown = () if continues else _CONTINUATION
@@ -79,6 +81,7 @@ class Server:
         except (ServerGone, PolicyError) as error:
             self.ended = self.ended or str(error)
             raise
+        self.heard(reply)
         if "actions" not in reply:
             keys = ", ".join(map(str, reply))[:200] or "nothing"
             raise PolicyError(f"the server's reply has no actions, only {keys}")

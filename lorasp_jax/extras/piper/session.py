@@ -224,7 +224,7 @@ class Session:
             self._switch(own, now)
         self._asked = None
         self.chunks += 1
-        self._write(now, chunk=chunk)
+        self._write(now, chunk=chunk, start=self._start)
 
     def _check_length(self, chunk: np.ndarray) -> None:
         """Refuse a chunk that is too short; ValueError if it is the first, as no arm moves yet."""

@@ -45,7 +45,8 @@ def parser(program: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=program,
         description="Serve a policy over websockets, in openpi's protocol or vla-eval's.",
-        epilog="Pages on the same port: /healthz, /status and /metrics. See docs/serving.md.",
+        epilog="Pages on the same port: / for people, /healthz, /status and /metrics. See "
+        "docs/serving.md.",
     )
     add = parser.add_argument
     add(
@@ -127,14 +128,20 @@ def _serve(options: argparse.Namespace, console: Console) -> None:
         if options.vla_eval:
             policy_server: Any = vla_eval.VlaEvalServer(policy, options.vla_eval)
         else:
-            limit = options.max_clients
-            policy_server = server.PolicyServer(policy, token=token, max_clients=limit)
+            more = {"max_clients": options.max_clients, "about": _about(options)}
+            policy_server = server.PolicyServer(policy, token=token, **more)
         answers = asyncio.run(_run(policy_server, port, console))
     if not answers:
         from lorasp_jax.training.distributed import processes
 
         _say(console, f"the policy has not answered within {GRACE:g} s, or loads: ended without it")
         processes.exit_all(1)  # a thread that hangs cannot be stopped
+
+
+def _about(options: argparse.Namespace) -> dict[str, str]:
+    """Return where the policies are from, for the server's page."""
+    about = {"from": ", ".join(path for _, path in options.policy), "base": options.base}
+    return {name: text for name, text in about.items() if text}
 
 
 async def _run(policy_server: Any, port: socket.socket, console: Console) -> bool:

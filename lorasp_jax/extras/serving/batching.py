@@ -106,6 +106,10 @@ class Batcher:
             return "the policy's thread has ended"
         return "the policy failed when it was last asked" if self._failed else None
 
+    def load(self) -> tuple[int, int]:
+        """Return how many requests wait, and how many run."""
+        return self._queue.qsize() + len(self._pending), len(self._running)
+
     def close(self, timeout: float | None = None) -> bool:
         """Stop the thread after the current batch; return False if that takes longer [s]."""
         self._closing = True

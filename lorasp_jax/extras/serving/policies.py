@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lorasp_jax.extras.serving.adapters import OnDevice, is_shared
 from lorasp_jax.extras.serving.exported import Description, sampling_options
 from lorasp_jax.extras.serving.loading import Loaded
 from lorasp_jax.policies.policy import Observation, Policy
@@ -62,6 +63,13 @@ class CompiledPolicy:
         self._guidance = None if guidance is None else np.float32(guidance)
         # Not a method: a cycle of references would keep the weights of a policy that was unloaded.
         self.tokens = _tokens(policy.processor.prompts, loaded.words)
+
+    @property
+    def where(self) -> str:
+        """Where its weights, of an adapter on a shared base its own, are."""
+        place, moves = self._place, is_shared(self) and bool(self.policy.model.own)
+        away = moves and isinstance(place, OnDevice) and self.policy not in place
+        return "in host memory" if away else "on the device"
 
     def run(self, batch: Mapping[str, Any]) -> np.ndarray:
         """Return actions f32 `[B, C, J+1]`; see `sample`."""

@@ -91,8 +91,11 @@ class Adapters:
     def listed(self) -> str:
         """Return the adapters as JSON, and how the last change ended."""
         adapters = [{"name": n, "instructions": t} for n, t in self._policy.instructions.items()]
-        state = {"adapters": adapters, "loading": len(self._loading), "last": self._last}
-        return json.dumps(state) + "\n"
+        return json.dumps({"adapters": adapters, **self.state()}) + "\n"
+
+    def state(self) -> dict[str, Any]:
+        """Return how many changes are under way, and how the last ended."""
+        return {"loading": len(self._loading), "last": self._last}
 
     async def change(self, body: bytes) -> tuple[http.HTTPStatus, str]:
         """Do what a body says; return the status of the response and a sentence."""

@@ -104,6 +104,12 @@ class ServedPolicies:
         """The present adapters, the default first."""
         return [*self._adapters.values()]
 
+    @property
+    def places(self) -> dict[str, str]:
+        """Where the weights of each adapter are, in words."""
+        on = "on the device"  # exported ones do not move
+        return {name: getattr(each.policy, "where", on) for name, each in self._adapters.items()}
+
     def warm_up(self, say: Callable[[str], None] = lambda _: None) -> None:
         """Compile and run every program; `say` is told of each before it starts."""
         programs = list(itertools.product(self.adapters, self.sizes))

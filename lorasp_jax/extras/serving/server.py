@@ -12,12 +12,12 @@ import hmac
 import http
 import ipaddress
 import itertools
-import json
 import logging
 import socket
 import time
+import types
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Iterable
+from collections.abc import AsyncIterator, Awaitable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +29,7 @@ from websockets.http11 import Request as HttpRequest
 from websockets.http11 import Response
 
 import lorasp_jax
-from lorasp_jax.extras.serving import metrics, posting, wire
+from lorasp_jax.extras.serving import metrics, posting, watching, wire
 from lorasp_jax.extras.serving.batching import Batcher, PolicyFailure
 from lorasp_jax.extras.serving.requests import MAX_VALUES, Request, parse
 
@@ -38,6 +38,8 @@ if TYPE_CHECKING:  # which imports JAX
 
 MAX_CLIENTS = 64
 """Maximum number of connections, unless given."""
+SERVER = f"lorasp_jax {lorasp_jax.__version__}"
+"""What this server calls itself."""
 _MOST_WARNINGS = 20  # keys come from outside
 _log = logging.getLogger(__name__)
 
@@ -48,12 +50,14 @@ class ClientState:
 
     Attributes:
         number: of the connection.
+        seen: what the page shows of it.
         requests: requests on this connection.
         previous: the last chunk of the episode, f32 `[C, J+1]`.
         previous_ms: time from receiving the previous request to having sent its reply.
     """
 
     number: int
+    seen: watching.Seen
     requests: int = 0
     previous: np.ndarray | None = field(default=None, repr=False)
     previous_ms: float | None = None
@@ -81,7 +85,12 @@ class PolicyServer:
     """
 
     def __init__(
-        self, policy: "ServedPolicies", *, token: str = "", max_clients: int = MAX_CLIENTS
+        self,
+        policy: "ServedPolicies",
+        *,
+        token: str = "",
+        max_clients: int = MAX_CLIENTS,
+        about: Mapping[str, str] = types.MappingProxyType({}),
     ) -> None:
         """Start the policy's thread; `listen` opens the port.
 
@@ -89,6 +98,7 @@ class PolicyServer:
             policy: already compiled.
             token: if not empty, clients must send it in the header "Authorization: Api-Key TOKEN".
             max_clients: maximum number of connections.
+            about: shown on the page, such as where the policy is from.
         """
         names = ("connections", "open_connections", "refused_connections", "requests", "errors")
         self._max_clients, self._seconds = max_clients, metrics.Histogram()
@@ -96,6 +106,7 @@ class PolicyServer:
         self._policy, self._token = policy, token
         self._batcher = Batcher(policy, self.counts)
         self._adapters = posting.Adapters(policy)
+        self._watch = watching.Watch(policy, about)
         self._clients, self._warned = itertools.count(), set[str]()
 
     @contextlib.asynccontextmanager
@@ -137,9 +148,12 @@ class PolicyServer:
         if refusal := self._refusal(request):
             self.counts["refused_connections"] += 1
             _log.info("refused %s: %s", _peer(connection), refusal[1])
-            return connection.respond(refusal[0], f"{refusal[1]}\n")
-        if request.path == "/status":
-            return connection.respond(http.HTTPStatus.OK, json.dumps(self.counts) + "\n")
+            response = connection.respond(refusal[0], f"{refusal[1]}\n")
+            if refusal[0] is http.HTTPStatus.UNAUTHORIZED and watching.is_watched(request):
+                response.headers["WWW-Authenticate"] = watching.CHALLENGE
+            return response
+        if watching.is_watched(request):
+            return self._watched(request.path)
         if request.path == "/metrics":
             histograms = {"request_seconds": self._seconds, "batch_seconds": self._batcher.seconds}
             page = connection.respond(http.HTTPStatus.OK, metrics.text(self.counts, histograms))
@@ -155,15 +169,31 @@ class PolicyServer:
         headers = request.headers.get_all("Authorization")
         if len(headers) > 1:
             return http.HTTPStatus.BAD_REQUEST, "there must be one header Authorization"
-        given = "".join(headers).removeprefix("Api-Key ")
+        watched = watching.is_watched(request)
+        given = watching.password("".join(headers)) if watched else "".join(headers)
+        given = given.removeprefix("Api-Key ")
         if self._token and not hmac.compare_digest(given.encode(), self._token.encode()):
             text = "this server requires a token: Authorization: Api-Key TOKEN"
             return http.HTTPStatus.UNAUTHORIZED, text
-        is_page = request.path in ("/status", "/metrics", "/adapters")
+        if watched and not self._token and not watching.is_local(request):
+            text = "without a token, this page is only at localhost, 127.0.0.1 or another address"
+            return http.HTTPStatus.FORBIDDEN, text
+        is_page = watched or request.path in ("/metrics", "/adapters")
         if not is_page and self.counts["open_connections"] >= self._max_clients:
             text = f"this server has its maximum of {self._max_clients} connections"
             return http.HTTPStatus.SERVICE_UNAVAILABLE, text
         return None
+
+    async def _watched(self, path: str) -> Response:
+        """Answer a page for people, or what it shows."""
+        if path == "/":
+            return watching.page()
+        if path != "/status":
+            return watching.picture(await asyncio.to_thread(self._watch.picture, path))
+        waiting, running = self._batcher.load()
+        more = {"problem": self.problem(), "waiting": waiting, "running": running}
+        more |= {"max_clients": self._max_clients, "server": SERVER, **self._adapters.state()}
+        return watching.json_page(self._watch.status(**self.counts, **more))
 
     async def _change_adapters(self, connection: ServerConnection, body: bytes | None) -> Response:
         """Answer a GET or POST of /adapters."""
@@ -176,9 +206,10 @@ class PolicyServer:
 
     async def _handle(self, connection: ServerConnection) -> None:
         """Serve one connection until it closes."""
-        client = ClientState(next(self._clients))
+        client = ClientState(next(self._clients), watching.Seen(_peer(connection)))
+        self._watch.clients[client.number] = client.seen
         self.counts.update(("connections", "open_connections"))
-        _log.info("client %d connected from %s", client.number, _peer(connection))
+        _log.info("client %d connected from %s", client.number, client.seen.address)
         try:
             await connection.send(wire.pack(describe(self._policy)))
             async for frame in connection:
@@ -192,6 +223,7 @@ class PolicyServer:
             await self._refuse(connection, client, f"the server failed: {type(error).__name__}")
         finally:
             self.counts["open_connections"] -= 1
+            del self._watch.clients[client.number]
             _log.info("client %d left after %d requests", client.number, client.requests)
 
     async def _answer(
@@ -215,6 +247,7 @@ class PolicyServer:
         await connection.send(wire.pack(reply))
         client.previous_ms = (time.perf_counter() - start) * 1e3
         self._seconds.observe(str(adapter), client.previous_ms / 1e3)
+        self._watch.answered(client.seen, client.previous_ms)
         self.counts["requests"] += 1
 
     def _read(self, client: ClientState, frame: bytes) -> tuple[Any, Any, int | None]:
@@ -223,6 +256,7 @@ class PolicyServer:
         self._warn(request.unknown)
         adapter = self._policy.route(request)
         row = self._policy.prepare(adapter, *client.advance(request))
+        client.seen.keep(str(adapter), request)
         return adapter, row, request.actions
 
     def _warn(self, keys: Iterable[str]) -> None:
@@ -253,7 +287,7 @@ def describe(policy: "ServedPolicies") -> dict[str, Any]:
     """Return the metadata that clients receive first."""
     spec = policy.spec
     return {
-        "server": f"lorasp_jax {lorasp_jax.__version__}",
+        "server": SERVER,
         "cameras": list(spec.cameras),
         "image_size": spec.image_size,
         "encodings": ["raw", "jpeg"],

@@ -30,6 +30,10 @@ class StandIn:
         self.batches, self.indices = [], []
         self.gate.set()
 
+    @property
+    def places(self):
+        return dict.fromkeys(self.instructions, "nowhere")
+
     def route(self, request):
         adapter = request.adapter or next(iter(self.instructions))
         if adapter not in self.instructions:

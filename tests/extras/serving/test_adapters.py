@@ -94,6 +94,8 @@ def test_at_most_k_adapters_are_on_the_device(runs, served):
         )
     held = [each.name for each in limited.adapters if each.policy.policy in limited.place]
     assert (held, limited.place.loads) == (["press", "pour"], 4), "the last used ones are kept"
+    places = {name: "on the device" if name in held else "in host memory" for name in runs}
+    assert limited.places == places
 
 
 def test_an_unloaded_adapter_leaves_the_device_after_its_last_request(runs):

@@ -78,7 +78,7 @@ def _run(options: argparse.Namespace, console: Console) -> None:
     shared.settings(options, "")
     cache.enable()
     source = nullcontext() if options.expert else remote.policy(options)
-    with source as server, closing(shared.open_log(options)) as log:
+    with source as server, closing(shared.open_log(options, server)) as log:
         size = (server and server.metadata.get("image_size")) or options.image_size
         world = World(options.task, image_size=size)
         world.reset(options.seed)
