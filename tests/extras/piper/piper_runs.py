@@ -84,14 +84,14 @@ def assert_safe(run, jump=0.0):
     assert [fake.unsafe for fake in run.bench.fakes] == [[]] * len(run.bench.fakes)
 
 
-def assert_braked(run, arms=None):
+def assert_braked(run, arms=None, jump=0.0):
     """Check that arms, by default all, moved, and were stopped within the limits."""
     for sent in run.all_sent if arms is None else [run.all_sent[arm] for arm in arms]:
         velocity = np.diff(np.stack(sent), axis=0)[:, :6] / PERIOD
         assert np.abs(velocity).max() > 0.25
         assert np.abs(np.diff(velocity, axis=0)).max() <= LIMITS.acceleration[0] * PERIOD + 1e-9
         assert not velocity[-1].any()
-    assert_safe(run)
+    assert_safe(run, jump)
 
 
 def assert_holds(run, words, jump=0.0):

@@ -65,7 +65,8 @@ class Lockstep(_Fakes):
         while self.now() < seconds - PERIOD / 2:
             self._tick()
             for arm, fake in zip(self._arms, self.fakes, strict=False):
-                self._wait_for_reader(arm, fake)
+                if arm.sdk.get_connect_status():  # else it does not read yet
+                    self._wait_for_reader(arm, fake)
 
     def _wait_for_reader(self, arm: PiperArm, fake: FakePiper) -> None:
         """Wait for the status frame, which is the last of every tick."""
