@@ -6,6 +6,7 @@ import pytest
 from envs.rendering.video import write_video
 from lorasp_jax.extras.piper import remote, safety
 from lorasp_jax.extras.piper.arms import Arms
+from lorasp_jax.extras.piper.fake.hand_over import HandOver
 from lorasp_jax.extras.piper.fake.world import World
 from tests.extras.piper.benches import Bench
 from tests.extras.piper.piper_runs import Still
@@ -21,6 +22,19 @@ def world():
 @pytest.fixture
 def bench(world):
     bench = Bench(world).ready()
+    yield bench
+    bench.close()
+
+
+@pytest.fixture(scope="session")
+def table():
+    """A scene with two arms, as `world` is one with one."""
+    return HandOver(image_size=16)
+
+
+@pytest.fixture
+def pair(table):
+    bench = Bench(table).ready()
     yield bench
     bench.close()
 

@@ -6,7 +6,6 @@ import pytest
 from lorasp_jax.data.lerobot_export import to_lerobot
 from lorasp_jax.data.opening import open_source
 from lorasp_jax.extras.piper.arms import SIDES, dimension_names
-from lorasp_jax.extras.piper.fake.hand_over import HandOver
 from lorasp_jax.extras.piper.recording import Recording
 from tests.cases import mostly_slow
 from tests.extras.piper.benches import Bench
@@ -20,19 +19,6 @@ from tests.extras.piper.piper_runs import (
 )
 
 STEPS = np.arange(1, 11)[:, None]
-
-
-@pytest.fixture(scope="module")
-def table():
-    """A scene with two arms, which each bench resets."""
-    return HandOver(image_size=16)
-
-
-@pytest.fixture
-def pair(table):
-    bench = Bench(table).ready()
-    yield bench
-    bench.close()
 
 
 def bases(bench):

@@ -37,9 +37,11 @@ _STICK = f"""
 """
 _CENTER, _SPREAD = np.array([0.36, 0.0, 0.0]), np.array([0.03, 0.04, 0.15])  # m, m, rad
 _GRIP = 0.05  # m, from the stick's middle to where an arm grasps it
-_MEETING, _LIFTED = 0.22, 0.15  # m, height of the hand-over, and height that counts as lifted
+_MEETING, _RAISED = 0.22, 0.26  # m, heights of the hand-over, and above which it is done
+_LIFTED = 0.15  # m, height of the stick above which an arm that holds it carries it
 _SAG = 0.015  # m, by which the free end of the stick hangs lower
 _HOLD_STEPS = 5  # control steps for which the right arm holds it
+_EYE, _AXES = (0.4, -0.95, 0.6), (1.0, 0.0, 0.0, 0.0, 0.43, 0.90)  # m; the camera's x and y axes
 _OPEN, _CLOSED = 0.06, 0.0  # m
 _DURATION = 10.0  # s, of the demonstration
 
@@ -90,6 +92,11 @@ class HandOver(World):
         """The arms by name."""
         return self._arms
 
+    @property
+    def height(self) -> float:
+        """Height of the stick's middle [m]."""
+        return float(self.data.joint("stick").qpos[2])
+
     def demonstration(self, seed: int) -> np.ndarray:  # noqa: ARG002
         """Return the scripted expert's actions [T, 14] from the start of this layout."""
         return np.asarray(_demonstrate(jnp.array(self._layout)))
@@ -111,22 +118,22 @@ class HandOver(World):
         self.success, self._held, self._carried = False, 0, False
 
     def holders(self) -> set[str]:
-        """Return the arms that hold the stick above the table: between both fingers."""
+        """Return the arms that carry the stick: between both fingers, above the table."""
         stick, touching = self.model.geom("stick").id, set()
         with self._lock:
             for one, other in self.data.contact.geom:
                 if stick in (one, other):
                     geom = other if one == stick else one
                     touching.add(self.model.body(self.model.geom_bodyid[geom]).name)
-            lifted = self.data.joint("stick").qpos[2] > _LIFTED
+            lifted = self.height > _LIFTED
         fingers = {name: {f"{p}left", f"{p}right"} for name, p in _PREFIXES.items()}
         return {name for name, both in fingers.items() if lifted and both <= touching}
 
     def _is_done(self) -> bool:
-        """Return whether the right arm alone holds what the left arm alone has held before."""
+        """Return whether the right arm alone has raised what the left arm alone has carried."""
         holders = self.holders()
         self._carried |= holders == {"left"}
-        return self._carried and holders == {"right"}
+        return self._carried and holders == {"right"} and self.height > _RAISED
 
 
 def _model() -> mujoco.MjModel:
@@ -135,6 +142,8 @@ def _model() -> mujoco.MjModel:
         spec, other = (mujoco.MjSpec.from_string(scene.mjcf(x, ROBOT)) for x in (_STICK, ""))
         frame = spec.worldbody.add_frame(pos=[DISTANCE, 0, 0], quat=[0, 0, 0, 1])
         frame.attach_body(other.body(BASE), _PREFIXES["right"], "")
+        camera = spec.camera("side")  # now sees both arms
+        camera.pos, camera.alt.xyaxes, camera.fovy = _EYE, _AXES, 48.0
         return spec.compile()
 
 
