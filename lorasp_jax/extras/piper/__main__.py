@@ -92,6 +92,7 @@ def _run(options: argparse.Namespace) -> int:
     if options.record and options.dry_run:
         raise ValueError("--record has nothing to record in a --dry-run")
     shared.settings(options, prompts[0])
+    shared.limits(options)
     seconds = options.seconds or (task.time_limit if task else 60.0)
     with contextlib.ExitStack() as stack:
         buses = _buses(options)

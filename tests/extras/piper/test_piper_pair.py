@@ -7,6 +7,7 @@ from lorasp_jax.data.lerobot_export import to_lerobot
 from lorasp_jax.data.opening import open_source
 from lorasp_jax.extras.piper.arms import SIDES, dimension_names
 from lorasp_jax.extras.piper.recording import Recording
+from lorasp_jax.extras.piper.teaching import Lesson
 from tests.cases import mostly_slow
 from tests.extras.piper.benches import Bench
 from tests.extras.piper.piper_runs import (
@@ -19,6 +20,8 @@ from tests.extras.piper.piper_runs import (
 )
 
 STEPS = np.arange(1, 11)[:, None]
+WAYS = {"task": "turn", "instructions": (), "prompt": "turn", "control_dt": 0.1}
+WAYS |= {"robot": "bi_piper", "names": dimension_names(SIDES), "image_size": 16}
 
 
 def bases(bench):
@@ -138,6 +141,25 @@ def test_both_go_home_and_to_rest(pair, monkeypatch):
     np.testing.assert_allclose(bases(pair), rest[[0, 7]], atol=0.03)
 
 
+def test_both_are_guided_by_hand(pair, tmp_path):
+    recorder = Recording(tmp_path / "data", **WAYS)
+    lesson = Lesson(pair.arms, pair.world.images, recorder, pair.clock, way="hand", control_dt=0.1)
+    starts, begin = [fake.limb.pose for fake in pair.fakes], pair.clock.now()
+
+    def guide():
+        turn = 0.2 * max(0.0, pair.clock.now() - begin - 0.3) * np.eye(7)[0]
+        for fake, start, way in zip(pair.fakes, starts, (1, -1), strict=True):
+            fake.hand = start + way * turn
+        return False
+
+    lesson.run(1.5, guide)
+    recorder.keep()
+    action = open_source(tmp_path / "data").episode(0).action[0]
+    assert action.shape[1] == 14
+    np.testing.assert_allclose(action[-1, 0], -action[-1, 7], atol=0.01)
+    assert action[-1, 0] > 0.1
+
+
 def test_an_error_while_enabling_names_the_arm(table):
     bench = Bench(table)
     bench.arms.connect()
@@ -150,11 +172,9 @@ def test_an_error_while_enabling_names_the_arm(table):
 
 def test_recordings_are_two_armed_datasets(pair, tmp_path):
     """In this project's format and LeRobot's, both grippers are known by their names."""
-    names = dimension_names(SIDES)
+    names = WAYS["names"]
     assert names[::6] == ["left_joint_1.pos", "left_gripper.pos", "right_joint_6.pos"]
-    more = {"task": "turn", "instructions": (), "prompt": "turn", "control_dt": 0.1}
-    more |= {"robot": "bi_piper", "names": names, "image_size": 16}
-    recorder = Recording(tmp_path / "data", **more)
+    recorder = Recording(tmp_path / "data", **WAYS)
     run = Run(pair, Turning(), recorder=recorder)
     assert run(1.0) is None
     recorder.keep()
@@ -167,4 +187,4 @@ def test_recordings_are_two_armed_datasets(pair, tmp_path):
         assert episode.robot == "bi_piper"
         assert episode.state.shape == episode.action.shape == (1, 10, 14)
     with pytest.raises(ValueError, match=r"has names \['left_joint_1.pos'.* choose another folder"):
-        Recording(tmp_path / "data", **{**more, "robot": "piper", "names": ()})
+        Recording(tmp_path / "data", **WAYS | {"robot": "piper", "names": ()})
