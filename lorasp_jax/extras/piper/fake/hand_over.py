@@ -15,11 +15,10 @@ import numpy as np
 from envs.experts import expert
 from envs.rendering.model import build
 from envs.rendering.renderer import RayRenderer
-from envs.robots import BASE, multiply, turn
+from envs.robots import BASE, multiply, rotation, turn
 from envs.robots.piper import ROBOT
 from envs.scene import scene
 from envs.state import Poses
-from envs.tasks import Waypoints
 from lorasp_jax.extras.piper.fake.world import Limb, World, unlike_training
 
 CAMERAS = {"cam_high": "side", "cam_left_wrist": "wrist", "cam_right_wrist": "right_wrist"}
@@ -44,6 +43,8 @@ _HOLD_STEPS = 5  # control steps for which the right arm holds it
 _EYE, _AXES = (0.4, -0.95, 0.6), (1.0, 0.0, 0.0, 0.0, 0.43, 0.90)  # m; the camera's x and y axes
 _OPEN, _CLOSED = 0.06, 0.0  # m
 _DURATION = 10.0  # s, of the demonstration
+_HAND = np.diag([-1.0, 1.0, -1.0]) @ rotation("y", -ROBOT.lean)[:3, :3]
+"""Rotation of a hand that points down, leaning outward, and grasps across a stick along x."""
 
 
 class Task(NamedTuple):
@@ -99,7 +100,7 @@ class HandOver(World):
 
     def demonstration(self, seed: int) -> np.ndarray:  # noqa: ARG002
         """Return the scripted expert's actions [T, 14] from the start of this layout."""
-        return np.asarray(_demonstrate(jnp.array(self._layout)))
+        return np.asarray(_path(*map(jnp.float32, _waypoints(*self._layout))))
 
     def _reset(self, seed: int) -> None:
         random = np.random.default_rng(seed)
@@ -147,56 +148,43 @@ def _model() -> mujoco.MjModel:
         return spec.compile()
 
 
-def _rows(layout: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _waypoints(x: float, y: float, yaw: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the expert's waypoints for a stick at x, y, yaw.
 
     Returns:
         [2, P, 5] x, y, z of the tcp [m], yaw [rad] and opening [m] of each arm, in its own base
         frame; and [P] the time from waypoint to waypoint [s].
     """
-    x, y, yaw = layout
-    low = (x - _GRIP * jnp.cos(yaw), y - _GRIP * jnp.sin(yaw))
-    near, home, away = DISTANCE / 2 - _GRIP, (0.34, 0.0, 0.30, 0.0, _OPEN), (0.30, 0.0)
+    on, near = (x - _GRIP * math.cos(yaw), y - _GRIP * math.sin(yaw)), DISTANCE / 2 - _GRIP
     give, take = (near, 0.0, _MEETING, 0.0), (near, 0.0, _MEETING - _SAG, 0.0)
-    above = (near, 0.0, _MEETING + 0.08, 0.0, _OPEN)
-    rows = (
-        ((*low, 0.12, yaw, _OPEN), home, 1.5),
-        ((*low, _THICKNESS, yaw, _OPEN), home, 1.0),
-        ((*low, _THICKNESS, yaw, _CLOSED), home, 0.6),
+    above, home = (near, 0.0, _MEETING + 0.08, 0.0, _OPEN), (0.34, 0.0, 0.30, 0.0, _OPEN)
+    away = (0.30, 0.0, 0.30, 0.0)
+    rows = (  # left, right, seconds
+        ((*on, 0.12, yaw, _OPEN), home, 1.5),
+        ((*on, _THICKNESS, yaw, _OPEN), home, 1.0),
+        ((*on, _THICKNESS, yaw, _CLOSED), home, 0.6),
         ((*give, _CLOSED), above, 2.0),
         ((*give, _CLOSED), (*take, _OPEN), 1.0),
         ((*give, _CLOSED), (*take, _CLOSED), 0.6),
         ((*give, _OPEN), (*take, _CLOSED), 0.5),
         (above, (*take, _CLOSED), 0.8),
-        ((*away, 0.30, 0.0, _OPEN), (*away, 0.30, 0.0, _CLOSED), 1.5),
+        ((*away, _OPEN), (*away, _CLOSED), 1.5),
     )
     left, right, seconds = zip(*rows, strict=True)
-    arms = jnp.stack([jnp.array(left, jnp.float32), jnp.array(right, jnp.float32)])
-    return arms, jnp.array(seconds)
+    return np.array([left, right]), np.array(seconds)
 
 
 @jax.jit
-def _demonstrate(layout: jax.Array) -> jax.Array:
-    """Return actions [T, 14] that hand over a stick at x, y, yaw."""
-    arms, seconds = _rows(layout)
+def _path(arms: jax.Array, seconds: jax.Array) -> jax.Array:
+    """Return actions [T, 14] through the waypoints of both arms."""
     start = jnp.append(jnp.array(ROBOT.home, jnp.float32), ROBOT.stroke)
 
     def knots(rows: jax.Array) -> jax.Array:
-        joints = expert.solve(ROBOT, rows[:, :3], _tool(rows[:, 3]), start[:6])
-        return jnp.concatenate([start[None], jnp.concatenate([joints, rows[:, 4:]], 1)])
+        turns = jax.vmap(lambda yaw: turn(jnp.array([0.0, 0.0, 1.0]) * yaw))(rows[:, 3])
+        joints = expert.solve(ROBOT, rows[:, :3], multiply(turns, jnp.array(_HAND)), start[:6])
+        return jnp.concatenate([start[None], jnp.concatenate([joints, rows[:, 4:]], axis=1)])
 
     path = jnp.concatenate([knots(rows) for rows in arms], axis=1)
     times = jnp.concatenate([jnp.zeros(1), jnp.cumsum(seconds)])
     steps = HandOver.control_dt * (1 + jnp.arange(round(_DURATION / HandOver.control_dt)))
     return jax.vmap(lambda time: expert.interpolate(path, times, time))(steps)
-
-
-def _tool(yaw: jax.Array) -> jax.Array:
-    """Return tcp rotations [P, 3, 3] that lean outward and grasp across a stick along x and yaw."""
-    lean = jnp.full_like(yaw, ROBOT.lean)
-    down = jnp.broadcast_to(jnp.diag(jnp.array([-1.0, 1.0, -1.0])), (len(yaw), 3, 3))
-    turned = multiply(jax.vmap(lambda a: turn(jnp.array([0.0, 0.0, 1.0]) * a))(yaw), down)
-    same = jnp.zeros_like(yaw)
-    return expert.tool_rotations(
-        ROBOT, Waypoints(turned[:, :, 2], same, turned, lean / ROBOT.lean, same, same, same, same)
-    )
