@@ -1,5 +1,6 @@
 """Two arms: one session drives both, and what goes wrong with one holds both."""
 
+import jax
 import numpy as np
 import pytest
 
@@ -8,6 +9,8 @@ from lorasp_jax.data.opening import open_source
 from lorasp_jax.extras.piper.arms import SIDES, dimension_names
 from lorasp_jax.extras.piper.recording import Recording
 from lorasp_jax.extras.piper.teaching import Lesson
+from lorasp_jax.training.loop import train
+from lorasp_jax.training.run_folder import read_metrics
 from tests.cases import mostly_slow
 from tests.extras.piper.benches import Bench
 from tests.extras.piper.piper_runs import (
@@ -18,6 +21,7 @@ from tests.extras.piper.piper_runs import (
     assert_holds,
     assert_safe,
 )
+from tests.training.test_two_arms import prepare
 
 STEPS = np.arange(1, 11)[:, None]
 WAYS = {"task": "turn", "instructions": (), "prompt": "turn", "control_dt": 0.1}
@@ -188,3 +192,18 @@ def test_recordings_are_two_armed_datasets(pair, tmp_path):
         assert episode.state.shape == episode.action.shape == (1, 10, 14)
     with pytest.raises(ValueError, match=r"has names \['left_joint_1.pos'.* choose another folder"):
         Recording(tmp_path / "data", **WAYS | {"robot": "piper", "names": ()})
+
+
+@pytest.mark.slow
+def test_recordings_train(pair, tmp_path, monkeypatch):
+    """Relative actions spare both grippers, as their names say."""
+    recorder = Recording(tmp_path / "data", **WAYS)
+    for _ in range(3):
+        assert Run(pair, Turning(), recorder=recorder)(1.0) is None
+        recorder.keep()
+    cameras = ("cam_high", "cam_left_wrist", "cam_right_wrist")
+    run = prepare(tmp_path / "run", monkeypatch, tmp_path / "data", cameras, relative=True)
+    assert run.policy.processor.inputs.delta == (*[True] * 6, False) * 2
+    run.devices = jax.devices()[:1]
+    train(run)
+    assert read_metrics(run.folder)[-1]["step"] == 2
