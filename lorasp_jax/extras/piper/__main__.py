@@ -138,7 +138,7 @@ def _open(
     limits = shared.limits(options)
     if not buses:
         print("a dry run without an arm: it stands in the start pose")
-        two = server and server.metadata.get("action_dim") == 14
+        two = server and remote.arms_of(server.metadata) == 2
         return Arms({side: NoArm(limits.model) for side in (SIDES if two else [""])}, limits)
     motion = {"bus": options.bus, **shared.motion(options)}
     return Arms({side: PiperArm(can, **motion) for side, can in buses.items()}, limits)

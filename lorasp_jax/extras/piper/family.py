@@ -2,7 +2,8 @@
 
 The numbers of PiPER-X and PiPER-H are AgileX's: limits and bus from pyAgxArm (`api/constants.py`,
 `docs/piper/firmware_reference.md`: of what differs by arm, only MIT and CPV frames, which are never
-sent here), geometry from agx_arm_urdf (`piper_x/urdf`, `piper_h/urdf`). Nobody has tried them here.
+sent here), geometry from agx_arm_urdf (`piper_x/urdf`, `piper_h/urdf`). Speed, acceleration and the gripper's
+stroke are taken to be the PiPER's. Nobody has tried them here.
 """
 
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from envs.robots.piper import ROBOT, SDK_OFFSET
 _TIPS = 0.1425
 """From link 6 to the finger tips with the flange of newer arms [m]: 4.5 mm and 138 mm, as the
 agx_arm_urdf's `*_with_gripper_description.urdf`."""
+_FOLDED, _LOWERED = np.array([0.0, 0.06, -0.06, 0.0, 0.0, 0.0]), 0.35  # rad; our choices
 _HALF, _FULL = np.pi / 2, np.pi
 
 
@@ -47,7 +49,7 @@ def _joint(x: float, y: float, z: float, roll: float, pitch: float, yaw: float) 
 
 
 def _wrist(bend: int, size: float) -> np.ndarray:
-    """Return angles [6] that are 0, but for the joint that lowers the hand."""
+    """Return angles [6] that are 0, but for the joint (from 1) that lowers the hand."""
     return size * np.eye(6)[bend - 1]
 
 
@@ -64,10 +66,6 @@ def _model(joints: tuple, wrist: tuple[float, float], bend: int) -> Model:
         rest=np.append(_FOLDED + _wrist(bend, _LOWERED), 0.0),
     )
 
-
-# Our choices.
-_FOLDED, _LOWERED = np.array([0.0, 0.06, -0.06, 0.0, 0.0, 0.0]), 0.35
-_SHOULDER = (0, 0, 0.123, 0, 0, 0), (0, 0, 0, _HALF, -0.1357866, -_FULL)
 
 PIPER = Model(
     chain=ROBOT.chain,
@@ -94,7 +92,8 @@ MODELS = {
     ),
     "piper-h": _model(
         (
-            *_SHOULDER,
+            (0, 0, 0.123, 0, 0, 0),
+            (0, 0, 0, _HALF, -0.1357866, -_FULL),
             (0.28503, 0, 0, 0, 0, -1.7938494),
             (-0.02198, -0.25575, 0, _HALF, 0, 0),
             (0, 0, 0, -_HALF, 0, 0),

@@ -65,7 +65,7 @@ class Server:
             self._client.reset()
 
     def __call__(self, observation: Observation) -> np.ndarray:
-        """Return the server's actions [C, 7]; its pictures are resized here, so less is sent.
+        """Return the server's actions [C, 7 N]; its pictures are resized here, so less is sent.
 
         Raises:
             ServerGone, PolicyError: as `PolicyClient.infer`.
@@ -115,10 +115,15 @@ def policy(options: argparse.Namespace, arms: int = 1) -> Iterator[Server]:
         yield Server(client, options.adapter)
 
 
+def arms_of(metadata: dict[str, Any]) -> int:
+    """Return how many arms a policy moves, as far as it says."""
+    return 2 if metadata.get("action_dim") == 14 else 1
+
+
 def _period(options: argparse.Namespace, metadata: dict[str, Any], arms: int) -> float | None:
     """Return the duration of an action [s], after comparing the policy with the arm."""
-    size = metadata.get("action_dim") or 7 * (arms or 1)
-    arms = arms or (2 if size == 14 else 1)
+    arms = arms or arms_of(metadata)
+    size = metadata.get("action_dim") or 7 * arms
     expected = options.robot or own_robot(options, arms)
     robot = metadata.get("robot") or expected
     if robot != expected:
