@@ -2,7 +2,7 @@
 
 The numbers of PiPER-X and PiPER-H are AgileX's: limits and bus from pyAgxArm (`api/constants.py`,
 `docs/piper/firmware_reference.md`: of what differs by arm, only MIT and CPV frames, which are never
-sent here), geometry from agx_arm_urdf (`piper_x/urdf`, `piper_h/urdf`). Speed, acceleration and the gripper's
+sent here), geometry from agx_arm_urdf (`piper_x/urdf`, `piper_h/urdf`). Speed, acceleration and
 stroke are taken to be the PiPER's. Nobody has tried them here.
 """
 
