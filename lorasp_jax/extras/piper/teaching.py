@@ -57,9 +57,9 @@ class Lesson:
             Unsafe: feedback stops or is implausible, the arm reports a fault, there is no leader,
                 or a picture is missing.
         """
-        if self._way == "hand":
-            self._arms.teach(True)
         try:
+            if self._way == "hand":
+                self._arms.teach(True)
             self._record(seconds, done)
         finally:
             if self._way == "hand":
