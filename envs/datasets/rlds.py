@@ -36,7 +36,12 @@ METADATA = "metadata.json"
 """Metadata file in a dataset's folder; tfds reads it, too."""
 _THREADS = ThreadPoolExecutor(8)
 """Shared by all open datasets: more threads would only wait for the GIL."""
-_TYPES: dict[str, Any] = {"options": {}, "parts": [int], "steps": int, "attempted": int}
+_TYPES: dict[str, Any] = {
+    "options": {"names?": [str]},
+    "parts": [int],
+    "steps": int,
+    "attempted": int,
+}
 """Schema of the metadata of every dataset, see `json_values.check`."""
 _SHARD_TYPES: dict[str, Any] = {
     **{"task": str, "robot": str, "actions": str, "instructions": [str]},
@@ -98,6 +103,8 @@ class Reader:
         left_out: camera -> why it is not among the cameras.
         control_dt: time between two actions [s].
         num_steps: total number of control steps.
+        names: "state" and "action" -> names of their dimensions; empty if nothing names them.
+        grippers: "state" and "action" -> which of these are grippers.
     """
 
     kind = "RLDS"
@@ -123,6 +130,13 @@ class Reader:
         with _reading(self.path):
             self.control_dt: float = float(self.metadata["control_dt"])
             self.num_steps: int = self.metadata["steps"]
+            names = self.metadata["options"].get("names", [])
+            if names and self.metadata.get("widths") != 2 * [len(names)]:
+                raise ValueError(f"options.names must name all dimensions, got {len(names)}")
+            kinds = ("state", "action") if names else ()
+            self.names: dict[str, list[str]] = dict.fromkeys(kinds, names)
+            grippers = [number for number, name in enumerate(names) if "gripper" in name]
+            self.grippers: dict[str, list[int]] = dict.fromkeys(kinds, grippers)
             self._shared: dict[str, Any] = {name: self.metadata[name] for name in SHARED}
             self._shared |= {"instructions": tuple(self.metadata["instructions"]), "attempted": 1}
             check_regular(self.path / _INFO, self.path)
@@ -187,7 +201,8 @@ class ShardWriter:
         metadata: content of metadata.json:
 
             - the fields of `Episodes` that all shards share;
-            - `options`: how the episodes were made;
+            - `options`: how the episodes were made, and `names` of the dimensions of states and
+              actions if they are not one arm's;
             - `parts`: number of episodes in each shard;
             - `steps`, `attempted`: total number of control steps and of attempts;
             - `cameras`: height and width of each camera's images;

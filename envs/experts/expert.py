@@ -43,7 +43,7 @@ def plan(env: Env, state: State, key: jax.Array) -> Plan:
 def act(env: Env, plan: Plan, state: State) -> jax.Array:
     """Return the actions [W, A] for the next control step; past the plan, hold its last pose."""
     seconds = (state.info["steps"] + 1).astype(jnp.float32) * env.control_dt
-    targets = jax.vmap(_interpolate)(plan.knots, plan.times, seconds)
+    targets = jax.vmap(interpolate)(plan.knots, plan.times, seconds)
     convert = functools.partial(actions.from_targets, env.actions, env.robot)
     return jax.vmap(convert)(state.info["command"], targets)
 
@@ -70,7 +70,7 @@ def _plan(env: Env, info: dict, key: jax.Array) -> Plan:
     positions = scaled + noise + waypoints.reach[:, None] * rotations[:, :, 2]
     if info["draw"]:  # the robot's inverse kinematics start at its mount, not at the table
         positions = positions.at[:, 2].add(info["draw"].table_height)
-    joints = _joints(env.robot, positions, rotations, start[:-1])
+    joints = solve(env.robot, positions, rotations, start[:-1])
     knots = jnp.concatenate([joints, waypoints.opening[:, None]], axis=1)
     knots = jnp.concatenate([start[None], knots])
     scale = jax.random.uniform(time_key, waypoints.seconds.shape, minval=0.8, maxval=1.2)
@@ -80,9 +80,7 @@ def _plan(env: Env, info: dict, key: jax.Array) -> Plan:
     return Plan(knots, jnp.concatenate([jnp.zeros(1), jnp.cumsum(seconds)]))
 
 
-def _joints(
-    robot: Robot, positions: jax.Array, rotations: jax.Array, start: jax.Array
-) -> jax.Array:
+def solve(robot: Robot, positions: jax.Array, rotations: jax.Array, start: jax.Array) -> jax.Array:
     """Compute joint angles [P, J] at the waypoints, starting each search at the last solution."""
 
     def body(q: jax.Array, target: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -92,7 +90,8 @@ def _joints(
     return jax.lax.scan(body, start, (positions, rotations))[1]
 
 
-def _interpolate(knots: jax.Array, times: jax.Array, seconds: jax.Array) -> jax.Array:
+def interpolate(knots: jax.Array, times: jax.Array, seconds: jax.Array) -> jax.Array:
+    """Return the pose [N] at a time [s] on the way through knots [P, N] at times [P], in s."""
     i = jnp.clip(jnp.searchsorted(times, seconds) - 1, 0, len(times) - 2)
     s = jnp.clip((seconds - times[i]) / (times[i + 1] - times[i]), 0.0, 1.0)
     s = s * s * s * (10.0 - 15.0 * s + 6.0 * s * s)  # minimum jerk

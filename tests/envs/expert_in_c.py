@@ -83,7 +83,7 @@ def _plan(scene, layout, command, key):
     return plan.knots, plan.times
 
 
-_target = jax.jit(expert._interpolate)
+_target = jax.jit(expert.interpolate)
 
 
 @functools.partial(jax.jit, static_argnums=1)

@@ -89,6 +89,21 @@ def test_lengths_of_states_and_actions(path):
     assert rlds.read(path).action.shape[2] == 7
 
 
+@pytest.mark.parametrize("names", [["gripper"], ["a", 1], "abcdefg", {}])
+def test_names_of_dimensions(names, path):
+    edit(path / "metadata.json", lambda found: found["options"].update(names=names))
+    with pytest.raises(ValueError, match=r"options\.names"):
+        rlds.Reader(path)
+
+
+def test_dimensions_are_known_by_their_names(path):
+    names = ["left_gripper", *"abcd", "right_gripper", "e"]
+    edit(path / "metadata.json", lambda found: found["options"].update(names=names))
+    source = rlds.Reader(path)
+    assert source.names == {"state": names, "action": names}
+    assert source.grippers == {"state": [0, 5], "action": [0, 5]}
+
+
 @pytest.mark.parametrize("number", [-1, 5, 2**40])
 def test_instructions_that_do_not_exist(number, path):
     (file,) = path.glob("*array_record*")

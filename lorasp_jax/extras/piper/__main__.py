@@ -1,11 +1,10 @@
 """Run a policy on a PiPER: `python -m lorasp_jax.extras.piper --task press --dry-run`."""
 
 import argparse
-import contextlib
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import closing
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, closing
+from typing import NamedTuple
 
 from rich.console import Console
 
@@ -14,6 +13,7 @@ from lorasp_jax.base.errors import run_command
 from lorasp_jax.extras.piper import options as shared
 from lorasp_jax.extras.piper import remote
 from lorasp_jax.extras.piper.arm import NoArm, PiperArm
+from lorasp_jax.extras.piper.arms import SIDES, Arms
 from lorasp_jax.extras.piper.asking import InThread
 from lorasp_jax.extras.piper.cameras import Look, open_cameras
 from lorasp_jax.extras.piper.clock import RealClock
@@ -56,7 +56,8 @@ def parser(program: str) -> argparse.ArgumentParser:
         "hand or through a leader arm, in place of a policy")  # fmt: skip
     add("--image-size", type=int, default=224, help="of recorded pictures [px] (default: 224)")
     add = parser.add_argument_group("robot").add_argument
-    add("--can", default="", help="CAN interface (default: can0)")
+    add("--can", nargs="+", default=[], metavar="INTERFACE", help="CAN interface (default: can0); "
+        "left=can0 right=can1 for two arms")  # fmt: skip
     add("--bus", choices=("socketcan", "slcan"), default="socketcan", help="its kind "
         "(default: %(default)s)")  # fmt: skip
     add("--camera", action="append", type=pair, default=[], metavar="NAME=SOURCE", help="such as "
@@ -73,7 +74,7 @@ def parser(program: str) -> argparse.ArgumentParser:
 class Rig(NamedTuple):
     """What episodes need; server and log are None if a person teaches."""
 
-    arm: Any
+    arms: Arms
     look: Look
     server: remote.Server | None
     recorder: Recording | None
@@ -93,37 +94,61 @@ def _run(options: argparse.Namespace) -> int:
     if options.record and options.dry_run:
         raise ValueError("--record has nothing to record in a --dry-run")
     shared.settings(options, prompts[0])
+    shared.limits(options)
     seconds = options.seconds or (task.time_limit if task else 60.0)
-    with contextlib.ExitStack() as stack:
-        server = None if options.teach else stack.enter_context(remote.policy(options))
+    with ExitStack() as stack:
+        buses = _buses(options)
+        server = None
+        if not options.teach:
+            server = stack.enter_context(remote.policy(options, len(buses)))
         device = {"video_size": options.camera_size, "framerate": options.camera_rate}
         if options.camera_format:
             device["input_format"] = options.camera_format
         look = open_cameras(_sources(options, server), stack, device)
         if server:
             server.warn(prompts)
-        size = {"image_size": options.image_size}
-        recorder = stack.enter_context(shared.recording(options, task, prompt=prompts[0], **size))
+        more = {"prompt": prompts[0], "image_size": options.image_size}
+        recorder = stack.enter_context(shared.recording(options, task, [*buses], **more))
         log = stack.enter_context(closing(shared.open_log(options, server))) if server else None
-        arm: Any = _open(options)
-        stack.callback(arm.close)
-        arm.connect()
+        arms = _open(options, buses, server)
+        stack.callback(arms.close)
+        arms.connect()
         if not (options.dry_run or options.teach == "leader"):
-            arm.enable(shared.limits(options))
+            arms.enable()
         keys = stack.enter_context(Keyboard())
-        return _episodes(options, Rig(arm, look, server, recorder, log, keys), prompts, seconds)
+        return _episodes(options, Rig(arms, look, server, recorder, log, keys), prompts, seconds)
 
 
-def _open(options: argparse.Namespace) -> PiperArm | NoArm:
-    if options.dry_run and not options.can:
+def _buses(options: argparse.Namespace) -> dict[str, str]:
+    """Return name of the arm -> interface: "" for a single arm, none in a dry run without any."""
+    given = options.can or ([] if options.dry_run else ["can0"])
+    if len(given) < 2 and "=" not in "".join(given):
+        return dict.fromkeys([""], given[0]) if given else {}
+    buses = {name: can for name, _, can in (text.partition("=") for text in given)}
+    if {*buses} != {*SIDES} or not all(buses.values()) or len({*buses.values()}) < len(given):
+        raise ValueError(
+            "--can takes one interface, or two for two arms as left=can0 right=can1, got "
+            f"{' '.join(given)}"
+        )
+    return {side: buses[side] for side in SIDES}
+
+
+def _open(
+    options: argparse.Namespace, buses: Mapping[str, str], server: remote.Server | None
+) -> Arms:
+    """Open the buses; in a dry run without any, the policy says how many arms there are."""
+    limits = shared.limits(options)
+    if not buses:
         print("a dry run without an arm: it stands in the start pose")
-        return NoArm()
-    return PiperArm(options.can or "can0", bus=options.bus, **shared.motion(options))
+        two = server and remote.arms_of(server.metadata) == 2
+        return Arms({side: NoArm(limits.model) for side in (SIDES if two else [""])}, limits)
+    motion = {"bus": options.bus, **shared.motion(options)}
+    return Arms({side: PiperArm(can, **motion) for side, can in buses.items()}, limits)
 
 
 def _episodes(options: argparse.Namespace, rig: Rig, prompts: Sequence[str], seconds: float) -> int:
     """Run until enough episodes were judged, or recorded; return the exit code."""
-    start, judged, kept = rig.arm.read().pose, 0, 0
+    start, judged, kept = rig.arms.read(), 0, 0
     judging = bool(rig.recorder) or options.episodes > 1
     work: Session | Lesson | None = None
     while True:
@@ -171,7 +196,7 @@ def _reset(options: argparse.Namespace, rig: Rig) -> bool:
 
 def _prepare(options: argparse.Namespace, rig: Rig, prompt: str) -> Session | Lesson:
     """Return the next episode: a policy's, or a lesson."""
-    limits, clock = shared.limits(options), RealClock()
+    clock = RealClock()
     print(f"next: {prompt}", flush=True)
     if rig.recorder:
         rig.recorder.say(prompt)
@@ -179,11 +204,11 @@ def _prepare(options: argparse.Namespace, rig: Rig, prompt: str) -> Session | Le
         rig.server.reset()
         settings = shared.settings(options, prompt, dry_run=options.dry_run)
         more = {"recorder": rig.recorder, "log": rig.log}
-        return Session(rig.arm, rig.look, InThread(rig.server), limits, settings, clock, **more)
+        return Session(rig.arms, rig.look, InThread(rig.server), settings, clock, **more)
     assert rig.recorder
     way = {"way": options.teach, "control_dt": shared.period(options)}
     print(f"show the task, then press a key: {QUESTION}")
-    return Lesson(rig.arm, rig.look, rig.recorder, limits, clock, **way)
+    return Lesson(rig.arms, rig.look, rig.recorder, clock, **way)
 
 
 def _execute(work: Session | Lesson, seconds: float, done: Callable[[], bool]) -> str | None:

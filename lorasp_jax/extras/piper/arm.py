@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from envs.robots.piper import ROBOT, SDK_OFFSET
+from envs.robots.piper import ROBOT
 from lorasp_jax.extras.piper.clock import Clock, RealClock
+from lorasp_jax.extras.piper.family import PIPER, Model
 from lorasp_jax.extras.piper.safety import (
     CAN_CONTROL,
     MAX_AGE,
@@ -58,6 +59,7 @@ class PiperArm:
     def __init__(
         self,
         can: str = "can0",
+        model: Model = PIPER,
         *,
         bus: str = "socketcan",
         speed: float = 1.0,
@@ -69,6 +71,7 @@ class PiperArm:
 
         Args:
             can: name of the interface, such as can0.
+            model: the arm.
             bus: python-can's name of its kind: socketcan, slcan or, for tests, virtual.
             speed: highest joint speed [rad/s]; the firmware gets the same as a share of 3 rad/s.
             effort: gripper effort [0.001 N m], at most `MAX_EFFORT`.
@@ -82,7 +85,7 @@ class PiperArm:
         if not 0 < effort <= MAX_EFFORT:
             raise ValueError(f"the effort must be above 0 and at most {MAX_EFFORT}, got {effort}")
         self._effort, self._percent = effort, int(np.clip(np.ceil(speed / 3 * 100), 1, 100))
-        self._offset = SDK_OFFSET if zeros == "sdk" else np.zeros(6)
+        self._offset = model.offset if zeros == "sdk" else np.zeros(6)
         self._clock = clock or RealClock()
         self.heard: dict[int, float] = {}
         self.sdk = _open(can, bus)
@@ -218,14 +221,16 @@ class PiperArm:
 class NoArm:
     """What a dry run needs of an arm, without a bus: it stands in its start pose."""
 
-    pose = np.append(ROBOT.home, ROBOT.stroke)
+    def __init__(self, model: Model = PIPER) -> None:
+        """Stand still."""
+        self._pose = np.append(model.home, ROBOT.stroke)
 
     def connect(self) -> None:
         """Do nothing."""
 
     def read(self) -> Reading:
         """Return the start pose."""
-        return Reading(self.pose, 0.0, 0.0, CAN_CONTROL, 0, True)
+        return Reading(self._pose, 0.0, 0.0, CAN_CONTROL, 0, True)
 
     def command(self, pose: np.ndarray) -> None:
         """Do nothing."""

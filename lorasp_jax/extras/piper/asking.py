@@ -10,10 +10,11 @@ from lorasp_jax.extras.piper.clock import Clock
 from lorasp_jax.extras.serving.client import PolicyError
 
 Observation = Mapping[str, Any]
-"""`image`: camera -> uint8 [H, W, 3]; `state`: f32 [7]; `prompt`: the request in words; `executed`
-and `delay` as in `lorasp_jax.extras.serving.requests`, if the arm does not wait for the answer."""
+"""`image`: camera -> uint8 [H, W, 3]; `state`: f32 [7 N] of N arms; `prompt`: the request in words;
+`executed` and `delay` as in `lorasp_jax.extras.serving.requests`, if they do not wait for the
+answer."""
 Ask = Callable[[Observation], Any]
-"""Return actions [C, 7] for an observation; may raise anything."""
+"""Return actions [C, 7 N] for an observation; may raise anything."""
 
 
 class InThread:

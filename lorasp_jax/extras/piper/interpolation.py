@@ -19,15 +19,15 @@ class Path:
         """Create a path.
 
         Args:
-            start: [7] target before the first action.
-            actions: [C, 7], one per control step.
+            start: [7 N] target before the first action.
+            actions: [C, 7 N], one per control step.
             control_dt: duration of a control step [s].
         """
         self._knots, self._dt = np.concatenate([start[None], actions]), control_dt
         self.steps = len(actions)
 
     def starting_at(self, start: np.ndarray) -> "Path":
-        """Return this path from another start [7]."""
+        """Return this path from another start [7 N]."""
         return Path(start, self._knots[1:], self._dt)
 
     def switching(self, observed: int, step: int, actions: np.ndarray) -> "Path":
@@ -37,18 +37,18 @@ class Path:
             observed: this path's step at which the new chunk was asked for; the returned path, and
                 the new chunk, count from there.
             step: this path's step from which on the new chunk is followed.
-            actions: [C, 7] the new chunk.
+            actions: [C, 7 N] the new chunk.
         """
         under_way = self._knots[observed + 1 : step + 1]
         actions = np.concatenate([under_way, actions[step - observed :]])
         return Path(self._knots[observed], actions, self._dt)
 
     def action(self, step: int) -> np.ndarray:
-        """Return the action of a control step from 0, [7]."""
+        """Return the action of a control step from 0, [7 N]."""
         return self._knots[step + 1]
 
     def target(self, seconds: float) -> np.ndarray:
-        """Return the target [7] at a time since the start [s]; past the end, the last action."""
+        """Return the target [7 N] at a time since the start [s]; past the end, the last action."""
         position = min(max(seconds / self._dt, 0.0), float(self.steps))
         step = min(math.floor(position), self.steps - 1)
         fraction = position - step

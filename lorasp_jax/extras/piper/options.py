@@ -5,13 +5,15 @@ import contextlib
 import importlib
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from envs import names
 from lorasp_jax.base.arguments import positive
 from lorasp_jax.base.locks import locked
+from lorasp_jax.extras.piper.arms import dimension_names
+from lorasp_jax.extras.piper.family import MODELS
 from lorasp_jax.extras.piper.keys import SIGNALS
 from lorasp_jax.extras.piper.log import Log
 from lorasp_jax.extras.piper.recording import Recording
@@ -30,8 +32,8 @@ def add_shared(parser: argparse.ArgumentParser) -> None:
     add("--token-file", type=Path, metavar="FILE", help="file with the server's token")
     add("--adapter", default="", metavar="NAME", help="one of the server's adapters; default: its "
         "first")  # fmt: skip
-    add("--robot", default="piper", help="robot of the policy's training; another than the arm is "
-        "refused unless it is named here (default: %(default)s)")  # fmt: skip
+    add("--robot", help="robot of the policy's training; another than the arm is refused unless it "
+        "is named here; default: the arm, such as piper, or bi_piper for two")  # fmt: skip
     add("--prompt", action="append", default=[], help="the request in words; several take turns; "
         "default: one of the task's")  # fmt: skip
     add("--patience", type=float, default=2.0, metavar="S", help="longest time to wait for an "
@@ -52,14 +54,15 @@ def add_shared(parser: argparse.ArgumentParser) -> None:
         "folder for a recording of each episode, or a viewer's address such as "
         "rerun+http://127.0.0.1:9876/proxy")  # fmt: skip
     add = parser.add_argument_group("limits").add_argument
+    add("--arm", choices=[*MODELS], default="piper", help="its model (default: %(default)s)")
     add("--speed", type=float, default=1.0, help="of the joints [rad/s] (default: %(default)s)")
     add(
         "--effort", type=int, default=1000, help="of the gripper [0.001 N m] (default: %(default)s)"
     )
-    add("--zeros", choices=("sdk", "urdf"), default="sdk", help="the firmware's zeros of joints 2 "
+    add("--zeros", choices=("sdk", "urdf"), default="sdk", help="a PiPER's zeros of joints 2 "
         "and 3, see docs/robot.md (default: %(default)s)")  # fmt: skip
     add("--box", type=float, nargs=6, metavar=("X0", "X1", "Y0", "Y1", "Z0", "Z1"),
-        help="space for the finger tips in the base frame [m]")  # fmt: skip
+        help="space for the finger tips in the base frame of each arm [m]")  # fmt: skip
 
 
 def limits(options: argparse.Namespace) -> Limits:
@@ -67,7 +70,9 @@ def limits(options: argparse.Namespace) -> Limits:
     box = {}
     if options.box:
         box = {"box_low": tuple(options.box[::2]), "box_high": tuple(options.box[1::2])}
-    return Limits.of(speed=options.speed, zeros=options.zeros, **box)
+    if options.zeros != "sdk" and options.arm != "piper":
+        raise ValueError(f"--zeros {options.zeros} is for a piper: {options.arm} has its own")
+    return Limits.of(MODELS[options.arm], speed=options.speed, zeros=options.zeros, **box)
 
 
 def settings(options: argparse.Namespace, prompt: str, **more: Any) -> Settings:
@@ -89,13 +94,21 @@ def period(options: argparse.Namespace) -> float:
 
 def task(name: str) -> Any:
     """Return the `Task` of this name; raise ValueError if there is none."""
+    if name == "hand_over":  # for two arms, which the environments do not have
+        return importlib.import_module("lorasp_jax.extras.piper.fake.hand_over").TASK
     names.check("task", name)
     return importlib.import_module(f"envs.tasks.{name}").TASK
 
 
 def motion(options: argparse.Namespace) -> dict[str, Any]:
-    """Return what `PiperArm` needs to know of the limits."""
-    return {"speed": options.speed, "effort": options.effort, "zeros": options.zeros}
+    """Return what `PiperArm` needs to know of the arm and the limits."""
+    limits = {"speed": options.speed, "effort": options.effort, "zeros": options.zeros}
+    return {"model": MODELS[options.arm], **limits}
+
+
+def own_robot(options: argparse.Namespace, arms: int) -> str:
+    """Return the name of one or two arms, as LeRobot names its two-armed robots: bi_piper."""
+    return "bi_" * (arms == 2) + options.arm
 
 
 def open_log(options: argparse.Namespace, server: Server | None) -> Log:
@@ -111,13 +124,14 @@ def open_log(options: argparse.Namespace, server: Server | None) -> Log:
 
 @contextlib.contextmanager
 def recording(
-    options: argparse.Namespace, task: Any, **settings: Any
+    options: argparse.Namespace, task: Any, sides: Sequence[str] = ("",), **settings: Any
 ) -> Iterator[Recording | None]:
     """Open the dataset, if there is to be one, and keep other processes from writing it.
 
     Args:
         options: of the command.
         task: the `Task`, or None.
+        sides: names of the arms.
         **settings: of `Recording`.
     """
     if not options.record:
@@ -130,6 +144,8 @@ def recording(
             task=name,
             instructions=instructions,
             control_dt=period(options),
+            robot=own_robot(options, len(sides)),
+            names=dimension_names(sides) if len(sides) > 1 else (),
             **settings,
         )
 

@@ -29,6 +29,8 @@ class Recording:
         instructions: Sequence[str],
         prompt: str,
         control_dt: float,
+        robot: str = "piper",
+        names: Sequence[str] = (),
         image_size: int = 224,
         physics_dt: float = _REAL,
     ) -> None:
@@ -40,15 +42,18 @@ class Recording:
             instructions: phrasings of the task.
             prompt: the phrasing of the present episode; added to the others if it is new.
             control_dt: duration of an action [s].
+            robot: its name.
+            names: of the dimensions of poses; empty: those of one arm.
             image_size: height and width of the stored pictures [px], padded with black.
             physics_dt: period of the simulation [s].
 
         Raises:
             ValueError: the folder holds something else, or a dataset with other settings.
         """
-        self._writer = ShardWriter(folder, {"image_size": image_size})
+        named = {"names": [*names]} if names else {}
+        self._writer = ShardWriter(folder, {"image_size": image_size, **named})
         earlier = self._writer.metadata
-        self._shared = {"task": task or earlier.get("task", "task"), "robot": "piper"}
+        self._shared = {"task": task or earlier.get("task", "task"), "robot": robot}
         self._shared |= {"control_dt": control_dt, "physics_dt": physics_dt}
         for name, value in self._shared.items():  # before somebody demonstrates in vain
             if (was := earlier.get(name, value)) != value:
@@ -70,7 +75,7 @@ class Recording:
         return len(self._actions)
 
     def step(self, images: Mapping[str, np.ndarray], state: np.ndarray, action: np.ndarray) -> None:
-        """Add a control step: pictures uint8 [H, W, 3], measured pose [7] and action [7]."""
+        """Add a control step: pictures uint8 [H, W, 3], measured pose and action [7 N]."""
         for name, image in images.items():
             square = to_square(name, image, self._image_size)
             self._images.setdefault(name, []).append(square)

@@ -11,6 +11,7 @@ import numpy as np
 
 from lorasp_jax.base import json_values
 from lorasp_jax.extras.piper.asking import Observation
+from lorasp_jax.extras.piper.options import own_robot
 from lorasp_jax.extras.serving.client import PolicyClient, PolicyError, ServerGone
 from lorasp_jax.extras.serving.pictures import to_square
 
@@ -66,7 +67,7 @@ class Server:
             self._client.reset()
 
     def __call__(self, observation: Observation) -> np.ndarray:
-        """Return the server's actions [C, 7]; its pictures are resized here, so less is sent.
+        """Return the server's actions [C, 7 N]; its pictures are resized here, so less is sent.
 
         Raises:
             ServerGone, PolicyError: as `PolicyClient.infer`.
@@ -92,8 +93,12 @@ class Server:
 
 
 @contextlib.contextmanager
-def policy(options: argparse.Namespace) -> Iterator[Server]:
+def policy(options: argparse.Namespace, arms: int = 1) -> Iterator[Server]:
     """Connect to the server, and let an action last as long as in its policy's training.
+
+    Args:
+        options: of the command.
+        arms: number of arms that the policy is to move; 0: as many as it can.
 
     Raises:
         ServerGone: there is no server.
@@ -109,20 +114,29 @@ def policy(options: argparse.Namespace) -> Iterator[Server]:
             json_values.check(client.metadata, _SCHEMA, nulls=True)
         except ValueError as error:
             raise ValueError(f"the metadata of {options.server} are malformed: {error}") from error
-        options.control_dt = _period(options, client.metadata)
+        options.control_dt = _period(options, client.metadata, arms)
         yield Server(client, options.adapter)
 
 
-def _period(options: argparse.Namespace, metadata: dict[str, Any]) -> float | None:
+def arms_of(metadata: dict[str, Any]) -> int:
+    """Return how many arms a policy moves, as far as it says."""
+    return 2 if metadata.get("action_dim") == 14 else 1
+
+
+def _period(options: argparse.Namespace, metadata: dict[str, Any], arms: int) -> float | None:
     """Return the duration of an action [s], after comparing the policy with the arm."""
-    robot, size = metadata.get("robot") or options.robot, metadata.get("action_dim") or 7
-    if robot != options.robot:
+    arms = arms or arms_of(metadata)
+    size = metadata.get("action_dim") or 7 * arms
+    expected = options.robot or own_robot(options, arms)
+    robot = metadata.get("robot") or expected
+    if robot != expected:
         raise ValueError(
-            f"the policy is of the robot {robot}, not of {options.robot}: pass --robot {robot} to "
+            f"the policy is of the robot {robot}, not of {expected}: pass --robot {robot} to "
             "run it nevertheless"
         )
-    if size != 7:
-        raise ValueError(f"the policy's actions have {size} numbers, but a PiPER takes 7")
+    if size != 7 * arms:
+        takes = "a PiPER takes 7" if arms == 1 else f"{arms} PiPERs take {7 * arms}"
+        raise ValueError(f"the policy's actions have {size} numbers, but {takes}")
     trained, given = metadata.get("control_dt"), options.control_dt
     if trained and given and abs(trained - given) > 1e-6:
         print(f"warning: the policy acts every {trained:g} s, not every {given:g} s", flush=True)

@@ -1,7 +1,7 @@
 """Limits and checks between a policy and a real PiPER, in plain NumPy.
 
-A pose has seven numbers: the angles of joints 1 to 6 [rad], with the zeros of `envs.robots.piper`,
-and the gripper's opening [m]. `Governor` turns targets into commands that keep all limits, and
+A pose has seven numbers: the angles of joints 1 to 6 [rad], with the zeros of `family.Model`, and
+the gripper's opening [m]. `Governor` turns targets into commands that keep all limits, and
 brakes where it cannot. It stops by holding: an emergency stop makes a PiPER sink, and a reset drops
 it, so both stay with a person.
 """
@@ -11,8 +11,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from envs.robots import TIP_LENGTH
-from envs.robots.piper import ROBOT, SDK_OFFSET
+from envs.robots.piper import ROBOT
+from lorasp_jax.extras.piper.family import PIPER, Model
 
 Zeros = Literal["sdk", "urdf"]
 """Where a firmware has the zeros of joints 2 and 3: as piper_sdk by default, or as the URDF."""
@@ -76,11 +76,13 @@ class Limits:
     """Limits of commands; poses are as in this module.
 
     Attributes:
+        model: the arm.
         lower, upper: [7].
         speed, acceleration: [7], per s and per s².
         box_low, box_high: [3] corners of the space for the finger tips in the base frame [m].
     """
 
+    model: Model
     lower: np.ndarray
     upper: np.ndarray
     speed: np.ndarray
@@ -91,15 +93,17 @@ class Limits:
     @classmethod
     def of(
         cls,
+        model: Model = PIPER,
         *,
         speed: float = 1.0,
         zeros: Zeros = "sdk",
         box_low: tuple[float, float, float] = (0.02, -0.45, 0.0),
         box_high: tuple[float, float, float] = (0.65, 0.45, 0.70),
     ) -> "Limits":
-        """Return the PiPER's limits.
+        """Return an arm's limits.
 
         Args:
+            model: the arm.
             speed: highest joint speed [rad/s]; the arm's own limit is 3.
             zeros: the firmware's zeros; targets must be within its limits and the simulation's.
             box_low, box_high: as in the class. The mount stands on the table, z = 0. Our choice.
@@ -113,13 +117,11 @@ class Limits:
             )
         if not all(low < high for low, high in zip(box_low, box_high, strict=True)):
             raise ValueError(f"the box must not be empty, got {box_low} to {box_high}")
-        lower, upper = ROBOT.action_low.astype(float), ROBOT.action_high.astype(float)
-        if zeros == "sdk":
-            lower[:6] = np.maximum(lower[:6], ROBOT.lower + SDK_OFFSET)
-            upper[:6] = np.minimum(upper[:6], ROBOT.upper + SDK_OFFSET)
+        offset = model.offset if zeros == "sdk" else np.zeros(6)
         return cls(
-            lower=lower,
-            upper=upper,
+            model=model,
+            lower=np.append(np.maximum(model.lower, model.lower + offset), 0.0),
+            upper=np.append(np.minimum(model.upper, model.upper + offset), ROBOT.stroke),
             speed=np.append(np.full(6, speed), ROBOT.gripper_speed),
             # The joints' is the firmware's default, 286.48 deg/s²; the gripper's is our choice.
             acceleration=np.append(np.full(6, 5.0), 2.0),
@@ -128,15 +130,17 @@ class Limits:
         )
 
 
-def check_chunk(actions: Any) -> np.ndarray:
-    """Return a server's actions as float64 [C, 7].
+def check_chunk(actions: Any, width: int = 7) -> np.ndarray:
+    """Return a server's actions as float64 [C, width].
 
     Raises:
         Unsafe: they have another shape or kind, or a number is not finite.
     """
     chunk = np.asarray(actions)
-    if chunk.dtype.kind not in "iuf" or chunk.ndim != 2 or chunk.shape[1] != 7 or not len(chunk):
-        raise Unsafe(f"actions must be numbers [C, 7], got {chunk.dtype} {list(chunk.shape)}")
+    numbers = chunk.dtype.kind in "iuf" and chunk.ndim == 2 and len(chunk)
+    if not numbers or chunk.shape[1] != width:
+        got = f"{chunk.dtype} {list(chunk.shape)}"
+        raise Unsafe(f"actions must be numbers [C, {width}], got {got}")
     if not np.isfinite(chunk).all():
         step = int(np.argwhere(~np.isfinite(chunk))[0, 0])
         raise Unsafe(f"actions must be finite, got {chunk[step]} at step {step}")
@@ -152,7 +156,7 @@ def clamped(chunk: np.ndarray, limits: Limits) -> str | None:
     name = f"joint {number + 1}" if number < 6 else "the gripper"
     unit = "radians" if number < 6 else "meters"
     return (
-        f"warning: all actions of {name} are far beyond its limits, such as "
+        f"all actions of {name} are far beyond its limits, such as "
         f"{chunk[0, number]:.4g}, and clamped: are they in {unit}?"
     )
 
@@ -180,20 +184,20 @@ def fault(reading: Reading, limits: Limits) -> str | None:
     return None if reading.enabled else "a joint's driver is off"
 
 
-def finger_tips(joints: np.ndarray) -> np.ndarray:
+def finger_tips(joints: np.ndarray, model: Model = PIPER) -> np.ndarray:
     """Return the point [3] between the ends of the fingers in the base frame [m]."""
     position, rotation = np.zeros(3), np.eye(3)
-    for fixed, angle in zip(ROBOT.chain, joints, strict=True):
+    for fixed, angle in zip(model.chain, joints, strict=True):
         position = position + rotation @ fixed[:3, 3]
         c, s = np.cos(angle), np.sin(angle)
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         rotation = rotation @ fixed[:3, :3] @ turn
-    return position + rotation @ (ROBOT.tool[:3, 3] + TIP_LENGTH * ROBOT.tool[:3, 2])
+    return position + model.tips * rotation[:, 2]
 
 
 def outside(joints: np.ndarray, limits: Limits) -> float:
     """Return how far the finger tips are outside the box [m], 0 inside."""
-    tips = finger_tips(joints)
+    tips = finger_tips(joints, limits.model)
     return float(np.maximum(np.maximum(limits.box_low - tips, tips - limits.box_high), 0.0).max())
 
 

@@ -4,7 +4,7 @@ Whatever goes wrong, the arm brakes and holds. Only then one sentence says why, 
 block. If feedback or pictures come back soon, it goes on from where it holds. Otherwise, and after
 a refused chunk or a policy's error, it moves slowly to its rest pose and stays there, powered; it
 does not move again while it reports a fault itself. Signals and all other errors stop it where it
-is.
+is. Several arms do all of this as one: what goes wrong with one holds all.
 """
 
 import math
@@ -14,31 +14,17 @@ from typing import Any
 import numpy as np
 
 from lorasp_jax.base.errors import one_line
-from lorasp_jax.extras.piper.arm import NoArm, PiperArm
+from lorasp_jax.extras.piper.arms import PERIOD, Arms
 from lorasp_jax.extras.piper.asking import InThread
 from lorasp_jax.extras.piper.cameras import Look, NoPicture
 from lorasp_jax.extras.piper.clock import Clock
 from lorasp_jax.extras.piper.interpolation import Path
 from lorasp_jax.extras.piper.log import Log
 from lorasp_jax.extras.piper.recording import Recording
-from lorasp_jax.extras.piper.safety import (
-    CAN_CONTROL,
-    MAX_AGE,
-    Governor,
-    Limits,
-    Reading,
-    Unsafe,
-    check_chunk,
-    clamped,
-    fault,
-)
+from lorasp_jax.extras.piper.safety import CAN_CONTROL, Reading, Unsafe
 from lorasp_jax.extras.piper.settings import Settings
 from lorasp_jax.extras.serving.client import PolicyError
 
-PERIOD = 0.005
-"""Time between two commands [s], as in piper_sdk's examples (200 Hz)."""
-REST = np.array([0.0, 0.06, -0.06, 0.0, 0.35, 0.0, 0.0])
-"""Pose in which the arm lies folded [rad, m]: all joints near zero; our choice."""
 _REACHED = 0.01  # rad from the rest pose that counts as arrived
 _APPROACH_TIME = 20.0  # s that the way to the first action may take
 _GO_TIME = 60.0  # s that the way to the rest or start pose may take
@@ -47,20 +33,19 @@ _LATE = 0.05  # s of delay after which ticks are skipped instead of made up for
 
 
 class Session:
-    """One run of a policy on an arm.
+    """One run of a policy on one or several arms.
 
     Attributes:
-        problem: why the arm holds, in a sentence; None while it does not.
+        problem: why the arms hold, in a sentence; None while they do not.
         chunks: number of chunks received.
         stopped: whether `stop` was called.
     """
 
     def __init__(
         self,
-        arm: PiperArm | NoArm,
+        arms: Arms,
         look: Look,
         asker: InThread,
-        limits: Limits,
         settings: Settings,
         clock: Clock,
         *,
@@ -68,11 +53,10 @@ class Session:
         recorder: Recording | None = None,
         say: Callable[[str], None] = print,
     ) -> None:
-        """Prepare a session; the arm is enabled, unless it is a dry run."""
-        self._arm, self._look, self._asker, self._clock = arm, look, asker, clock
-        self._limits, self._settings, self._log, self._say = limits, settings, log, say
+        """Prepare a session; the arms are enabled, unless it is a dry run."""
+        self._arms, self._look, self._asker, self._clock = arms, look, asker, clock
+        self._settings, self._log, self._say = settings, log, say
         self._recorder = recorder
-        self._governor = Governor(limits, PERIOD)
         self.problem: str | None = None
         self.chunks = 0
         self._final, self._since, self.stopped, self._next = False, 0.0, False, 0.0
@@ -100,7 +84,7 @@ class Session:
         return self._guarded(lambda: self._follow(seconds, done))
 
     def home(self, pose: np.ndarray) -> str | None:
-        """Move slowly to a pose [7] after a run; result and errors are those of `run`."""
+        """Move slowly to a pose [7 N] after a run; result and errors are those of `run`."""
 
         def work() -> None:
             self._say("moving slowly to the start pose")
@@ -111,7 +95,7 @@ class Session:
 
     def _guarded(self, work: Callable[[], None]) -> str | None:
         """Work on an arm at rest; however that ends, brake, then say why, and only then raise."""
-        self._governor.start(self._read().pose)
+        self._arms.start(self._read())
         self._failures: list[BaseException] = []
         self._attempt(work)
         self._settle()
@@ -136,56 +120,55 @@ class Session:
         self._next = start = self._clock.now()
         while self._clock.now() - start < seconds and not self.stopped and not done():
             self._tick()
-            held = self.problem and not self._governor.velocity.any()
+            held = self.problem and not self._arms.moving
             if held and self._clock.now() - self._since > self._settings.hold:
                 self._rest()
                 break
 
     def _tick(self) -> None:
-        reading, now = self._read(), self._clock.now()
+        self._read()
         try:
-            if problem := fault(reading, self._limits):
-                self._fail(problem, reading)
+            if problem := self._arms.fault():
+                self._fail(problem)
             elif not self._final:
-                self._drive(reading, now)
+                self._drive(self._clock.now())
         except (Unsafe, PolicyError) as error:
             self._hold(one_line(error))
             self._final |= not isinstance(error, NoPicture)
         if self.problem:
-            self._send(self._governor.brake(), reading)
-        if not self._governor.velocity.any():
+            self._send(self._arms.brake())
+        if not self._arms.moving:
             self._tell()
         self._wait()
 
-    def _drive(self, reading: Reading, now: float) -> None:
+    def _drive(self, now: float) -> None:
         """Follow the policy's path by one tick."""
         if self.problem:
-            if self._governor.velocity.any():
+            if self._arms.moving:
                 return  # it brakes to the end, whatever comes back
             self._look()  # still no picture: it goes on holding
             self._say("going on")
-            self._governor.start(self._governor.pose)
+            self._arms.start(self._arms.pose)
             self.problem = None
             self._forget()
         self._receive(now)
         if self._asked is None and self._wants_chunk(now):
-            self._ask(reading, now)
+            self._ask(now)
             self._receive(now)
         if self._asked is not None and now - self._asked > self._settings.patience:
             raise PolicyError(f"the server did not answer within {self._settings.patience:g} s")
         if self._path is None:
-            self._send(self._governor.brake(), reading)
+            self._send(self._arms.brake())
             return
-        if self._governor.approaching:
-            self._send(self._approach(self._path, now), reading)
+        if self._arms.approaching:
+            self._send(self._approach(self._path, now))
         else:
-            self._record(reading, now)
-            command = self._governor.step(self._path.target(now + PERIOD - self._start))
-            self._send(command, reading)
+            self._record(now)
+            self._send(self._arms.step(self._path.target(now + PERIOD - self._start)))
 
     def _approach(self, path: Path, now: float) -> np.ndarray:
         """Return the command of a tick on the way to the first action; the path waits for it."""
-        command = self._governor.step(path.action(0))
+        command = self._arms.step(path.action(0))
         if self._approached is None:
             self._approached = now
         if now - self._approached > _APPROACH_TIME:
@@ -193,9 +176,9 @@ class Session:
         self._path, self._start = path.starting_at(command), now + PERIOD
         return command
 
-    def _ask(self, reading: Reading, now: float) -> None:
+    def _ask(self, now: float) -> None:
         images = self._look()
-        state = reading.pose.astype(np.float32)
+        state = self._arms.measured.astype(np.float32)
         observation = {"image": images, "state": state, "prompt": self._settings.prompt}
         if self._path:
             self._executed = min(round(self._position(now)), self._path.steps)
@@ -211,14 +194,14 @@ class Session:
         """Start on a new chunk if there is one."""
         if self._asked is None or (actions := self._asker.answer()) is None:
             return
-        settings, chunk = self._settings, check_chunk(actions)
+        settings, chunk = self._settings, self._arms.check_chunk(actions)
         self._check_length(chunk)
-        if not self._warned and (warning := clamped(chunk, self._limits)):
+        if not self._warned and (warning := self._arms.clamped(chunk)):
             self._warned = True
             self._untold.append(warning)
         own = chunk[: settings.execute + settings.ahead]
         if self._path is None:
-            self._path = Path(self._governor.pose.copy(), own, settings.control_dt)
+            self._path = Path(self._arms.pose, own, settings.control_dt)
             self._start, self._recorded = now, -1
         else:
             self._switch(own, now)
@@ -259,12 +242,10 @@ class Session:
         """Return the time on the path in control steps."""
         return (now - self._start) / self._settings.control_dt
 
-    def _fail(self, problem: str, reading: Reading) -> None:
-        """Hold because of what the arm reports: where it is, if it may stand still already."""
-        stands = reading.age <= MAX_AGE and (reading.arm_status or not reading.enabled)
-        if stands and not self.problem:
-            self._governor.start(reading.pose)
-        self._final |= bool(reading.arm_status) or reading.ctrl_mode != CAN_CONTROL
+    def _fail(self, problem: str) -> None:
+        """Hold because of what an arm reports: where it is, if it may stand still already."""
+        self._arms.yield_to_faults()
+        self._final |= self._arms.taken
         self._hold(problem)
 
     def _hold(self, problem: str) -> None:
@@ -281,25 +262,26 @@ class Session:
             self._say(self._untold.pop(0))
 
     def _rest(self) -> None:
-        """Move slowly to the rest pose, unless the arm itself reports a fault."""
-        if fault(self._read(), self._limits) or self.stopped:
+        """Move slowly to the rest pose, unless an arm itself reports a fault."""
+        self._read()
+        if self._arms.fault() or self.stopped:
             return
         self._say("moving slowly to the rest pose")
-        if problem := self._go(REST):
+        if problem := self._go(self._arms.rest):
             self._untold.append(f"holding: {problem}")
 
     def _go(self, pose: np.ndarray) -> str | None:
-        """Move slowly to a pose [7]; return what prevents it in a sentence, if anything does."""
-        self._governor.start(self._governor.pose)
+        """Move slowly to a pose; return what prevents it in a sentence, if anything does."""
+        self._arms.start(self._arms.pose)
         self._next = self._clock.now()
         end = self._next + _GO_TIME
-        while np.abs(self._governor.pose - pose)[:6].max() > _REACHED and not self.stopped:
-            reading = self._read()
-            if problem := fault(reading, self._limits):
+        while self._arms.distance(pose) > _REACHED and not self.stopped:
+            self._read()
+            if problem := self._arms.fault():
                 return problem
             if self._clock.now() > end:
                 return "the pose is out of reach"
-            self._send(self._governor.step(pose, slow=True), reading)
+            self._send(self._arms.step(pose, slow=True))
             self._wait()
         return None
 
@@ -307,36 +289,32 @@ class Session:
         """Brake, whatever fails meanwhile, then leave the arm holding its last target."""
         while True:
             self._attempt(self._read)
-            self._attempt(self._send, self._governor.brake(), self._reading)
-            if not self._governor.velocity.any():
+            self._attempt(self._send, self._arms.brake())
+            if not self._arms.moving:
                 return
             self._attempt(self._wait)
 
-    def _read(self) -> Reading:
-        self._reading = self._arm.read()
-        if self._settings.dry_run:  # the arm need not be ready
-            self._reading = self._reading._replace(ctrl_mode=CAN_CONTROL, enabled=True)
-        return self._reading
+    def _read(self) -> np.ndarray:
+        return self._arms.read(_ready) if self._settings.dry_run else self._arms.read()
 
-    def _send(self, command: np.ndarray, reading: Reading) -> None:
-        now = self._clock.now()
-        if self._settings.dry_run:
-            if now - self._printed >= self._settings.control_dt - 1e-6:
-                degrees = " ".join(f"{angle:7.2f}" for angle in np.rad2deg(command[:6]))
-                self._say(f"would command {degrees} degrees, {1000 * command[6]:.1f} mm")
-                self._printed = now
-        elif reading.ctrl_mode == CAN_CONTROL:  # else a person or another program has the arm
-            self._arm.command(command)
-        self._write(now, pose=reading.pose, command=command, age=reading.age)
+    def _send(self, command: np.ndarray) -> None:
+        now, arms = self._clock.now(), self._arms
+        if not self._settings.dry_run:
+            arms.send(command)
+        elif now - self._printed >= self._settings.control_dt - 1e-6:
+            self._say(f"would command {arms.describe(command)}")
+            self._printed = now
+        age = max(reading.age for reading in arms.readings)
+        self._write(now, pose=arms.measured, command=command, age=age)
 
-    def _record(self, reading: Reading, now: float) -> None:
+    def _record(self, now: float) -> None:
         """Record the first tick of every action."""
         if self._recorder is None or self._path is None:
             return
         step = int(self._position(now) + _INSTANT)
         if self._recorded < step < self._path.steps:
             action = self._path.action(step)
-            self._recorder.step(self._look(), reading.pose, action)
+            self._recorder.step(self._look(), self._arms.measured, action)
             self._recorded = step
 
     def _forget(self) -> None:
@@ -357,3 +335,8 @@ class Session:
         if now > self._next + _LATE:
             self._next = now
         self._clock.wait_until(self._next)
+
+
+def _ready(reading: Reading) -> Reading:
+    """In a dry run, arms need not be ready."""
+    return reading._replace(ctrl_mode=CAN_CONTROL, enabled=True)

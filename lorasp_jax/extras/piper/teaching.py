@@ -10,11 +10,11 @@ from typing import Literal
 
 import numpy as np
 
-from lorasp_jax.extras.piper.arm import PiperArm
+from lorasp_jax.extras.piper.arms import Arms
 from lorasp_jax.extras.piper.cameras import Look
 from lorasp_jax.extras.piper.clock import Clock
 from lorasp_jax.extras.piper.recording import Recording
-from lorasp_jax.extras.piper.safety import CAN_CONTROL, Limits, Reading, Unsafe, fault
+from lorasp_jax.extras.piper.safety import CAN_CONTROL, Reading, Unsafe
 
 Way = Literal["hand", "leader"]
 _TEACHING = 11  # arm_status in teaching mode
@@ -30,18 +30,17 @@ class Lesson:
 
     def __init__(
         self,
-        arm: PiperArm,
+        arms: Arms,
         look: Look,
         recorder: Recording,
-        limits: Limits,
         clock: Clock,
         *,
         way: Way,
         control_dt: float,
     ) -> None:
-        """Prepare a demonstration; for guiding by hand, the arm must be enabled."""
-        self._arm, self._look, self._recorder = arm, look, recorder
-        self._limits, self._clock, self._way, self._dt = limits, clock, way, control_dt
+        """Prepare a demonstration; for guiding by hand, the arms must be enabled."""
+        self._arms, self._look, self._recorder = arms, look, recorder
+        self._clock, self._way, self._dt = clock, way, control_dt
         self.stopped = False
 
     def stop(self) -> None:
@@ -58,42 +57,43 @@ class Lesson:
             Unsafe: feedback stops or is implausible, the arm reports a fault, there is no leader,
                 or a picture is missing.
         """
-        if self._way == "hand":
-            self._arm.teach(True)
         try:
+            if self._way == "hand":
+                self._arms.teach(True)
             self._record(seconds, done)
         finally:
             if self._way == "hand":
-                self._arm.teach(False)
+                self._arms.teach(False)
 
     def _record(self, seconds: float, done: Callable[[], bool]) -> None:
         start = due = self._clock.now()
         before = shown = None
         while self._clock.now() - start < seconds and not self.stopped and not done():
-            reading = self._read()
-            target = self._target(reading)
+            pose = self._read()
+            target = self._target(pose)
             if before is not None:
                 shown = target if shown is None else shown
                 if np.abs(target - shown).max() > _STILL or self._recorder.steps:
-                    self._recorder.step(
-                        *before, np.clip(target, self._limits.lower, self._limits.upper)
-                    )
-            before = self._look(), reading.pose
+                    self._recorder.step(*before, self._arms.clip(target))
+            before = self._look(), pose
             due += self._dt
             self._clock.wait_until(due)
 
-    def _target(self, reading: Reading) -> np.ndarray:
+    def _target(self, pose: np.ndarray) -> np.ndarray:
         if self._way == "hand":
-            return reading.pose
-        if (leader := self._arm.leader()) is None:
+            return pose
+        if (targets := self._arms.leaders()) is None:
             raise Unsafe("no leader sends targets on this bus")
-        return leader
+        return targets
 
-    def _read(self) -> Reading:
-        reading = self._arm.read()
-        seen = reading._replace(ctrl_mode=CAN_CONTROL, enabled=True)
-        if seen.arm_status == _TEACHING:
-            seen = seen._replace(arm_status=0)
-        if problem := fault(seen, self._limits):
+    def _read(self) -> np.ndarray:
+        pose = self._arms.read(_taught)
+        if problem := self._arms.fault():
             raise Unsafe(problem)
-        return reading
+        return pose
+
+
+def _taught(reading: Reading) -> Reading:
+    """An arm that is guided need not be ready."""
+    status = 0 if reading.arm_status == _TEACHING else reading.arm_status
+    return reading._replace(ctrl_mode=CAN_CONTROL, enabled=True, arm_status=status)

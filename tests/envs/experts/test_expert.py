@@ -102,7 +102,7 @@ def test_inverse_kinematics_reaches(robot_name):
 
 def test_path_rests_at_every_knot_and_holds_the_last():
     knots, times = jnp.array([[0.0, 0.0], [1.0, -1.0], [1.0, 2.0]]), jnp.array([0.0, 1.0, 3.0])
-    path = jax.jit(jax.vmap(expert._interpolate, in_axes=(None, None, 0)))
+    path = jax.jit(jax.vmap(expert.interpolate, in_axes=(None, None, 0)))
     found = np.asarray(path(knots, times, jnp.append(jnp.linspace(0.0, 3.0, 301), 99.0)))
     np.testing.assert_allclose(found[[0, 100, 300, 301]], np.asarray(knots)[[0, 1, 2, 2]])
     speed = np.diff(found[:-1], axis=0) / 0.01

@@ -5,9 +5,11 @@ import types
 from dataclasses import dataclass
 
 from lorasp_jax.extras.piper.arm import PiperArm
+from lorasp_jax.extras.piper.arms import Arms
 from lorasp_jax.extras.piper.fake import frames
 from lorasp_jax.extras.piper.fake.firmware import PERIOD, FakePiper
 from lorasp_jax.extras.piper.fake.timing import Lockstep
+from lorasp_jax.extras.piper.safety import Limits
 
 _CHANNELS = (f"bench{i}" for i in itertools.count())  # the SDK keeps one interface per name
 
@@ -70,20 +72,22 @@ class FaultyPiper(FakePiper):
 
 
 class Bench(types.SimpleNamespace):
-    """Attributes: arm, fake, clock, world."""
+    """Attributes: arms, drivers, fakes, clock, world; arm and fake are the only or left one."""
 
-    def __init__(self, world, seed=3, *, speed=1.0, **options):
+    def __init__(self, world, seed=3, *, speed=1.0, limits=None, **options):
         world.reset(seed)
-        name = channel()
-        fake = FaultyPiper(name, world, **options)
-        clock = Lockstep(fake)
-        arm = PiperArm(name, bus="virtual", clock=clock, speed=speed)
-        clock.start(arm)
-        super().__init__(arm=arm, fake=fake, clock=clock, world=world)
+        limbs = {channel(): limb for limb in world.limbs.values()}
+        fakes = [FaultyPiper(name, world, limb, **options) for name, limb in limbs.items()]
+        clock = Lockstep(*fakes)
+        drivers = [PiperArm(name, bus="virtual", clock=clock, speed=speed) for name in limbs]
+        clock.start(*drivers)
+        arms = Arms(dict(zip(world.limbs, drivers, strict=True)), limits or Limits.of())
+        super().__init__(arms=arms, drivers=drivers, fakes=fakes, clock=clock, world=world)
+        self.arm, self.fake = drivers[0], fakes[0]
 
-    def ready(self, limits):
-        self.arm.connect()
-        self.arm.enable(limits)
+    def ready(self):
+        self.arms.connect()
+        self.arms.enable()
         return self
 
     def wait(self, seconds):
@@ -95,8 +99,9 @@ class Bench(types.SimpleNamespace):
         self.fake._send = lambda kind, data: kind in kinds or send(kind, data)
 
     def close(self):
-        self.arm.close()
-        self.fake.close()
+        self.arms.close()
+        for fake in self.fakes:
+            fake.close()
 
     def every_control_step(self, function):
         """Return a function for every tick that calls another one every 0.1 s."""

@@ -5,9 +5,9 @@ import pytest
 
 from envs.rendering.video import write_video
 from lorasp_jax.extras.piper import remote, safety
-from lorasp_jax.extras.piper import session as sessions
+from lorasp_jax.extras.piper.arms import Arms
+from lorasp_jax.extras.piper.fake.hand_over import HandOver
 from lorasp_jax.extras.piper.fake.world import World
-from lorasp_jax.extras.piper.safety import Limits
 from tests.extras.piper.benches import Bench
 from tests.extras.piper.piper_runs import Still
 from tests.extras.serving.stand_in import serving
@@ -21,7 +21,20 @@ def world():
 
 @pytest.fixture
 def bench(world):
-    bench = Bench(world).ready(Limits.of())
+    bench = Bench(world).ready()
+    yield bench
+    bench.close()
+
+
+@pytest.fixture(scope="session")
+def table():
+    """A scene with two arms, as `world` is one with one."""
+    return HandOver(image_size=16)
+
+
+@pytest.fixture
+def pair(table):
+    bench = Bench(table).ready()
     yield bench
     bench.close()
 
@@ -29,7 +42,8 @@ def bench(world):
 @pytest.fixture
 def near_rest(bench, monkeypatch):
     """Let the rest pose be near, so that the way to it is short."""
-    monkeypatch.setattr(sessions, "REST", bench.world.pose + 0.1 * np.eye(7)[0])
+    rest = bench.world.pose + 0.1 * np.eye(7)[0]
+    monkeypatch.setattr(Arms, "rest", property(lambda _: rest))
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ class Still(StandIn):
 
 
 class Turning:
-    """Turns the base by `ARM_STEP` an action; keeps what it was asked."""
+    """Turns the base of each arm by `ARM_STEP` an action; keeps what it was asked."""
 
     def __init__(self, chunk=10):
         self.asked, self.chunk, self.change = [], chunk, lambda actions: actions
@@ -29,21 +29,21 @@ class Turning:
     def __call__(self, observation):
         self.asked.append(observation)
         steps = np.arange(1, self.chunk + 1)[:, None]
-        return self.change(observation["state"] + steps * ARM_STEP)
+        state = observation["state"]
+        return self.change(state + steps * np.resize(ARM_STEP, len(state)))
 
 
 class Run:
     """A session whose sentences are kept; `at` calls functions at times since the start."""
 
     def __init__(self, bench, ask, *, look=None, latency=0.0, **options):
-        self.bench, self.said, self.at, self.commands, self.sent = bench, [], {}, [], []
+        self.bench, self.said, self.at, self.commands = bench, [], {}, []
         settings = Settings("turn", hold=options.pop("hold", 0.5), **options.pop("settings", {}))
         asker = options.pop("asker", None) or InTurn(ask, bench.clock, latency)
         self.session = Session(
-            bench.arm,
+            bench.arms,
             look or bench.world.images,
             asker,
-            LIMITS,
             settings,
             bench.clock,
             say=options.pop("say", self.said.append),
@@ -52,11 +52,15 @@ class Run:
 
     def __call__(self, seconds, done=lambda: False):
         start, pending = self.bench.clock.now(), dict(self.at)
-        command = self.bench.arm.command
-        self.bench.arm.command = lambda pose: self.sent.append(pose.copy()) or command(pose)
+        sent = self.all_sent = [[] for _ in self.bench.drivers]
+        self.sent = sent[0]
+        for arm, own in zip(self.bench.drivers, sent, strict=True):
+            arm.command = lambda pose, own=own, command=arm.command: (
+                own.append(pose.copy()) or command(pose)
+            )
 
         def each_tick():
-            self.commands.append(self.session._governor.pose.copy())
+            self.commands.append(self.session._arms.pose)
             for time in [t for t in pending if self.bench.clock.now() - start >= t]:
                 pending.pop(time)()
             return done()
@@ -73,28 +77,31 @@ def assert_safe(run, jump=0.0):
 
     At the start of a hold, the command may jump back to the measured pose [rad].
     """
-    steps = np.abs(np.diff(run.path, axis=0)[:, :6]).max(axis=1)
-    assert np.sort(steps)[-2] < 1.0 * PERIOD + 1e-9
-    assert steps.max() < max(jump, 1.0 * PERIOD + 1e-9)
-    assert run.bench.fake.unsafe == []
+    for path in np.split(run.path, len(run.bench.fakes), axis=1):
+        steps = np.abs(np.diff(path, axis=0)[:, :6]).max(axis=1)
+        assert np.sort(steps)[-2] < 1.0 * PERIOD + 1e-9
+        assert steps.max() < max(jump, 1.0 * PERIOD + 1e-9)
+    assert [fake.unsafe for fake in run.bench.fakes] == [[]] * len(run.bench.fakes)
 
 
-def assert_braked(run):
-    """Check that the arm moved, and was stopped within the limits by what was sent to it."""
-    velocity = np.diff(np.stack(run.sent), axis=0)[:, :6] / PERIOD
-    assert np.abs(velocity).max() > 0.25
-    assert np.abs(np.diff(velocity, axis=0)).max() <= LIMITS.acceleration[0] * PERIOD + 1e-9
-    assert not velocity[-1].any()
-    assert_safe(run)
+def assert_braked(run, arms=None, jump=0.0):
+    """Check that arms, by default all, moved, and were stopped within the limits."""
+    for sent in run.all_sent if arms is None else [run.all_sent[arm] for arm in arms]:
+        velocity = np.diff(np.stack(sent), axis=0)[:, :6] / PERIOD
+        assert np.abs(velocity).max() > 0.25
+        assert np.abs(np.diff(velocity, axis=0)).max() <= LIMITS.acceleration[0] * PERIOD + 1e-9
+        assert not velocity[-1].any()
+    assert_safe(run, jump)
 
 
 def assert_holds(run, words, jump=0.0):
     """Check that the arm stands still, and that one sentence says why."""
     bench = run.bench
     bench.wait(0.5)  # until the servos have caught up
-    before = bench.world.pose
+    before = [limb.pose for limb in bench.world.limbs.values()]
     bench.wait(0.3)
-    np.testing.assert_allclose(bench.world.pose, before, atol=2e-3)
+    after = [limb.pose for limb in bench.world.limbs.values()]
+    np.testing.assert_allclose(after, before, atol=2e-3)
     holding = [text for text in run.said if text.startswith("holding")]
     assert len(holding) == 1, run.said
     assert words in holding[0]

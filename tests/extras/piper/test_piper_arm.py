@@ -96,7 +96,7 @@ def test_the_speed_percentage_limits_the_arm_too(bench):
 def test_commands_take_the_latency(world):
     moved = []
     for latency in (0.0, 0.15):
-        bench = Bench(world, latency=latency).ready(LIMITS)
+        bench = Bench(world, latency=latency).ready()
         bench.wait(0.3)
         start = world.pose
         drive(bench.arm, bench.clock, start + np.array([0.3, 0, 0, 0, 0, 0, 0]), 40)
@@ -109,7 +109,7 @@ def test_commands_take_the_latency(world):
 def test_a_new_layout_starts_at_its_start_pose_whatever_was_commanded_before(bench):
     arm, fake, clock = ready(bench)
     arm.command(fake.world.pose + np.array([0.5, 0, 0, 0, 0, 0, -0.02]))
-    fake.reset(5)
+    clock.reset(5)
     start = fake.world.pose
     wait(clock, 0.3)
     np.testing.assert_allclose(fake.world.pose, start, atol=2e-3)
@@ -129,7 +129,7 @@ def test_frames_that_stop_are_noticed_within_60_ms(bench):
 
 @pytest.mark.parametrize("kind", [*frames.JOINTS, frames.GRIPPER, *frames.DRIVERS])
 def test_every_kind_of_frame_must_come(world, kind):
-    bench, words = Bench(world).ready(LIMITS), "no feedback"
+    bench, words = Bench(world).ready(), "no feedback"
     slack = 0.0
     if kind in frames.DRIVERS:
         words, slack = "no state of a joint's driver", MAX_DRIVER_AGE - MAX_AGE

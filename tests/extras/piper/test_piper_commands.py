@@ -161,6 +161,25 @@ def test_the_policys_robot_and_period_are_kept(
     assert len(policy.batches) == (0 if code else 2 if told else 1)
 
 
+@pytest.mark.parametrize(
+    ("metadata", "words", "message"),
+    [
+        (
+            {},
+            ["--can", "left=a", "right=b"],
+            "policy's actions have 7 numbers, but 2 PiPERs take 14",
+        ),
+        ({"action_dim": 14}, ["--can", "a"], "actions have 14 numbers, but a PiPER takes 7"),
+        ({"robot": "piper"}, ["--can", "right=b", "left=a"], "of the robot piper, not of bi_piper"),
+        ({"robot": "piper"}, ["--arm", "piper-x"], "of the robot piper, not of piper-x"),
+    ],
+)
+def test_a_policy_must_be_of_as_many_arms(metadata, words, message, capsys):
+    with serving(Still(metadata={"action_dim": 7} | metadata)) as server:
+        assert real(["--server", server.address, "--task", "press", *words]) == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+
+
 @pytest.mark.parametrize("adapter", ["", "pour", "press"])
 def test_an_adapter_of_another_task_is_warned_of(adapter, capsys):
     policy = Still(adapters=("pour", "press"))
@@ -204,6 +223,7 @@ def test_only_servers_that_continue_chunks_are_told_how_far_the_arm_is(execution
         (["--thinking", "-1"], "--thinking must be at least 0 s, got -1.0"),
         (["--speed", "9"], "at most 3 rad/s, got 9.0"),
         (["--ahead", "5"], "ahead must be 0 to 4"),
+        (["--arm", "piper-x"], "the fake arm is a piper, not a piper-x"),
     ],
 )
 def test_the_fake_arm_refuses_wrong_options(words, message, tmp_path, capsys):
@@ -249,6 +269,15 @@ def test_the_real_arm_is_not_on_a_virtual_bus(capsys):
     [
         (["--teach", "hand"], "--teach needs --record FOLDER"),
         (["--record", "data", "--dry-run"], "nothing to record"),
+        (["--can", "left=can0"], "left=can0 right=can1, got left=can0"),
+        (["--can", "can0", "can1"], "left=can0 right=can1, got can0 can1"),
+        (["--can", "left=can0", "right=can0"], "got left=can0 right=can0"),
+        (["--can", "left=can0", "right="], "got left=can0 right="),
+        (["--can", "left=can0", "left=can1"], "got left=can0 left=can1"),
+        (
+            ["--arm", "piper-h", "--zeros", "urdf"],
+            "--zeros urdf is for a piper: piper-h has its own",
+        ),
     ],
 )
 def test_options_that_do_not_go_together(words, message, capsys):

@@ -1,5 +1,6 @@
 """Episodes of the real arm's command, with a fake arm on its bus, and the keys that judge them."""
 
+import dataclasses
 import os
 import pty
 import signal
@@ -17,6 +18,7 @@ from lorasp_jax.extras.piper import options
 from lorasp_jax.extras.piper.__main__ import HELD
 from lorasp_jax.extras.piper.__main__ import main as real
 from lorasp_jax.extras.piper.arm import PiperArm
+from lorasp_jax.extras.piper.arms import SIDES
 from lorasp_jax.extras.piper.fake.firmware import FakePiper
 from lorasp_jax.extras.piper.fake.timing import RealTime
 from lorasp_jax.extras.piper.keys import SIGNALS, Keyboard
@@ -24,7 +26,7 @@ from lorasp_jax.extras.piper.recording import Recording
 from lorasp_jax.extras.piper.session import Session
 from tests.extras.piper.benches import channel
 from tests.extras.piper.piper_runs import Still
-from tests.extras.serving.stand_in import serving
+from tests.extras.serving.stand_in import SPEC, serving
 
 
 class LinkedArm(PiperArm):
@@ -134,6 +136,51 @@ def test_a_dry_run_needs_no_bus(film, tmp_path, monkeypatch, capsys):
         words += ["--server", server.address, "--seconds", "0.3", "--dry-run"]
         assert real([*words, "--log", str(tmp_path)]) == 0
     assert "would command" in capsys.readouterr().out
+
+
+def test_two_arms_on_two_buses(table, film, tmp_path, monkeypatch, patient, press_keys, capsys):
+    """A policy of 14 dimensions moves both, and its episode becomes a two-armed dataset."""
+    names = {name: channel() for name in SIDES}
+    table.reset(0)
+    fakes = [FakePiper(names[name], table, limb) for name, limb in table.limbs.items()]
+    time, drivers = RealTime(*fakes), []
+
+    def open_arm(can, **options):
+        drivers.append(PiperArm(names[can], **options | {"bus": "virtual"}))
+        if drivers[1:]:
+            time.start(*drivers)
+        return drivers[-1]
+
+    monkeypatch.setattr(command, "PiperArm", open_arm)
+    monkeypatch.setattr("lorasp_jax.extras.piper.cameras.MAX_AGE", 60.0)
+    press_keys("", "s")
+    spec = dataclasses.replace(SPEC, cameras=("top",), state_dim=14)
+    with serving(Still(spec, metadata={"robot": "bi_piper", "action_dim": 14})) as server:
+        words = ["--server", server.address, "--camera", f"top={film}", "--task", "hand_over"]
+        words += ["--can", "right=right", "left=left", "--seconds", "1.5", "--image-size", "16"]
+        words += ["--log", str(tmp_path / "log"), "--record", str(tmp_path / "data")]
+        assert real(words) == 0, capsys.readouterr()
+    time.stop()
+    for fake in fakes:
+        fake.close()
+    assert all(fake.commands > 100 and not fake.unsafe for fake in fakes)
+    source = open_source(tmp_path / "data")
+    assert source.episode(0).robot == "bi_piper"
+    assert source.grippers["action"] == [6, 13]
+    np.testing.assert_allclose(source.episode(0).state[0, -1, [0, 7]], 0.0, atol=0.01)
+
+
+def test_a_dry_run_without_a_bus_has_as_many_arms_as_the_policy(
+    film, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr("lorasp_jax.extras.piper.cameras.MAX_AGE", 60.0)
+    spec = dataclasses.replace(SPEC, cameras=("top",), state_dim=14)
+    with serving(Still(spec, metadata={"robot": "bi_piper-x", "action_dim": 14})) as server:
+        words = ["--server", server.address, "--camera", f"top={film}", "--prompt", "go"]
+        words += ["--arm", "piper-x", "--seconds", "0.3", "--dry-run", "--log", str(tmp_path)]
+        assert real(words) == 0
+    assert "would command left arm: " in (printed := capsys.readouterr().out)
+    assert "; right arm: " in printed
 
 
 def test_the_camera_is_asked_for_size_rate_and_format(server, monkeypatch, capsys):

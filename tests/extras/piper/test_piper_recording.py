@@ -11,12 +11,11 @@ from lorasp_jax.extras.piper.asking import InTurn
 from lorasp_jax.extras.piper.fake import frames
 from lorasp_jax.extras.piper.fake.demonstrator import Demonstrator
 from lorasp_jax.extras.piper.recording import Recording
-from lorasp_jax.extras.piper.safety import Limits, Unsafe
+from lorasp_jax.extras.piper.safety import Unsafe
 from lorasp_jax.extras.piper.session import Session
 from lorasp_jax.extras.piper.settings import Settings
 from lorasp_jax.extras.piper.teaching import Lesson
 
-LIMITS = Limits.of()
 WAYS = {"task": "press", "instructions": ("press it", "push it"), "control_dt": 0.1}
 
 
@@ -26,7 +25,7 @@ def recording(folder, prompt="push it", **more):
 
 def lesson(bench, recorder, way):
     look = bench.world.images
-    return Lesson(bench.arm, look, recorder, LIMITS, bench.clock, way=way, control_dt=0.1)
+    return Lesson(bench.arms, look, recorder, bench.clock, way=way, control_dt=0.1)
 
 
 def only_episode(folder):
@@ -41,7 +40,7 @@ def test_a_policys_episode_is_recorded_as_it_was_executed(bench, tmp_path):
     look, asker = bench.world.images, InTurn(expert, bench.clock)
     settings = Settings("push it")
     session = Session(
-        bench.arm, look, asker, LIMITS, settings, bench.clock, recorder=recorder, say=pytest.fail
+        bench.arms, look, asker, settings, bench.clock, recorder=recorder, say=pytest.fail
     )
     assert session.run(2.0) is None
     assert recorder.steps == 20

@@ -98,8 +98,8 @@ def test_a_new_chunk_takes_over_as_in_the_simulation(bench, case):
 
     recorder = types.SimpleNamespace(step=lambda images, state, action: recorded.append(action[0]))
     run = Run(bench, ask, latency=latency, settings={"ahead": 3}, recorder=recorder)
-    step = run.session._governor.step
-    run.session._governor.step = lambda target: targets.append(target[0]) or step(target)
+    step = run.session._arms.step
+    run.session._arms.step = lambda target: targets.append(target[0]) or step(target)
     run(latency + 1.5)
     parts = [chunks[0][: 5 + delay], *(chunk[delay : 5 + delay] for chunk in chunks[1:])]
     waits = [np.repeat(part[-1], wait) for part in parts]

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from websockets.exceptions import ConcurrencyError
 
-from lorasp_jax.extras.piper import session as sessions
 from lorasp_jax.extras.piper.cameras import NoPicture
 from lorasp_jax.extras.piper.fake import frames
 from lorasp_jax.extras.piper.keys import SIGNALS
@@ -82,7 +81,7 @@ def test_an_arm_with_a_fault_holds_where_it_is(bench, faults, words):
     if "zeros" not in faults:  # it does not push on against what stopped it
         assert run.path[-1, 0] == pytest.approx(seen[0][0], abs=0.012)
     assert_holds(run, words, jump=0.03)
-    assert np.abs(run.path[-1] - sessions.REST)[:6].max() > 0.5
+    assert np.abs(run.path[-1] - bench.arms.rest)[:6].max() > 0.5
 
 
 @pytest.mark.usefixtures("near_rest")
@@ -113,7 +112,7 @@ def test_a_chunk_with_nan_is_refused_and_the_arm_goes_to_rest(bench):
     last = np.where(np.arange(10) < 9, 1.0, np.nan)[:, None]  # an action that is not executed
     run.at = {0.3: lambda: setattr(ask, "change", lambda actions: actions * last)}
     assert "actions must be finite" in run(30.0)
-    np.testing.assert_allclose(bench.world.pose[:6], sessions.REST[:6], atol=0.03)
+    np.testing.assert_allclose(bench.world.pose[:6], bench.arms.rest[:6], atol=0.03)
     assert run.said == [run.said[0], "moving slowly to the rest pose"]
     assert_holds(run, "actions must be finite")
 
@@ -243,7 +242,7 @@ def test_the_arm_stands_still_before_anything_is_said(bench):
     speeds = []
 
     def say(_):
-        speeds.append(np.abs(run.session._governor.velocity).max())
+        speeds.append(run.session._arms.moving)
 
     run = Run(bench, ask := Turning(), say=say)
     run.at = {0.3: lambda: setattr(ask, "change", lambda actions: actions[:, :3])}
@@ -364,6 +363,6 @@ def test_pictures_that_stop_for_good(bench, way, request):
     run = Run(bench, Turning(), look=die)
     assert "nothing new" in run(30.0)
     assert run.said == [run.said[0], "moving slowly to the rest pose"]
-    np.testing.assert_allclose(bench.world.pose[:6], sessions.REST[:6], atol=0.03)
+    np.testing.assert_allclose(bench.world.pose[:6], bench.arms.rest[:6], atol=0.03)
     assert_braked(run)
     assert_holds(run, "camera wrist shows nothing new")

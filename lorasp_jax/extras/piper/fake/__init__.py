@@ -4,4 +4,5 @@
 
 The unmodified piper_sdk talks to it, so the client of a real arm runs as it is. python-can's
 virtual bus lives inside one process: fake arm and client share it, only the policy is elsewhere.
+In the scene `hand_over` there are two arms, each on a bus of its own.
 """

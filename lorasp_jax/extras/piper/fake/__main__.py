@@ -19,9 +19,11 @@ from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.extras.piper import options as shared
 from lorasp_jax.extras.piper import remote
 from lorasp_jax.extras.piper.arm import PiperArm
+from lorasp_jax.extras.piper.arms import SIDES, Arms
 from lorasp_jax.extras.piper.asking import InThread, InTurn
 from lorasp_jax.extras.piper.fake.demonstrator import Demonstrator
 from lorasp_jax.extras.piper.fake.firmware import PERIOD, FakePiper
+from lorasp_jax.extras.piper.fake.hand_over import TASK, HandOver
 from lorasp_jax.extras.piper.fake.timing import Lockstep, RealTime
 from lorasp_jax.extras.piper.fake.world import TIMESTEP, World
 from lorasp_jax.extras.piper.session import Session
@@ -51,7 +53,10 @@ def parser(program: str) -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add(
-        "--task", default="press", help="open_pot, pick_place, pour or press (default: %(default)s)"
+        "--task",
+        default="press",
+        help="open_pot, pick_place, pour or press, or hand_over for two arms "
+        "(default: %(default)s)",
     )
     add("--expert", action="store_true", help="the scripted expert in place of a server")
     add("--seed", type=int, default=0, help="of the first layout (default: %(default)s)")
@@ -73,25 +78,28 @@ def _run(options: argparse.Namespace, console: Console) -> None:
         raise ValueError(f"--latency must be 0 to {_LARGEST_LATENCY} s, got {options.latency}")
     if options.thinking < 0:
         raise ValueError(f"--thinking must be at least 0 s, got {options.thinking}")
+    if options.arm != "piper":
+        raise ValueError(f"the fake arm is a piper, not a {options.arm}")
     task = shared.task(options.task)
     shared.limits(options)
     shared.settings(options, "")
     cache.enable()
-    source = nullcontext() if options.expert else remote.policy(options)
+    scene, sides = (HandOver, SIDES) if task is TASK else (World, ("",))
+    source = nullcontext() if options.expert else remote.policy(options, len(sides))
     with source as server, closing(shared.open_log(options, server)) as log:
         size = (server and server.metadata.get("image_size")) or options.image_size
-        world = World(options.task, image_size=size)
+        world = scene(options.task, image_size=size)
         world.reset(options.seed)
         if server:
-            server.warn(options.prompt or world.env.instructions)
+            server.warn(options.prompt or world.instructions)
         settings = {"image_size": size, "physics_dt": TIMESTEP}
         prompt = (options.prompt or task.instructions)[0]
         with (
             _video(options.video) as film,
             _bench(options, world) as bench,
-            shared.recording(options, task, prompt=prompt, **settings) as recorder,
+            shared.recording(options, task, sides, prompt=prompt, **settings) as recorder,
         ):
-            bench.arm.connect()
+            bench.arms.connect()
             _episodes(options, bench, server, (log, recorder, film), console)
 
 
@@ -109,7 +117,7 @@ def _episodes(
         bench.reset(options.seed + episode)
         log.line(bench.clock.now(), episode=episode)
         session = _session(options, bench, server, episode, records, console)
-        world = bench.fake.world
+        world = bench.world
         problem = session.run(limit, _judge(world, film))
         wins += world.success
         if film:
@@ -162,9 +170,9 @@ def _session(
     records: tuple,
     console: Console,
 ) -> Session:
-    """Enable the arm, and prepare an episode."""
-    limits, world, clock = shared.limits(options), bench.fake.world, bench.clock
-    bench.arm.enable(limits)
+    """Enable the arms, and prepare an episode."""
+    world, clock = bench.world, bench.clock
+    bench.arms.enable()
     if server:
         server.reset()
     ask = server or Demonstrator(world, clock, options.seed + episode)
@@ -176,44 +184,50 @@ def _session(
         recorder.say(settings.prompt)
     say = functools.partial(console.print, markup=False, highlight=False, soft_wrap=True)
     more = {"log": log, "recorder": recorder, "say": say}
-    session = Session(bench.arm, world.images, asker, limits, settings, clock, **more)
+    session = Session(bench.arms, world.images, asker, settings, clock, **more)
     shared.stop_on_signals(session)
     return session
 
 
 class Bench(NamedTuple):
-    """A connected arm, its fake other end and their clock."""
+    """Connected arms, the world of their fake other ends and their clock."""
 
-    arm: PiperArm
-    fake: FakePiper
+    arms: Arms
+    world: World
     clock: Lockstep | RealTime
 
     def reset(self, seed: int) -> None:
-        """Start a new layout, and wait until the arm's driver has noticed."""
-        self.fake.reset(seed)
+        """Start a new layout, and wait until the arms' drivers have noticed."""
+        self.clock.reset(seed)
         self.clock.wait_until(self.clock.now() + _SETTLING)
 
 
 @contextmanager
 def _bench(options: argparse.Namespace, world: World) -> Iterator[Bench]:
-    """Yield both ends of a bus."""
-    channel = f"fake_piper_{next(_CHANNELS)}"
-    noise = {"noise": options.noise, "seed": options.seed}
-    fake = FakePiper(channel, world, latency=options.latency, **noise)
-    clock = RealTime(fake) if options.realtime else Lockstep(fake)
-    arm = PiperArm(channel, bus="virtual", clock=clock, **shared.motion(options))
+    """Yield both ends of a bus for each arm."""
+    fakes = {f"fake_piper_{next(_CHANNELS)}": limb for limb in world.limbs.values()}
+    more = {"latency": options.latency, "noise": options.noise}
+    ends = [
+        FakePiper(channel, world, limb, seed=options.seed + number, **more)
+        for number, (channel, limb) in enumerate(fakes.items())
+    ]
+    clock = RealTime(*ends) if options.realtime else Lockstep(*ends)
+    motion = {"bus": "virtual", "clock": clock, **shared.motion(options)}
+    drivers = [PiperArm(channel, **motion) for channel in fakes]
+    arms = Arms(dict(zip(world.limbs, drivers, strict=True)), shared.limits(options))
     try:
-        clock.start(arm)
-        yield Bench(arm, fake, clock)
+        clock.start(*drivers)
+        yield Bench(arms, world, clock)
     finally:
         clock.stop()
-        arm.close()
-        fake.close()
+        arms.close()
+        for end in ends:
+            end.close()
 
 
 def _judge(world: World, film: list[np.ndarray] | None) -> Callable[[], bool]:
     """Return a function for every tick that tests for success at every control step."""
-    ticks, every = 0, round(world.env.control_dt / PERIOD)
+    ticks, every = 0, round(world.control_dt / PERIOD)
 
     def done() -> bool:
         nonlocal ticks

@@ -5,7 +5,6 @@ percentage, the last target that stays in force, delays and noise; and that the 
 emergency stop, and falls after a reset or without its drivers.
 """
 
-import threading
 from collections import deque
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from envs.robots.piper import ROBOT, SDK_OFFSET
 from lorasp_jax.extras.piper.fake import frames
-from lorasp_jax.extras.piper.fake.world import World
+from lorasp_jax.extras.piper.fake.world import Limb, World
 
 PERIOD = 0.005
 """Time between two feedback frames of a kind [s], as measured on PiPERs (200 Hz)."""
@@ -30,7 +29,7 @@ class FakePiper:
     """A PiPER on one end of a virtual bus.
 
     Attributes:
-        world: the simulated scene.
+        world, limb: the simulated scene, and the arm in it.
         time: simulated time [s].
         stamp: time stamp of the latest frames [s].
         reported: when the latest feedback was sent [s].
@@ -43,6 +42,7 @@ class FakePiper:
         self,
         channel: str,
         world: World,
+        limb: Limb | World | None = None,
         *,
         latency: float = 0.0,
         noise: float = 2e-4,
@@ -53,11 +53,13 @@ class FakePiper:
         Args:
             channel: name of python-can's virtual bus.
             world: the scene; call its `reset` first.
+            limb: the arm in it; None: its only one.
             latency: delay of every command [s].
             noise: standard deviation of measured angles [rad]; our choice.
             seed: of the noise.
         """
-        self.world, self.time, self.stamp, self.reported = world, 1.0, 1.0, 0.0
+        self.world, self.limb = world, limb or world
+        self.time, self.stamp, self.reported = 1.0, 1.0, 0.0
         self.unsafe: list[str] = []
         self.commands, self.hand = 0, None
         self._latency, self._noise = latency, noise
@@ -66,32 +68,24 @@ class FakePiper:
         self._waiting: deque[tuple[float, Any]] = deque()
         self._tick, self._ctrl_mode, self._stopped = 0, _STANDBY, 0
         self._percent, self._enabled = 100, np.zeros(6, bool)
-        self._target, self._setpoint = self.world.pose, self.world.pose
-        self._turn = threading.Lock()  # the arm may live in a thread of its own
+        self._target, self._setpoint = self.limb.pose, self.limb.pose
 
-    def reset(self, seed: int) -> None:
-        """Start a random layout, with the arm at rest in its start pose.
+    def start(self) -> None:
+        """Stand where the arm is, and lose commands that are still on their way."""
+        self._receive()
+        self._waiting.clear()
+        self._target, self._setpoint = self.limb.pose, self.limb.pose
 
-        Commands that are still on their way are lost: they were meant for the previous layout.
-        """
-        with self._turn:
-            self.world.reset(seed)
-            self._receive()
-            self._waiting.clear()
-            self._target, self._setpoint = self.world.pose, self.world.pose
-
-    def tick(self) -> None:
-        """Advance by `PERIOD`: receive, simulate, send."""
-        with self._turn:
-            self._take_turn()
-
-    def _take_turn(self) -> None:
+    def obey(self) -> None:
+        """Begin a tick: receive, and move the servos' targets."""
         self.time = self.stamp = round(self.time + PERIOD, 6)
         self._receive()
         while self._waiting and self._waiting[0][0] <= self.time + 1e-9:
             self._obey(self._waiting.popleft()[1])
         self._move()
-        self.world.advance(PERIOD)
+
+    def report(self) -> None:
+        """End a tick: send feedback."""
         self._tick += 1
         self._report()
 
@@ -131,10 +125,10 @@ class FakePiper:
     def _switch(self, on: bool) -> None:
         """Switch the drivers: without them the arm falls, and with them it stays where it is."""
         if self._enabled.any() and not on:
-            self.world.support("none")
+            self.limb.support("none")
         elif on and not self._enabled.all():
-            self.world.support("none" if self._stopped else "motors")
-            self._target, self._setpoint = self.world.pose, self.world.pose
+            self.limb.support("none" if self._stopped else "motors")
+            self._target, self._setpoint = self.limb.pose, self.limb.pose
         self._enabled[:] = on
 
     def _stop_or_teach(self, data: bytes) -> None:
@@ -142,13 +136,13 @@ class FakePiper:
             self.unsafe.append("emergency stop or reset")
         if data[0] == _STOP:
             self._stopped = _EMERGENCY
-            self.world.support("damping")  # it sinks
+            self.limb.support("damping")  # it sinks
         elif data[0] == _RESUME:  # which cuts the power at once
             self._stopped, self._ctrl_mode = 0, _STANDBY
             self._switch(False)
         if data[2] in (1, 2):
             self._ctrl_mode = _TEACHING if data[2] == 1 else _STANDBY
-            self._target = self.world.pose
+            self._target = self.limb.pose
 
     def _aim(self, joints: slice, angles: np.ndarray) -> None:
         # A count is 0.001 degrees, and a target at a limit may be rounded past it.
@@ -166,14 +160,14 @@ class FakePiper:
     def _move(self) -> None:
         """Let the servos' targets follow the last target, as fast as the percentage allows."""
         if self._ctrl_mode == _TEACHING:
-            self._setpoint = self.world.pose if self.hand is None else np.array(self.hand)
+            self._setpoint = self.limb.pose if self.hand is None else np.array(self.hand)
         elif self._enabled.all() and not self._stopped:
             speed = np.append(np.full(6, _FASTEST * self._percent / 100), _GRIPPER_SPEED) * PERIOD
             self._setpoint = self._setpoint + np.clip(self._target - self._setpoint, -speed, speed)
-        self.world.command(self._setpoint)
+        self.limb.command(self._setpoint)
 
     def _report(self) -> None:
-        pose = self.world.pose
+        pose = self.limb.pose
         angles = pose[:6] + self._noise * self._random.standard_normal(6) - SDK_OFFSET
         counts = np.rad2deg(angles) * 1000
         for i, kind in enumerate(frames.JOINTS):

@@ -4,6 +4,7 @@ Cameras are rendered by the ray caster that policies were trained with, and the 
 judge success. Physics differ from training: the engine, its time step, gains, friction, damping.
 """
 
+import dataclasses
 import functools
 import threading
 from typing import Any, Literal
@@ -14,14 +15,17 @@ import mujoco
 import numpy as np
 
 import envs
+from envs.experts import expert
+from envs.robots import BASE
 from envs.scene import placing
 from envs.state import Poses, State
 from envs.tasks import View
 
 _FIELDS = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "xpos", "xmat", "site_xpos")
-_SUPPORT = ("actuator_gainprm", "actuator_biasprm", "body_gravcomp", "dof_damping")
 _MATRICES = ("geom_xmat", "cam_xmat", "xmat", "site_xmat")
 
+
+Support = Literal["motors", "damping", "none"]
 
 # How the fake arm's physics differ from the simulation's; all our choices.
 TIMESTEP = 0.0025
@@ -30,6 +34,42 @@ _GAINS = 1.15  # factor on the servos' stiffness and damping
 _FRICTION = 0.9  # factor on the friction of all contacts
 _DRY_FRICTION = 0.05  # N m, friction torque in the arm's joints
 _SINKING = 10.0  # N m s, damping of the joints after an emergency stop
+
+
+class Limb:
+    """An arm in a MuJoCo model, as its firmware sees it."""
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, side: str = "") -> None:
+        """Find an arm whose parts' names begin with `side`, such as left_."""
+        self._model, self._data = model, data
+        names = [*(f"joint{i + 1}" for i in range(6)), "left", "right"]
+        joints = [model.joint(side + name) for name in names]
+        servos = [model.actuator(side + name).id for name in (*names[:6], "gripper")]
+        bodies = model.body_rootid == model.body(side + BASE).id
+        self._places = np.array([joint.qposadr[0] for joint in joints])
+        self._servos, dofs = np.array(servos), np.array([joint.dofadr[0] for joint in joints])
+        parts = {"actuator_gainprm": servos, "actuator_biasprm": servos}
+        self._parts = parts | {"body_gravcomp": bodies, "dof_damping": dofs}
+        self._supported = {name: getattr(model, name)[at] for name, at in self._parts.items()}
+
+    @property
+    def pose(self) -> np.ndarray:
+        """Joints [rad] and gripper opening [m], [7]."""
+        places = self._data.qpos[self._places]
+        return np.append(places[:6], places[6:].sum())
+
+    def command(self, pose: np.ndarray) -> None:
+        """Set the servos' targets [7]."""
+        self._data.ctrl[self._servos] = np.append(pose[:6], pose[6] / 2)
+
+    def support(self, by: Support) -> None:
+        """Choose what carries the arm: its motors, or against its weight only damping, or none."""
+        for name, at in self._parts.items():
+            getattr(self._model, name)[at] = self._supported[name] if by == "motors" else 0.0
+        if by == "damping":
+            self._model.dof_damping[self._parts["dof_damping"][:6]] = _SINKING
+        elif by == "none":
+            self._model.dof_damping[self._parts["dof_damping"]] = self._supported["dof_damping"]
 
 
 class World:
@@ -41,6 +81,8 @@ class World:
         data: MuJoCo's data now.
         success: whether the task has been solved.
         instruction: the request in words.
+        instructions: all phrasings of it.
+        control_dt: time between two actions [s].
     """
 
     def __init__(self, task: str, *, image_size: int = 64) -> None:
@@ -50,6 +92,8 @@ class World:
             ValueError: the task is unknown.
         """
         self.env: envs.Env = envs.make(task, robot="piper", num_envs=1, image_size=image_size)
+        self.instructions, self.control_dt = self.env.instructions, self.env.control_dt
+        self._hold_steps = self.env.task.hold_steps
         self._render = jax.jit(self.env.render)
         self._check = jax.jit(functools.partial(_check, self.env))
         self._lock = threading.Lock()  # the arm may live in a thread of its own
@@ -62,37 +106,37 @@ class World:
     def _reset(self, seed: int) -> None:
         self.state: State = self.env.reset(jax.random.key(seed))
         self.model = placing.world_model(self.env.model, self.state.info["layout"], 0)
-        self.model.opt.timestep = TIMESTEP
-        self.model.actuator_gainprm *= _GAINS
-        self.model.actuator_biasprm *= _GAINS
-        self.model.geom_friction *= _FRICTION
-        self.model.dof_frictionloss[:6] = _DRY_FRICTION
-        self._supported = {name: getattr(self.model, name).copy() for name in _SUPPORT}
+        unlike_training(self.model)
         self.data = mujoco.MjData(self.model)
+        self._limb = Limb(self.model, self.data)
         self.data.qpos[:] = np.asarray(self.state.data.qpos[0])
         self.command(self.pose)
         mujoco.mj_forward(self.model, self.data)
-        self.instruction = self.env.instructions[int(self.state.info["instruction"][0])]
+        self.instruction = self.instructions[int(self.state.info["instruction"][0])]
         self.success, self._held = False, 0
+
+    @property
+    def limbs(self) -> dict[str, "Limb | World"]:
+        """The arms by name; a single arm has none, and is moved through this world."""
+        return {"": self}
 
     @property
     def pose(self) -> np.ndarray:
         """Joints [rad] and gripper opening [m], [7]."""
-        return np.append(self.data.qpos[:6], self.data.qpos[6:8].sum())
+        return self._limb.pose
+
+    def demonstration(self, seed: int) -> np.ndarray:
+        """Return the scripted expert's actions [T, 7] from the start of this layout."""
+        return np.asarray(_actions(self.env, self.state, jax.random.key(seed)))
 
     def command(self, pose: np.ndarray) -> None:
         """Set the servos' targets [7]."""
-        self.data.ctrl[:] = np.append(pose[:6], pose[6] / 2)
+        self._limb.command(pose)
 
-    def support(self, by: Literal["motors", "damping", "none"]) -> None:
-        """Choose what carries the arm: its motors, or against its weight only damping, or none."""
+    def support(self, by: Support) -> None:
+        """Choose what carries the arm, as in `Limb`."""
         with self._lock:
-            for name, value in self._supported.items():
-                getattr(self.model, name)[:] = value if by == "motors" else 0.0
-            if by == "damping":
-                self.model.dof_damping[:6] = _SINKING
-            elif by == "none":
-                self.model.dof_damping[:] = self._supported["dof_damping"]
+            self._limb.support(by)
 
     def advance(self, seconds: float) -> None:
         """Simulate a multiple of the time step."""
@@ -102,7 +146,7 @@ class World:
     def judge(self) -> bool:
         """Test for success, as the environment does after every control step."""
         self._held = self._held + 1 if bool(self._check(self._arrays())) else 0
-        self.success |= self._held >= self.env.task.hold_steps
+        self.success |= self._held >= self._hold_steps
         return self.success
 
     def images(self) -> dict[str, np.ndarray]:
@@ -121,7 +165,29 @@ class World:
         return arrays | {name: arrays[name].reshape(-1, 3, 3) for name in _MATRICES}
 
 
+def unlike_training(model: mujoco.MjModel) -> None:
+    """Change a scene's physics."""
+    model.opt.timestep = TIMESTEP
+    model.actuator_gainprm *= _GAINS
+    model.actuator_biasprm *= _GAINS
+    model.geom_friction *= _FRICTION
+    hinges = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE  # only arms have any
+    model.dof_frictionloss[model.jnt_dofadr[hinges]] = _DRY_FRICTION
+
+
 def _check(env: envs.Env, arrays: dict[str, jax.Array]) -> jax.Array:
     zero = jnp.zeros(0)
     data = envs.state.Data(qacc_warmstart=zero, xquat=zero, **arrays)
     return env.task.check(View(env.model, data))[0]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _actions(env: envs.Env, state: envs.State, key: jax.Array) -> jax.Array:
+    """Return the expert's actions [T, 7] from a state of one world."""
+    plan = expert.plan(env, state, key)
+
+    def act(step: jax.Array) -> jax.Array:
+        at_step = dataclasses.replace(state, info=state.info | {"steps": step[None]})
+        return expert.act(env, plan, at_step)[0]
+
+    return jax.vmap(act)(jnp.arange(env.expert_steps))
