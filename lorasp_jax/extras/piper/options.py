@@ -17,7 +17,7 @@ from lorasp_jax.extras.piper.family import MODELS
 from lorasp_jax.extras.piper.keys import SIGNALS
 from lorasp_jax.extras.piper.log import Log
 from lorasp_jax.extras.piper.recording import Recording
-from lorasp_jax.extras.piper.remote import Server
+from lorasp_jax.extras.piper.remote import Server, own_robot
 from lorasp_jax.extras.piper.rerun_log import Viewer, WatchedLog
 from lorasp_jax.extras.piper.safety import Limits
 from lorasp_jax.extras.piper.session import Session
@@ -104,11 +104,6 @@ def motion(options: argparse.Namespace) -> dict[str, Any]:
     """Return what `PiperArm` needs to know of the arm and the limits."""
     limits = {"speed": options.speed, "effort": options.effort, "zeros": options.zeros}
     return {"model": MODELS[options.arm], **limits}
-
-
-def own_robot(options: argparse.Namespace, arms: int) -> str:
-    """Return the name of one or two arms, as LeRobot names its two-armed robots: bi_piper."""
-    return "bi_" * (arms == 2) + options.arm
 
 
 def open_log(options: argparse.Namespace, server: Server | None) -> Log:

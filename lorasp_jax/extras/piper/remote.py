@@ -11,7 +11,6 @@ import numpy as np
 
 from lorasp_jax.base import json_values
 from lorasp_jax.extras.piper.asking import Observation
-from lorasp_jax.extras.piper.options import own_robot
 from lorasp_jax.extras.serving.client import PolicyClient, PolicyError, ServerGone
 from lorasp_jax.extras.serving.pictures import to_square
 
@@ -90,6 +89,11 @@ class Server:
             return np.asarray(reply["actions"])
         except ValueError as error:
             raise PolicyError("the server's actions are lists of different lengths") from error
+
+
+def own_robot(options: argparse.Namespace, arms: int) -> str:
+    """Return the name of one or two arms, as LeRobot names its two-armed robots: bi_piper."""
+    return "bi_" * (arms == 2) + options.arm
 
 
 @contextlib.contextmanager

@@ -14,6 +14,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from lorasp_jax.base.errors import one_line
+from lorasp_jax.extras.piper.arms import SIDES
 from lorasp_jax.extras.serving import wire
 
 INSTALL = 'pip install "lorasp_jax[rerun]"'
@@ -26,9 +27,8 @@ _CONNECTING, _WRITING = 2.0, 5.0  # s to wait for a viewer, and for what was log
 
 
 def joint_names(number: int) -> list[str]:
-    """Return the names of the numbers of a pose, of one arm or of several."""
-    arms = range(-(-number // len(_NAMES)))
-    prefixes = [f"arm_{arm + 1}/" if len(arms) > 1 else "" for arm in arms]
+    """Return the names of the numbers of a pose, of one arm or of two."""
+    prefixes = [f"{side}/" for side in SIDES] if number > len(_NAMES) else [""]
     return [prefix + name for prefix in prefixes for name in _NAMES][:number]
 
 

@@ -244,7 +244,7 @@ def test_replies_may_be_anything():
 
 def test_joints_have_names():
     assert joint_names(7) == [*(f"joint_{i}" for i in range(1, 7)), "gripper"]
-    assert joint_names(14)[6:8] == ["arm_1/gripper", "arm_2/joint_1"]
+    assert joint_names(14)[6:8] == ["left/gripper", "right/joint_1"]
 
 
 def test_lessons_are_not_shown(tmp_path, capsys):
