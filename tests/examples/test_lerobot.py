@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from lorasp_jax.extras.piper import safety
+from lorasp_jax.extras.piper.arms import PERIOD
 from lorasp_jax.extras.piper.fake.timing import RealTime
 from lorasp_jax.extras.piper.fake.world import World
 from lorasp_jax.extras.piper.safety import Limits, Unsafe
-from lorasp_jax.extras.piper.session import PERIOD
 from tests.extras.piper.benches import Bench
 
 LIMITS = Limits.of()
@@ -28,14 +28,14 @@ def world():
 
 @pytest.fixture
 def bench(world):
-    bench = Bench(world).ready(LIMITS)
+    bench = Bench(world).ready()
     yield bench
     bench.close()
 
 
 @pytest.fixture
 def follower(module, bench):
-    return module.Follower(bench.arm, LIMITS, bench.clock, 0.1)
+    return module.Follower(bench.arms, bench.clock, 0.1)
 
 
 def moving(follower, bench):
@@ -105,12 +105,12 @@ def test_after_a_fault_it_holds_for_good(follower, bench, fault, word):
     follower.run(0.5)
     for name in fault:
         setattr(bench.fake.faults, name, type(fault[name])())
-    held = follower._governor.pose.copy()
+    held = follower._arms.pose.copy()
     for ask in (follower.pose, lambda: follower.follow(target)):
         with pytest.raises(Unsafe, match=word):
             ask()
     follower.run(0.5)
-    np.testing.assert_array_equal(follower._governor.pose, held)
+    np.testing.assert_array_equal(follower._arms.pose, held)
 
 
 def test_an_error_of_its_thread_is_told(follower, bench, monkeypatch):
@@ -122,7 +122,7 @@ def test_an_error_of_its_thread_is_told(follower, bench, monkeypatch):
     with pytest.raises(Unsafe, match="StopIteration"):
         follower.pose()
     follower.settle()
-    assert not follower._governor.velocity.any()
+    assert not follower._arms.moving
 
 
 def test_it_runs_in_a_thread_until_it_is_stopped(module, bench, monkeypatch):
@@ -133,7 +133,7 @@ def test_it_runs_in_a_thread_until_it_is_stopped(module, bench, monkeypatch):
     clock.start(bench.arm)
     clock.wait_until(clock.now() + 0.3)  # until each kind of frame has come by this clock
     try:
-        follower = module.Follower(bench.arm, LIMITS, clock, 0.1)
+        follower = module.Follower(bench.arms, clock, 0.1)
         thread = threading.Thread(target=follower.run)
         thread.start()
         target = follower.follow(follower.pose() + STEP)

@@ -20,6 +20,7 @@ from lerobot.utils.decorators import check_if_not_connected
 
 from lerobot_robot_lorasp_piper.follower import Follower
 from lorasp_jax.extras.piper.arm import PiperArm
+from lorasp_jax.extras.piper.arms import Arms
 from lorasp_jax.extras.piper.clock import RealClock
 from lorasp_jax.extras.piper.fake.demonstrator import Demonstrator
 from lorasp_jax.extras.piper.fake.firmware import FakePiper
@@ -116,9 +117,10 @@ class LoraspPiper(Robot):
             self._closing = stack.pop_all()
 
     def _take(self, arm: PiperArm, clock: Any, control_dt: float) -> Follower:
-        arm.connect()
-        arm.enable(self.limits)
-        return Follower(arm, self.limits, clock, control_dt)
+        arms = Arms({"": arm}, self.limits)
+        arms.connect()
+        arms.enable()
+        return Follower(arms, clock, control_dt)
 
     @check_if_not_connected
     def get_observation(self) -> dict[str, Any]:

@@ -5,19 +5,10 @@ import math
 import numpy as np
 
 from lorasp_jax.base.errors import describe_any
-from lorasp_jax.extras.piper.arm import PiperArm
+from lorasp_jax.extras.piper.arms import PERIOD, Arms
 from lorasp_jax.extras.piper.clock import Clock
 from lorasp_jax.extras.piper.interpolation import Path
-from lorasp_jax.extras.piper.safety import (
-    CAN_CONTROL,
-    MAX_AGE,
-    Governor,
-    Limits,
-    Unsafe,
-    check_chunk,
-    fault,
-)
-from lorasp_jax.extras.piper.session import PERIOD
+from lorasp_jax.extras.piper.safety import Unsafe
 
 
 class Follower:
@@ -30,13 +21,13 @@ class Follower:
         problem: why the arm holds, in a sentence; None while it does not.
     """
 
-    def __init__(self, arm: PiperArm, limits: Limits, clock: Clock, control_dt: float) -> None:
+    def __init__(self, arms: Arms, clock: Clock, control_dt: float) -> None:
         """Take an arm whose drivers are on; it stays where it is."""
-        self._arm, self._limits, self._clock, self._dt = arm, limits, clock, control_dt
+        self._arms, self._clock, self._dt = arms, clock, control_dt
         self.problem: str | None = None
-        self._stopped, self._governor = False, Governor(limits, PERIOD)
-        self._governor.start(arm.read().pose)
-        self._way = Path(self._governor.pose, self._governor.pose[None], control_dt), clock.now()
+        self._stopped, start = False, arms.read()
+        arms.start(start)
+        self._way = Path(start, start[None], control_dt), clock.now()
 
     def pose(self) -> np.ndarray:
         """Return the measured pose [7]: joints [rad], gripper opening [m].
@@ -46,7 +37,7 @@ class Follower:
         """
         if self.problem:
             raise Unsafe(self.problem)
-        return self._arm.read().pose
+        return self._arms.read()
 
     def follow(self, target: np.ndarray) -> np.ndarray:
         """Begin to move to a target [7]; return it as clipped to the limits.
@@ -56,7 +47,7 @@ class Follower:
         """
         if self.problem:
             raise Unsafe(self.problem)
-        target = np.clip(check_chunk(target[None]), self._limits.lower, self._limits.upper)
+        target = self._arms.clip(self._arms.check_chunk(target[None])[0])[None]
         now, (path, since) = self._clock.now(), self._way
         self._way = Path(path.target(now - since), target, self._dt), now
         return target[0]
@@ -81,20 +72,16 @@ class Follower:
     def settle(self) -> None:
         """Brake; the arm then holds its last target."""
         self.problem = self.problem or "the arm was told to hold"
-        while self._governor.velocity.any():
+        while self._arms.moving:
             self._tick()
             self._clock.wait_until(self._clock.now() + PERIOD)
 
     def _tick(self) -> None:
-        reading, now = self._arm.read(), self._clock.now()
-        if not self.problem and (problem := fault(reading, self._limits)):
-            if reading.age <= MAX_AGE and (reading.arm_status or not reading.enabled):
-                self._governor.start(reading.pose)  # it may stand still already
+        self._arms.read()
+        if not self.problem and (problem := self._arms.fault()):
+            self._arms.yield_to_faults()
             self.problem = problem
         path, since = self._way
-        if self.problem:
-            command = self._governor.brake()
-        else:
-            command = self._governor.step(path.target(now + PERIOD - since))
-        if reading.ctrl_mode == CAN_CONTROL:  # else a person or another program has the arm
-            self._arm.command(command)
+        now = self._clock.now()
+        target = path.target(now + PERIOD - since)
+        self._arms.send(self._arms.brake() if self.problem else self._arms.step(target))
