@@ -37,6 +37,8 @@ API = {
 OUTSIDE = (
     "assets/**/*.gif",
     "assets/*.png",
+    "deploy/README.md",
+    "examples/*/README.md",
     "notebooks/*.ipynb",
     "studies/*/README.md",
     "studies/performance/peers.md",

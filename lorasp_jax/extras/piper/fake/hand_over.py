@@ -47,7 +47,7 @@ _HAND = np.diag([-1.0, 1.0, -1.0]) @ rotation("y", -ROBOT.lean)[:3, :3]
 """Rotation of a hand that points down, leaning outward, and grasps across a stick along x."""
 
 
-class Task(NamedTuple):
+class HandOverTask(NamedTuple):
     """What the commands need of a task; as in `envs.tasks.Task`."""
 
     name: str
@@ -55,7 +55,7 @@ class Task(NamedTuple):
     time_limit: float
 
 
-TASK = Task(
+TASK = HandOverTask(
     "hand_over",
     (
         "hand the stick over to the right arm",
