@@ -18,6 +18,7 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io import native
 from lorasp_jax.models.checkpoints.native import by_path
 from lorasp_jax.models.config import BackboneConfig
+from lorasp_jax.models.inputs import OURS
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.models.transformer.depth import unstack
@@ -28,6 +29,11 @@ _STACK = "/blocks/"
 _TOWERS = ("vision/", "language/", "action/")
 _FACTORS = ("lora_a", "lora_b", "u", "v")
 """Names of the factors of a low-rank adapter."""
+
+
+def sampling_config(config: BackboneConfig) -> BackboneConfig:
+    """Return a config without what only training reads, or only a policy's processor."""
+    return dataclasses.replace(config, remat="none", unroll=None, inputs=OURS)
 
 
 class _Structure(NamedTuple):
@@ -140,6 +146,16 @@ class SharedBase:
         pairs = zip(structure.names, structure.own, strict=True)
         base = [self._arrays[name] for name, place in pairs if place is None]
         return SharedSampler(base, [*arrays.values()], structure, self.config)
+
+    def attach_with(self, adapt: Callable[[Any], Any]) -> SharedSampler:
+        """Return a sampler for what a function adds to a model with the base's shapes.
+
+        The model's values are zeros that take no memory.
+        """
+        graphdef, shapes = nnx.split(self._bare)
+        zeros = lambda x: np.broadcast_to(np.zeros((), x.dtype), x.shape)  # noqa: E731
+        bare = nnx.merge(graphdef, jax.tree.map(zeros, shapes))
+        return self.attach_model(adapt(bare), bare)
 
     def attach_model(self, model: Any, bare: Any) -> SharedSampler:
         """Return a sampler for a model that was adapted from `bare`, from which this base is."""

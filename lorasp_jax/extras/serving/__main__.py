@@ -17,7 +17,7 @@ from typing import Any
 
 from rich.console import Console
 
-from lorasp_jax.base.arguments import indices, named, pair, positive
+from lorasp_jax.base.arguments import NAME, indices, named, pair, positive
 from lorasp_jax.base.errors import run_command
 from lorasp_jax.extras.serving import manager
 
@@ -62,8 +62,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--port", type=int, default=8000, help="default: %(default)s")
     add("--token-file", type=Path, metavar="FILE", help="file with the token of the clients; "
         "written with a fresh one if there is none, and made readable only by you")  # fmt: skip
-    add("--max-clients", type=positive, default=64, help="maximum number of connections (default: "
-        "%(default)s)")  # fmt: skip
+    add("--max-clients", type=positive, help="maximum number of connections (default: 64)")
     add("--prompt", default="", help="instruction of requests that have none")
     add("--max-batch", type=int, help="largest batch (default: 8)")
     add("--num-steps", type=int, help="flow steps (default: 10)")
@@ -120,15 +119,15 @@ def _serve(options: argparse.Namespace, console: Console) -> None:
     if options.vla_eval:
         from lorasp_jax.extras.serving import vla_eval  # before what takes long
 
-        _refuse(options, ("token_file",), "has no effect with --vla-eval")
+        _refuse(options, ("token_file", "max_clients"), "has no effect with --vla-eval")
     token = _read_token(options.token_file, console)
     with server.bind(options.host, options.port, token=token) as port:  # before what takes long
         policy: Any = _load(options, console)
         if options.vla_eval:
             policy_server: Any = vla_eval.VlaEvalServer(policy, options.vla_eval)
         else:
-            limit = options.max_clients
-            policy_server = server.PolicyServer(policy, token=token, max_clients=limit)
+            limit = {"max_clients": options.max_clients} if options.max_clients else {}
+            policy_server = server.PolicyServer(policy, token=token, **limit)
         answers = asyncio.run(_run(policy_server, port, console))
     if not answers:
         from lorasp_jax.training.distributed import processes
@@ -169,8 +168,11 @@ def _load(options: argparse.Namespace, console: Console) -> Any:
     from lorasp_jax.extras.serving.served import ServedPolicies
 
     named, start = dict(options.policy), time.monotonic()
-    if len(named) < len(options.policy):
+    names = [name for name, _ in (*options.policy, *options.adapter)]
+    if len({*names}) < len(names):
         raise ValueError("the policies must have different names: pass NAME=POLICY")
+    if unfit := [name for name in names if not NAME.fullmatch(name)]:
+        raise ValueError(f"names must match {NAME.pattern}, got {unfit[0]!r}: pass NAME=POLICY")
     cache.enable()
     seed = secrets.randbelow(2**31) if options.seed is None else options.seed
     _say(console, f"loading {', '.join(named.values())} with --seed {seed}")

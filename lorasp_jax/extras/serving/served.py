@@ -15,7 +15,12 @@ import numpy as np
 from lorasp_jax.base.arguments import NAME
 from lorasp_jax.extras.serving import routing
 from lorasp_jax.extras.serving.adapters import embed, is_shared
-from lorasp_jax.extras.serving.exported import ExportedPolicy, PolicyInterface, build_row
+from lorasp_jax.extras.serving.exported import (
+    Description,
+    ExportedPolicy,
+    PolicyInterface,
+    build_row,
+)
 from lorasp_jax.extras.serving.policies import CACHED_PROMPTS, CompiledPolicy
 from lorasp_jax.extras.serving.requests import PolicySpec, Request
 
@@ -53,7 +58,10 @@ class ServedPolicies:
         spec: what requests must have, and what is returned.
         metadata: what the first policy's run says of its robot.
         sizes: batch sizes, ascending.
+        routing: how requests without a name find their adapter, one of `routing.MODES`.
     """
+
+    routing: str = "name"
 
     def __init__(
         self,
@@ -81,8 +89,9 @@ class ServedPolicies:
             ValueError: the policies need different observations or are of different robots, or
                 cannot continue chunks as `execution` demands.
         """
-        self._prompt, self._route, self._load = prompt, route, load
-        self.spec: PolicySpec = _common_spec(policies, execution)
+        self._prompt, self._load = prompt, load
+        self.routing = route
+        self.spec: PolicySpec = common_spec(_descriptions(policies), execution)
         self.metadata: dict[str, Any] = dict(next(iter(policies.values())).description.metadata)
         self._adapters = {name: Adapter(name, policy) for name, policy in policies.items()}
         self._default = next(iter(policies))
@@ -139,8 +148,8 @@ class ServedPolicies:
             raise ValueError(f"name must match {NAME.pattern}, got {name[:80]!r}")
         with self._change:  # one at a time
             adapter, first = Adapter(name, self._load(path)), self._adapters[self._default]
-            present = f"the present {first.name}"
-            _common_spec({present: first.policy, name: adapter.policy}, self.spec.execution)
+            both = {f"the present {first.name}": first.policy, name: adapter.policy}
+            common_spec(_descriptions(both), self.spec.execution)
             for size in self.sizes:
                 self._try_out(adapter, size)
             self._adapters = self._adapters | {name: adapter}
@@ -170,14 +179,14 @@ class ServedPolicies:
             ValueError: there is no such adapter, or the instruction is not clearly of one.
         """
         prompt, known = request.prompt or self._prompt, self.instructions
-        if request.adapter or self._route == "name":
+        if request.adapter or self.routing == "name":
             return self._find(request.adapter or self._default)
         if not prompt:
             raise ValueError("the request must contain a prompt, or name an adapter")
         if name := routing.exact(prompt, known):
             return self._find(name)
         said = f"{', '.join(known)} were trained for others"
-        if self._route == "nearest":
+        if self.routing == "nearest":
             name, said = routing.nearest(prompt, known, self._embed)
         if not name:
             raise ValueError(f"no adapter is for {prompt!r}: {said}; name the adapter")
@@ -209,6 +218,7 @@ class ServedPolicies:
         prompt = request.prompt or self._prompt or (known[0] if len(known) == 1 else "")
         if not prompt:
             raise ValueError("the request must contain a prompt")
+        prompt = routing.trained(prompt, known) or prompt
         rest = None
         if execution != "naive":
             rest = np.zeros((0, self.spec.action_length), np.float32)
@@ -255,20 +265,24 @@ def draw_noise(key: jax.Array, index: jax.Array, shape: tuple[int, ...]) -> jax.
     return jax.random.normal(key, shape)
 
 
-def _common_spec(
-    policies: Mapping[str, CompiledPolicy | ExportedPolicy], execution: str
-) -> PolicySpec:
+def _descriptions(
+    policies: Mapping[str, CompiledPolicy | ExportedPolicy],
+) -> dict[str, Description]:
+    return {name: policy.description for name, policy in policies.items()}
+
+
+def common_spec(policies: Mapping[str, Description], execution: str = "naive") -> PolicySpec:
     """Return what all policies need; raise ValueError if they differ or cannot be executed so."""
     shared = [field.name for field in dataclasses.fields(PolicyInterface)]
-    (first, expected), *_ = ((name, policy.description) for name, policy in policies.items())
-    for name, policy in policies.items():
+    first, expected = next(iter(policies.items()))
+    for name, description in policies.items():
         for key in (*shared, "metadata"):
-            a, b = getattr(expected, key), getattr(policy.description, key)
+            a, b = getattr(expected, key), getattr(description, key)
             if a != b:
                 raise ValueError(
                     f"{first} and {name} cannot be served together: their {key} is {a} and {b}"
                 )
-        if execution == "trained" and not policy.description.continues:
+        if execution == "trained" and not description.continues:
             raise ValueError(
                 f"{name} was not trained to continue chunks (--optim.rtc-max-delay): choose "
                 "another --execution"

@@ -26,6 +26,7 @@ class StandIn:
         self.metadata = dict(metadata)
         self.spec, self.sizes, self.seconds = spec, (1, 2, 4, 8), seconds
         self.instructions = dict.fromkeys(adapters, instructions)
+        self.routing = "name"
         self.gate, self.failure = threading.Event(), None
         self.batches, self.indices = [], []
         self.gate.set()
