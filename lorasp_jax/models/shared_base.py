@@ -22,11 +22,12 @@ from lorasp_jax.models.inputs import OURS
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.models.transformer.depth import unstack
-from lorasp_jax.peft import Method
+from lorasp_jax.peft import LoRA, Method
 
 _STACK = "/blocks/"
 """In the name of an array that is stacked over layers."""
 _TOWERS = ("vision/", "language/", "action/")
+_RANKS = 16
 _FACTORS = ("lora_a", "lora_b", "u", "v")
 """Names of the factors of a low-rank adapter."""
 
@@ -141,6 +142,7 @@ class SharedBase:
             arrays: the adapter's, by name; stacked layers have leading axes. One with the name of
                 an array of the base replaces it.
         """
+        methods, arrays = _common_ranks(methods, arrays)
         arrays = self._rounded(methods, arrays)
         structure = self._structure(methods, arrays)
         pairs = zip(structure.names, structure.own, strict=True)
@@ -208,6 +210,26 @@ class SharedBase:
             own = tuple(map(places.get, names))
             self._structures[key] = _Structure(graphdef, jax.tree.structure(state), names, own)
         return self._structures[key]
+
+
+def _common_ranks(
+    methods: Mapping[str, Method], arrays: Mapping[str, np.ndarray]
+) -> tuple[dict[str, Method], dict[str, np.ndarray]]:
+    """Return LoRAs as ones of scale 1 whose rank is a multiple of `_RANKS`, padded with zeros.
+
+    Adapters that differ in these, or in settings of training, so share programs and batches.
+    """
+    methods, arrays = dict(methods), dict(arrays)
+    for path, method in methods.items():
+        if type(method) is LoRA:
+            down, up = f"{path}/adapter/lora_a", f"{path}/adapter/lora_b"
+            rank = arrays[down].shape[-1]
+            widen = lambda a, more=-rank % _RANKS: np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, more)])  # noqa: E731
+            arrays[down] = widen(arrays[down])
+            scaled = arrays[up] * np.asarray(method.scale, arrays[up].dtype)
+            arrays[up] = widen(scaled.swapaxes(-1, -2)).swapaxes(-1, -2)
+            methods[path] = LoRA(arrays[down].shape[-1], alpha=arrays[down].shape[-1])
+    return methods, arrays
 
 
 def unstacked(model: Any) -> Any:

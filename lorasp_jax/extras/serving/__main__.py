@@ -179,7 +179,8 @@ def _load(options: argparse.Namespace, console: Console) -> Any:
     exported = all(is_exported(path) or is_bundle(path) for path in named.values())
     policies, load = (_exported if exported else _compiled)(options, named)
     settings = {"prompt": options.prompt, "execution": options.execution, "route": options.route}
-    policy = ServedPolicies(policies, seed=seed, load=load, **settings)
+    together = options.adapters_on_device  # more would not be on the device at once
+    policy = ServedPolicies(policies, seed=seed, load=load, together=together, **settings)
     policy.warm_up(functools.partial(_say, console))
     _say(console, f"ready after {time.monotonic() - start:.0f} s")
     return policy

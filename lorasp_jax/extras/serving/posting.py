@@ -116,7 +116,10 @@ class Adapters:
 
     def listed(self) -> str:
         """Return the adapters as JSON, and how the last change ended."""
-        adapters = [{"name": n, "instructions": t} for n, t in self._policy.instructions.items()]
+        adapters = [
+            {"name": n, "instructions": t, "batches_with": self._policy.companions(n)}
+            for n, t in self._policy.instructions.items()
+        ]
         state = {"adapters": adapters, "loading": len(self._loading), "last": self._last}
         return json.dumps(state) + "\n"
 

@@ -42,10 +42,11 @@ def write_run(source, folder, seed, instructions=TEXTS["press"], config=None, **
     return str(folder)
 
 
-def serve_runs(runs, *, capacity=None, max_batch=2, share=True, **options):
+def serve_runs(runs, *, capacity=None, max_batch=2, share=True, guidance=None, **options):
     """Return `ServedPolicies` of runs by name, on one base."""
     bases, place = Bases(), OnDevice(capacity)
-    compiled = functools.partial(CompiledPolicy, num_steps=2, max_batch=max_batch, place=place)
+    settings = {"num_steps": 2, "max_batch": max_batch, "guidance": guidance, "place": place}
+    compiled = functools.partial(CompiledPolicy, **settings)
 
     def load(run, first=False):
         model = functools.partial(bases.sampler, load=first) if share else None
