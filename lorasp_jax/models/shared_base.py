@@ -6,7 +6,7 @@ the flow steps use once per call. Adapters with equal methods and shapes share t
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -72,6 +72,16 @@ class SharedSampler:
         sampler = Sampler.from_model(self._model(), once=True, fuse=self.fuse)
         return sampler.sample_actions(key, obs, **options)
 
+    @property
+    def replaces_kernels(self) -> bool:
+        """Whether the adapter has whole matrices of its own in place of the base's."""
+        structure = self.structure
+        own = ((n, place) for n, place in zip(structure.names, structure.own, strict=True) if place)
+        return any(
+            "/adapter/" not in name and self.own[k].ndim - (layer is not None) > 1
+            for name, (k, layer) in own
+        )
+
     def array(self, name: str) -> jax.Array:
         """Return an array of the model by its name."""
         pairs = zip(self.structure.names, self._leaves(), strict=True)
@@ -90,6 +100,27 @@ class SharedSampler:
                 array, layer = self.own[place[0]], place[1]
                 leaves.append(array if layer is None else array[layer])
         return leaves
+
+
+def by_row(
+    function: Callable[[SharedSampler, Any], Any],
+    model: SharedSampler,
+    adapters: Sequence[list[jax.Array]],
+    rows: Any,
+) -> Any:
+    """Apply a function to rows that have an adapter each.
+
+    The adapters are stacked, and each product with the base's weights is one for all rows.
+
+    Args:
+        function: of a sampler and a row.
+        model: has the base's weights.
+        adapters: `own` of each row's sampler, all of the same structure.
+        rows: arrays with a leading axis.
+    """
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *adapters)
+    call = lambda own, row: function(dataclasses.replace(model, own=own, fuse=False), row)  # noqa: E731
+    return jax.vmap(call)(stacked, rows)
 
 
 class SharedBase:

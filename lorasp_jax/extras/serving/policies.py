@@ -11,7 +11,7 @@ import numpy as np
 
 from lorasp_jax.extras.serving.exported import Description, sampling_options
 from lorasp_jax.extras.serving.loading import Loaded
-from lorasp_jax.models.shared_base import SharedSampler
+from lorasp_jax.models.shared_base import SharedSampler, by_row
 from lorasp_jax.policies.policy import Observation, Policy
 from lorasp_jax.policies.processor import Processor
 from lorasp_jax.policies.prompt_table import Ids, PromptTable
@@ -98,10 +98,11 @@ def _group(policy: Policy) -> Any:
     """Return what is equal for policies that `sample_mixed` can run together.
 
     They have one base, and adapters of the same layers, methods and shapes, since these make one
-    program; and processors that differ only in numbers, such as statistics.
+    program; and processors that differ only in numbers, such as statistics. Whole kernels in place
+    of the base's would be copied for each row.
     """
     model = policy.model
-    if not isinstance(model, SharedSampler) or not model.own:
+    if not isinstance(model, SharedSampler) or not model.own or model.replaces_kernels:
         return None
     leaves, tree = jax.tree.flatten((model.own, policy.processor))
     # A base has one such object for equal adapters.
@@ -232,22 +233,19 @@ def sample_mixed(
 ) -> jax.Array:
     """Sample `[B, C, J+1]`, each row with a policy of its own; the other arguments are `sample`'s.
 
-    The adapters of all rows are stacked, so that each product with the base's weights is one for
-    all rows.
-
     Args:
         model: with the base's weights.
         policies: of each row the adapter's arrays, and the processor.
     """
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *policies)
+    adapters, processors = zip(*policies, strict=True)
+    processors = jax.tree.map(lambda *leaves: jnp.stack(leaves), *processors)
 
-    def one(policy: tuple[list[jax.Array], Processor], row: Mapping[str, Any]) -> jax.Array:
-        own, processor = policy
-        alone = Policy(dataclasses.replace(model, own=own, fuse=False), processor)
-        row = jax.tree.map(lambda leaf: leaf[None], row)
-        return sample(alone, row, guidance, num_steps=num_steps)[0]
+    def one(model: SharedSampler, row: tuple[Processor, dict[str, Any]]) -> jax.Array:
+        processor, inputs = row
+        inputs = jax.tree.map(lambda leaf: leaf[None], inputs)
+        return sample(Policy(model, processor), inputs, guidance, num_steps=num_steps)[0]
 
-    return jax.vmap(one)(stacked, dict(batch))
+    return by_row(one, model, adapters, (processors, dict(batch)))
 
 
 def _encode(processor: Processor, batch: Mapping[str, Any]) -> Observation:

@@ -12,7 +12,7 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io import native
 from lorasp_jax.extras.serving import policies
 from lorasp_jax.models import presets
-from lorasp_jax.peft import DoRA, LoRA, LoRASP
+from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP
 from lorasp_jax.policies.statistics import Statistics
 from lorasp_jax.training import export
 from tests.cases import mostly_slow
@@ -45,7 +45,7 @@ def rows_of(served, names):
     return adapters, rows
 
 
-CASES = [LoRA(rank=4), LoRASP(rank=8), DoRA(rank=4)]
+CASES = [LoRA(rank=4), LoRASP(rank=8), DoRA(rank=4), AdaLoRA(), LoRAMoE()]
 
 
 @pytest.mark.parametrize("execution", mostly_slow(["naive", "guided"], ["naive"]))
@@ -80,6 +80,8 @@ def test_adapters_that_make_other_programs_have_batches_of_their_own(finished, t
         "rank": make("rank", LoRA(rank=20), 2),
         "layers": make("layers", LoRA(rank=4), 3, "language"),
         "method": make("method", LoRASP(rank=4), 4),
+        "kernels": make("kernels", FullFineTuning(), 6, "language"),
+        "kernels too": make("kernels too", FullFineTuning(), 7, "language"),
     }
     delta = {"inputs": dataclasses.asdict(finished.policy.model.config.inputs) | {"delta": [True]}}
     paths["delta"] = write_run(finished.folder, tmp_path / "delta", 5, config=delta)
