@@ -45,7 +45,9 @@ def rows_of(served, names):
     return adapters, rows
 
 
-TOLERANCE = 5e-4  # rad and m; batches of one and of two copies differ by up to 1e-4
+# rad and m. Rounding alone makes two copies in a batch differ from one by 1e-4, and guidance, which
+# takes derivatives, makes more of it; adapters differ by more than 1.
+TOLERANCES = {"naive": 2e-4, "guided": 5e-3}
 CASES = [LoRA(rank=4), LoRASP(rank=8), DoRA(rank=4), AdaLoRA(), LoRAMoE()]
 
 
@@ -66,11 +68,11 @@ def test_answers_are_those_of_batches_of_one_adapter(method, execution, finished
             row["previous"][:3] = 0.5
     found = served.run_mixed(adapters, rows)
     for adapter, row, actions in zip(adapters, rows, found, strict=True):
-        np.testing.assert_allclose(actions, served.run(adapter, [row])[0], atol=TOLERANCE)
+        np.testing.assert_allclose(
+            actions, served.run(adapter, [row])[0], atol=TOLERANCES[execution]
+        )
     others = served.run_mixed(adapters[1:3] + adapters[:2], rows)
-    assert np.abs(found - others).max(axis=(1, 2)).min() > 100 * TOLERANCE, (
-        "adapters differ far more"
-    )
+    assert np.abs(found - others).max(axis=(1, 2)).min() > 0.5, "adapters differ far more"
 
 
 def test_adapters_that_make_other_programs_have_batches_of_their_own(finished, tmp_path):
