@@ -4,9 +4,9 @@
     python -m benchmarks.adapters --size base --dtype bfloat16 --method lora_sp
 
 Weights are random. "own weights" is a policy served alone, whose adapter is fused with its base in
-advance. A batch of several adapters runs as one batch each, or as one batch whose rows gather their
-adapter from stacked arrays, without fused kernels. --shapes-only computes
-the memory without allocating it.
+advance. A batch of several adapters runs as one batch each, or as the server's mixed batch, whose
+rows have their adapters stacked, without fused kernels. --shapes-only computes the memory without
+allocating it.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.extras.serving.adapters import OnDevice
 from lorasp_jax.models import backbone, presets
 from lorasp_jax.models.observation import Observation, abstract_observation
-from lorasp_jax.models.shared_base import SharedBase, SharedSampler
+from lorasp_jax.models.shared_base import SharedBase, SharedSampler, by_row
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,22 +87,20 @@ def sample(sampler: Any, obs: Observation, noise: jax.Array, *, steps: int) -> j
 
 
 @functools.partial(jax.jit, static_argnames="steps")
-def sample_gathered(
+def sample_mixed(
     sampler: SharedSampler,
-    bank: list[jax.Array],
-    rows: jax.Array,
+    adapters: list[list[jax.Array]],
     obs: Observation,
     noise: jax.Array,
     *,
     steps: int,
 ) -> jax.Array:
-    """Sample with the adapters `rows` `[B]` of a bank of stacked arrays `[K, ...]`."""
+    """Sample each row with an adapter of its own."""
 
-    def one(own: list[jax.Array], obs: Observation, noise: jax.Array) -> jax.Array:
-        obs, noise = jax.tree.map(lambda a: a[None], (obs, noise))
-        return sample(dataclasses.replace(sampler, own=own, fuse=False), obs, noise, steps=steps)[0]
+    def one(sampler: SharedSampler, row: tuple[Observation, jax.Array]) -> jax.Array:
+        return sample(sampler, *jax.tree.map(lambda a: a[None], row), steps=steps)[0]
 
-    return jax.vmap(one)([a[rows] for a in bank], obs, noise)
+    return by_row(one, sampler, adapters, (obs, noise))
 
 
 def device_rows(samplers: list[SharedSampler]) -> list[dict[str, Any]]:
@@ -133,9 +131,7 @@ def batch_rows(
     single = [jax.tree.map(lambda a, i=i: a[i : i + 1], (obs, noise)) for i in range(batch)]
     chosen = [samplers[i % len(samplers)] for i in range(batch)]
     placed = [dataclasses.replace(each, own=jax.device_put(each.own)) for each in chosen]
-    leaves = zip(*(each.own for each in samplers), strict=True)
-    bank = [jnp.stack([jnp.asarray(a) for a in each]) for each in leaves]
-    rows = jnp.arange(batch) % len(samplers)
+    bare, owns = dataclasses.replace(placed[0], own=[]), [each.own for each in placed]
     run, steps_ = functools.partial(sample, steps=steps), {"steps": steps}
     calls = {
         "own weights, 1": (1, lambda: run(alone, *single[0])),
@@ -146,9 +142,9 @@ def batch_rows(
             batch,
             lambda: [run(p, *each) for p, each in zip(placed, single, strict=True)],
         ),
-        f"{batch} adapters, gathered": (
+        f"{batch} adapters, one mixed batch": (
             batch,
-            lambda: sample_gathered(placed[0], bank, rows, obs, noise, **steps_),
+            lambda: sample_mixed(bare, owns, obs, noise, **steps_),
         ),
     }
     table = []

@@ -35,7 +35,7 @@ class Waiting(ServedPolicies):
 
     def __init__(self, image_size: int, cameras: int, seconds: float) -> None:
         names = tuple(f"camera{i}" for i in range(cameras))
-        self.sizes, self.metadata = (1, 2, 4, 8), {}
+        self.sizes, self.together, self.metadata = (1, 2, 4, 8), 1, {}
         self.spec, self._seconds = PolicySpec(names, image_size, 7, 50), seconds
         self.instructions = {"base": ()}
 
@@ -49,9 +49,13 @@ class Waiting(ServedPolicies):
         del adapter, index
         return request.state
 
-    def run(self, adapter: str, rows: Sequence[np.ndarray]) -> np.ndarray:
+    def group(self, adapter: str) -> str:
+        """Return the only adapter."""
+        return adapter
+
+    def run_mixed(self, adapters: Sequence[str], rows: Sequence[np.ndarray]) -> np.ndarray:
         """Return chunks of the states."""
-        del adapter
+        del adapters
         time.sleep(self._seconds)
         return np.repeat(np.stack(rows)[:, None], self.spec.chunk, axis=1)
 

@@ -51,9 +51,10 @@ def unit(name):
     return parser
 
 
-def compose():
-    """Return the compose file with its variables at their defaults."""
-    text = re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", (FOLDER / "compose.yaml").read_text())
+def compose(**values):
+    """Return the compose file with its variables at these values or their defaults."""
+    given = lambda variable: values.get(variable[1], variable[2])  # noqa: E731
+    text = re.sub(r"\$\{(\w+):-([^}]*)\}", given, (FOLDER / "compose.yaml").read_text())
     return yaml.safe_load(text)
 
 
@@ -114,7 +115,9 @@ def test_the_image():
     assert names.index("USER") < names.index("ENTRYPOINT")
     assert "/healthz" in values["HEALTHCHECK"]
     assert yaml.safe_load(values["ENTRYPOINT"]) == ["lorasp-jax", "serve"]
-    parse(serving, yaml.safe_load(values["CMD"]))
+    options = parse(serving, yaml.safe_load(values["CMD"]))
+    assert options.host == "0.0.0.0", "a container's own loopback is out of reach"
+    assert str(options.token_file.parent) == "/home/policy/.cache", "which that user can write"
 
 
 def test_the_image_has_all_of_the_package(tmp_path):
@@ -141,7 +144,10 @@ def test_the_image_has_all_of_the_package(tmp_path):
 def test_the_compose_file():
     file = compose()
     service = file["services"]["policy"]
-    options = parse(serving, service["command"])
+    options = parse(serving, shlex.split(service["command"]))
+    assert options.policy == [("press", "press")]
+    several = compose(POLICY="press=a pour=b --route exact")["services"]["policy"]["command"]
+    assert parse(serving, shlex.split(several)).policy == [("press", "a"), ("pour", "b")]
     assert str(options.token_file) == "/run/secrets/token"
     assert options.host == "0.0.0.0"
     assert service["restart"] == "unless-stopped"

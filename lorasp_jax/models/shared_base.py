@@ -6,7 +6,7 @@ the flow steps use once per call. Adapters with equal methods and shapes share t
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -18,16 +18,23 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io import native
 from lorasp_jax.models.checkpoints.native import by_path
 from lorasp_jax.models.config import BackboneConfig
+from lorasp_jax.models.inputs import OURS
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.models.transformer.depth import unstack
-from lorasp_jax.peft import Method
+from lorasp_jax.peft import LoRA, Method
 
 _STACK = "/blocks/"
 """In the name of an array that is stacked over layers."""
 _TOWERS = ("vision/", "language/", "action/")
+_RANKS = 16
 _FACTORS = ("lora_a", "lora_b", "u", "v")
 """Names of the factors of a low-rank adapter."""
+
+
+def sampling_config(config: BackboneConfig) -> BackboneConfig:
+    """Return a config without what only training reads, or only a policy's processor."""
+    return dataclasses.replace(config, remat="none", unroll=None, inputs=OURS)
 
 
 class _Structure(NamedTuple):
@@ -65,6 +72,16 @@ class SharedSampler:
         sampler = Sampler.from_model(self._model(), once=True, fuse=self.fuse)
         return sampler.sample_actions(key, obs, **options)
 
+    @property
+    def replaces_kernels(self) -> bool:
+        """Whether the adapter has whole matrices of its own in place of the base's."""
+        structure = self.structure
+        own = ((n, place) for n, place in zip(structure.names, structure.own, strict=True) if place)
+        return any(
+            "/adapter/" not in name and self.own[k].ndim - (layer is not None) > 1
+            for name, (k, layer) in own
+        )
+
     def array(self, name: str) -> jax.Array:
         """Return an array of the model by its name."""
         pairs = zip(self.structure.names, self._leaves(), strict=True)
@@ -83,6 +100,27 @@ class SharedSampler:
                 array, layer = self.own[place[0]], place[1]
                 leaves.append(array if layer is None else array[layer])
         return leaves
+
+
+def by_row(
+    function: Callable[[SharedSampler, Any], Any],
+    model: SharedSampler,
+    adapters: Sequence[list[jax.Array]],
+    rows: Any,
+) -> Any:
+    """Apply a function to rows that have an adapter each.
+
+    The adapters are stacked, and each product with the base's weights is one for all rows.
+
+    Args:
+        function: of a sampler and a row.
+        model: has the base's weights.
+        adapters: `own` of each row's sampler, all of the same structure.
+        rows: arrays with a leading axis.
+    """
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *adapters)
+    call = lambda own, row: function(dataclasses.replace(model, own=own, fuse=False), row)  # noqa: E731
+    return jax.vmap(call)(stacked, rows)
 
 
 class SharedBase:
@@ -135,11 +173,22 @@ class SharedBase:
             arrays: the adapter's, by name; stacked layers have leading axes. One with the name of
                 an array of the base replaces it.
         """
+        methods, arrays = _common_ranks(methods, arrays)
         arrays = self._rounded(methods, arrays)
         structure = self._structure(methods, arrays)
         pairs = zip(structure.names, structure.own, strict=True)
         base = [self._arrays[name] for name, place in pairs if place is None]
         return SharedSampler(base, [*arrays.values()], structure, self.config)
+
+    def attach_with(self, adapt: Callable[[Any], Any]) -> SharedSampler:
+        """Return a sampler for what a function adds to a model with the base's shapes.
+
+        The model's values are zeros that take no memory.
+        """
+        graphdef, shapes = nnx.split(self._bare)
+        zeros = lambda x: np.broadcast_to(np.zeros((), x.dtype), x.shape)  # noqa: E731
+        bare = nnx.merge(graphdef, jax.tree.map(zeros, shapes))
+        return self.attach_model(adapt(bare), bare)
 
     def attach_model(self, model: Any, bare: Any) -> SharedSampler:
         """Return a sampler for a model that was adapted from `bare`, from which this base is."""
@@ -192,6 +241,26 @@ class SharedBase:
             own = tuple(map(places.get, names))
             self._structures[key] = _Structure(graphdef, jax.tree.structure(state), names, own)
         return self._structures[key]
+
+
+def _common_ranks(
+    methods: Mapping[str, Method], arrays: Mapping[str, np.ndarray]
+) -> tuple[dict[str, Method], dict[str, np.ndarray]]:
+    """Return LoRAs as ones of scale 1 whose rank is a multiple of `_RANKS`, padded with zeros.
+
+    Adapters that differ in these, or in settings of training, so share programs and batches.
+    """
+    methods, arrays = dict(methods), dict(arrays)
+    for path, method in methods.items():
+        if type(method) is LoRA:
+            down, up = f"{path}/adapter/lora_a", f"{path}/adapter/lora_b"
+            rank = arrays[down].shape[-1]
+            widen = lambda a, more=-rank % _RANKS: np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, more)])  # noqa: E731
+            arrays[down] = widen(arrays[down])
+            scaled = arrays[up] * np.asarray(method.scale, arrays[up].dtype)
+            arrays[up] = widen(scaled.swapaxes(-1, -2)).swapaxes(-1, -2)
+            methods[path] = LoRA(arrays[down].shape[-1], alpha=arrays[down].shape[-1])
+    return methods, arrays
 
 
 def unstacked(model: Any) -> Any:

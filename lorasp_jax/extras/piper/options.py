@@ -31,7 +31,7 @@ def add_shared(parser: argparse.ArgumentParser) -> None:
     add("--server", default="ws://127.0.0.1:8000", help="address (default: %(default)s)")
     add("--token-file", type=Path, metavar="FILE", help="file with the server's token")
     add("--adapter", default="", metavar="NAME", help="one of the server's adapters; default: its "
-        "first")  # fmt: skip
+        "first, or that of the prompt if the server chooses by it")  # fmt: skip
     add("--robot", help="robot of the policy's training; another than the arm is refused unless it "
         "is named here; default: the arm, such as piper, or bi_piper for two")  # fmt: skip
     add("--prompt", action="append", default=[], help="the request in words; several take turns; "

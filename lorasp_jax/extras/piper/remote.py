@@ -18,6 +18,7 @@ _CONTINUATION = ("executed", "delay")  # keys for servers whose chunks continue 
 _WAIT = 300.0  # s to wait for a server that is still compiling
 _SCHEMA = {"robot?": str, "control_dt?": float, "action_dim?": int, "image_size?": int}
 _SCHEMA |= {"cameras?": [str], "adapters?": [str], "instructions?": {str: [str]}, "execution?": str}
+_SCHEMA |= {"route?": str}
 
 
 class Server:
@@ -36,7 +37,9 @@ class Server:
             raise ValueError(f"the server has no adapter {adapter!r}, but {there}")
         self._choice = {"adapter": adapter} if adapter else {}
         trained = client.metadata.get("instructions") or {}
-        self._instructions = trained.get(adapter or next(iter(known), ""), [])
+        routed = (client.metadata.get("route") or "name") != "name"  # by the prompt
+        may_answer = [adapter] if adapter else known if routed else known[:1]
+        self._instructions = [text for name in may_answer for text in trained.get(name, [])]
         self._client = client
         self._lock = threading.Lock()  # a question that nobody waits for any more may be open
         self.ended: str | None = None

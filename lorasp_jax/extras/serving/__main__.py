@@ -17,7 +17,7 @@ from typing import Any
 
 from rich.console import Console
 
-from lorasp_jax.base.arguments import indices, named, pair, positive
+from lorasp_jax.base.arguments import NAME, indices, named, pair, positive
 from lorasp_jax.base.errors import run_command
 from lorasp_jax.extras.serving import manager
 
@@ -63,8 +63,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--port", type=int, default=8000, help="default: %(default)s")
     add("--token-file", type=Path, metavar="FILE", help="file with the token of the clients; "
         "written with a fresh one if there is none, and made readable only by you")  # fmt: skip
-    add("--max-clients", type=positive, default=64, help="maximum number of connections (default: "
-        "%(default)s)")  # fmt: skip
+    add("--max-clients", type=positive, help="maximum number of connections (default: 64)")
     add("--prompt", default="", help="instruction of requests that have none")
     add("--max-batch", type=int, help="largest batch (default: 8)")
     add("--num-steps", type=int, help="flow steps (default: 10)")
@@ -121,14 +120,15 @@ def _serve(options: argparse.Namespace, console: Console) -> None:
     if options.vla_eval:
         from lorasp_jax.extras.serving import vla_eval  # before what takes long
 
-        _refuse(options, ("token_file",), "has no effect with --vla-eval")
+        _refuse(options, ("token_file", "max_clients"), "has no effect with --vla-eval")
     token = _read_token(options.token_file, console)
     with server.bind(options.host, options.port, token=token) as port:  # before what takes long
         policy: Any = _load(options, console)
         if options.vla_eval:
             policy_server: Any = vla_eval.VlaEvalServer(policy, options.vla_eval)
         else:
-            more = {"max_clients": options.max_clients, "about": _about(options)}
+            limit = {"max_clients": options.max_clients} if options.max_clients else {}
+            more = {**limit, "about": _about(options)}
             policy_server = server.PolicyServer(policy, token=token, **more)
         answers = asyncio.run(_run(policy_server, port, console))
     if not answers:
@@ -176,15 +176,19 @@ def _load(options: argparse.Namespace, console: Console) -> Any:
     from lorasp_jax.extras.serving.served import ServedPolicies
 
     named, start = dict(options.policy), time.monotonic()
-    if len(named) < len(options.policy):
+    names = [name for name, _ in (*options.policy, *options.adapter)]
+    if len({*names}) < len(names):
         raise ValueError("the policies must have different names: pass NAME=POLICY")
+    if unfit := [name for name in names if not NAME.fullmatch(name)]:
+        raise ValueError(f"names must match {NAME.pattern}, got {unfit[0]!r}: pass NAME=POLICY")
     cache.enable()
     seed = secrets.randbelow(2**31) if options.seed is None else options.seed
     _say(console, f"loading {', '.join(named.values())} with --seed {seed}")
     exported = all(is_exported(path) or is_bundle(path) for path in named.values())
     policies, load = (_exported if exported else _compiled)(options, named)
     settings = {"prompt": options.prompt, "execution": options.execution, "route": options.route}
-    policy = ServedPolicies(policies, seed=seed, load=load, **settings)
+    together = options.adapters_on_device  # more would not be on the device at once
+    policy = ServedPolicies(policies, seed=seed, load=load, together=together, **settings)
     policy.warm_up(functools.partial(_say, console))
     _say(console, f"ready after {time.monotonic() - start:.0f} s")
     return policy

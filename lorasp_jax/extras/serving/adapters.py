@@ -12,7 +12,7 @@ import numpy as np
 
 from lorasp_jax import peft
 from lorasp_jax.adapters.io import native
-from lorasp_jax.models.shared_base import SharedBase, SharedSampler
+from lorasp_jax.models.shared_base import SharedBase, SharedSampler, sampling_config
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training.base import quantized
 from lorasp_jax.training.export import RecordedPolicy
@@ -62,7 +62,7 @@ class Bases:
     def __init__(self, *, any_base: bool = False) -> None:
         """Start without a base; `any_base` accepts adapters of another, see `load_adapters`."""
         self._any_base = any_base
-        self._bases: list[tuple[Any, str | None, str, SharedBase]] = []
+        self._bases: list[tuple[Any, str, SharedBase]] = []
 
     def sampler(self, recorded: RecordedPolicy, *, load: bool = True) -> SharedSampler:
         """Return a sampler for a run.
@@ -82,9 +82,8 @@ class Bases:
         saved, digest = description["weights"], description["base"]
         if not saved and not self._any_base:
             raise ValueError(f"{folder} has no fingerprints of its base: --any-base accepts it")
-        fitting = [
-            (d, b) for config, q, d, b in self._bases if (config, q) == (recorded.config, kind)
-        ]
+        needed = sampling_config(recorded.config), kind
+        fitting = [(d, base) for has, d, base in self._bases if has == needed]
         # Quantized kernels have no fingerprints of their own.
         known = [b for d, b in fitting if b.matches(saved) and (not kind or d == digest)]
         if self._any_base and not load:
@@ -97,7 +96,7 @@ class Bases:
                 "config: serve it on its own"
             )
         base = SharedBase(recorded.load_base(), functools.partial(quantized, kind=kind))
-        self._bases.append((recorded.config, kind, digest, base))
+        self._bases.append((needed, digest, base))
         return base.read(folder, any_base=self._any_base)
 
     @staticmethod

@@ -26,6 +26,7 @@ from lorasp_jax.extras.serving import exported
 from lorasp_jax.extras.serving.exported import Description
 from lorasp_jax.extras.serving.loading import Loaded
 from lorasp_jax.extras.serving.policies import batch_sizes, describe, sample, without_prompts
+from lorasp_jax.extras.serving.served import common_spec
 from lorasp_jax.models.shared_base import SharedSampler
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.statistics import Statistics
@@ -81,7 +82,7 @@ def write_bundle(
         max_batch: largest batch; see `batch_sizes`.
 
     Raises:
-        ValueError: as for `write`.
+        ValueError: as for `write`, or the policies cannot be served together.
     """
     folder, traced = Path(folder), _Programs()
     settings: Any = {"num_steps": num_steps, "max_batch": max_batch}
@@ -91,6 +92,7 @@ def write_bundle(
         )
         for name, each in policies.items()
     }
+    common_spec(descriptions)
     with locked(folder), atomic_folder(folder) as unfinished:
         base: dict[str, np.ndarray] = {}
         contents = {}

@@ -1,6 +1,7 @@
 """Load what a server serves: finished runs, or a published checkpoint with or without adapters."""
 
 import dataclasses
+import functools
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -46,9 +47,12 @@ class Loaded:
     base: SharedBase | None = None
 
     def with_adapters(self, folder: str, any_base: bool = False) -> "Loaded":
-        """Return this policy with other adapters on its shared base; see `load_adapters`."""
+        """Return this policy with other adapters on its shared base; see `load_checkpoint`."""
         assert self.base is not None
-        model = self.base.read(folder, any_base=any_base)
+        if _is_peft(folder):
+            model = self.base.attach_with(functools.partial(_with_peft, folder))
+        else:
+            model = self.base.read(folder, any_base=any_base)
         return replace(self, policy=replace(self.policy, model=model))
 
 
@@ -166,7 +170,15 @@ def _processor(
 
 def _adapted(where: str, model: Backbone, any_base: bool) -> Backbone:
     """Return the model with the adapters of a folder."""
-    if hub.is_remote(where) or (Path(where) / hugging_face.CONFIG).exists():
-        print(f"{where} has no digest of its base: taking this checkpoint", file=sys.stderr)
-        return lorasp_jax.load_peft(where, model, names=lorasp_jax.models.lerobot_names(model))
+    if _is_peft(where):
+        return _with_peft(where, model)
     return lorasp_jax.load_adapters(where, model, any_base=any_base)
+
+
+def _is_peft(where: str) -> bool:
+    return hub.is_remote(where) or (Path(where) / hugging_face.CONFIG).exists()
+
+
+def _with_peft(where: str, model: Backbone) -> Backbone:
+    print(f"{where} has no digest of its base: taking this checkpoint", file=sys.stderr)
+    return lorasp_jax.load_peft(where, model, names=lorasp_jax.models.lerobot_names(model))

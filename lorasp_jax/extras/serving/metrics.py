@@ -2,7 +2,7 @@
 
 import bisect
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _BOUNDS = (
@@ -36,6 +36,12 @@ class Histogram:
         self._counts[adapter][bisect.bisect_left(_BOUNDS, seconds)] += 1
         self._sums[adapter] += seconds
 
+    def keep(self, adapters: Container[str]) -> None:
+        """Forget all other adapters."""
+        for adapter in [*self._counts]:
+            if adapter not in adapters:
+                del self._counts[adapter], self._sums[adapter]
+
     def lines(self, name: str) -> list[str]:
         """Return the series; buckets are cumulative."""
         lines = [f"# TYPE {name} histogram"]
@@ -49,18 +55,22 @@ class Histogram:
         return lines
 
 
-def text(counts: Mapping[str, int], histograms: Mapping[str, Histogram]) -> str:
-    """Return all series of a server.
+def text(
+    counts: Mapping[str, int], histograms: Mapping[str, Histogram], adapters: Container[str]
+) -> str:
+    """Return all series of a server, and forget those of adapters that it no longer has.
 
     Args:
         counts: of `PolicyServer`.
         histograms: by what they measure, such as request_seconds.
+        adapters: those of the server.
     """
     lines = []
     for name, value in list(counts.items()):
         full = f"lorasp_jax_{name}" if name in _GAUGES else f"lorasp_jax_{name}_total"
         lines += [f"# TYPE {full} {'gauge' if name in _GAUGES else 'counter'}", f"{full} {value}"]
     for name, histogram in histograms.items():
+        histogram.keep(adapters)
         lines += histogram.lines(f"lorasp_jax_{name}")
     return "\n".join(lines) + "\n"
 

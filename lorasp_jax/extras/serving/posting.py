@@ -16,15 +16,21 @@ from typing import TYPE_CHECKING, Any
 
 from websockets.asyncio.server import ServerConnection
 
+from lorasp_jax.base import errors
+
 if TYPE_CHECKING:  # which imports JAX
     from lorasp_jax.extras.serving.served import ServedPolicies
 
 MAX_HEAD, MAX_BODY = 2**14, 2**16
 """Largest head and body of a POST [bytes]."""
-WAIT = 5.0
-"""How long a POST waits for an adapter to load [s]; loading then goes on without it."""
+PATIENCE, WAIT = 4.0, 5.0
+"""How long a body may take after its head, and how long a POST waits for an adapter to load, which
+then goes on without it [s]; a connection that has no answer after 10 s is closed."""
 _log = logging.getLogger(__name__)
 _LENGTH = re.compile(rb"\r\ncontent-length:[ \t]*(\d{1,9})[ \t]*(?=\r\n)", re.IGNORECASE)
+_ENCODING = re.compile(rb"\r\ntransfer-encoding:[^\r\n]*(?=\r\n)", re.IGNORECASE)
+Answer = tuple[http.HTTPStatus, str]
+"""Status and text of a response."""
 
 
 class Connection(ServerConnection):
@@ -32,10 +38,13 @@ class Connection(ServerConnection):
 
     Attributes:
         body: of a POST, at most `MAX_BODY` bytes; None for other requests.
+        refusal: why the body was not read to its end, if so.
     """
 
     body: bytes | None = None
+    refusal: Answer | None = None
     _received: bytes | None = b""
+    _timer: asyncio.TimerHandle | None = None
 
     def data_received(self, data: bytes) -> None:
         """Collect a POST; pass on everything else."""
@@ -53,9 +62,26 @@ class Connection(ServerConnection):
         length = _LENGTH.search(head + b"\r\n")
         size = int(length[1]) if length else 0
         if (not end and len(head) <= MAX_HEAD) or (end and len(body) < size <= MAX_BODY):
+            if end and not self._timer:
+                self._timer = self.loop.call_later(PATIENCE, self._give_up)
             return  # more is to come
-        self._received, self.body = None, body[:size] if size <= MAX_BODY else b""
-        head = _LENGTH.sub(b"", head + b"\r\n").removeprefix(b"POST ")
+        if not length:
+            self.refusal = http.HTTPStatus.LENGTH_REQUIRED, "send Content-Length, not chunks\n"
+        self._pass_on(head, body[:size] if size <= MAX_BODY else b"")
+
+    def _give_up(self) -> None:
+        """Answer a POST whose body has not come."""
+        if self._received is not None and not self.transport.is_closing():
+            text = f"the body did not come within {PATIENCE:g} s\n"
+            self.refusal = http.HTTPStatus.REQUEST_TIMEOUT, text
+            self._pass_on(self._received.partition(b"\r\n\r\n")[0], b"")
+
+    def _pass_on(self, head: bytes, body: bytes) -> None:
+        """Hand a POST to the library, without what it refuses to read."""
+        if self._timer:
+            self._timer.cancel()
+        self._received, self.body = None, body
+        head = _ENCODING.sub(b"", _LENGTH.sub(b"", head + b"\r\n")).removeprefix(b"POST ")
         super().data_received(b"GET " + head + b"\r\n")
 
 
@@ -90,14 +116,17 @@ class Adapters:
 
     def listed(self) -> str:
         """Return the adapters as JSON, and how the last change ended."""
-        adapters = [{"name": n, "instructions": t} for n, t in self._policy.instructions.items()]
+        adapters = [
+            {"name": n, "instructions": t, "batches_with": self._policy.companions(n)}
+            for n, t in self._policy.instructions.items()
+        ]
         return json.dumps({"adapters": adapters, **self.state()}) + "\n"
 
     def state(self) -> dict[str, Any]:
         """Return how many changes are under way, and how the last ended."""
         return {"loading": len(self._loading), "last": self._last}
 
-    async def change(self, body: bytes) -> tuple[http.HTTPStatus, str]:
+    async def change(self, body: bytes) -> Answer:
         """Do what a body says; return the status of the response and a sentence."""
         try:
             call, said = self._parse(body)
@@ -117,10 +146,11 @@ class Adapters:
         """Change the adapters in another thread, and remember how it ended."""
         try:
             await _in_daemon(call)
-        except ValueError as error:
-            self._last = str(error)
-            return http.HTTPStatus.BAD_REQUEST
-        except Exception as error:  # a bug must not show the client a traceback
+        except Exception as error:
+            if reason := errors.describe(error):
+                self._last = reason
+                return http.HTTPStatus.BAD_REQUEST
+            # A bug must not show the client a traceback.
             _log.exception("an adapter was not loaded")
             self._last = f"the server failed: {type(error).__name__}"
             return http.HTTPStatus.INTERNAL_SERVER_ERROR

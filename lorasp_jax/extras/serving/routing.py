@@ -21,16 +21,22 @@ Instructions = Mapping[str, Sequence[str]]
 """Instructions by adapter."""
 
 
-def exact(prompt: str, instructions: Instructions) -> str:
-    """Return the adapter with this instruction, "" if there is none.
+def trained(prompt: str, instructions: Sequence[str]) -> str:
+    """Return the instruction that a prompt is, "" if it is none of them.
 
-    Case, spaces and a final punctuation mark do not matter.
+    Case, spaces and a final punctuation mark do not matter, unless instructions differ in these.
+    """
+    same = [text for text in instructions if _plain(text) == _plain(prompt)]
+    return prompt if prompt in same else next(iter(same), "")
+
+
+def exact(prompt: str, instructions: Instructions) -> str:
+    """Return the adapter that was trained with an instruction, see `trained`; "" if none was.
 
     Raises:
         ValueError: several adapters have it.
     """
-    wanted = _plain(prompt)
-    found = [name for name, texts in instructions.items() if wanted in map(_plain, texts)]
+    found = [name for name, texts in instructions.items() if trained(prompt, texts)]
     if len(found) > 1:
         raise ValueError(f"{prompt!r} is an instruction of {', '.join(found)}: name the adapter")
     return found[0] if found else ""

@@ -15,8 +15,13 @@ import numpy as np
 from lorasp_jax.base.arguments import NAME
 from lorasp_jax.extras.serving import routing
 from lorasp_jax.extras.serving.adapters import embed, is_shared
-from lorasp_jax.extras.serving.exported import ExportedPolicy, PolicyInterface, build_row
-from lorasp_jax.extras.serving.policies import CACHED_PROMPTS, CompiledPolicy
+from lorasp_jax.extras.serving.exported import (
+    Description,
+    ExportedPolicy,
+    PolicyInterface,
+    build_row,
+)
+from lorasp_jax.extras.serving.policies import CACHED_PROMPTS, CompiledPolicy, run_mixed
 from lorasp_jax.extras.serving.requests import PolicySpec, Request
 
 _log = logging.getLogger(__name__)
@@ -30,11 +35,15 @@ class Adapter:
         name: its name.
         policy: the policy.
         warned: whether the log was told of an absurd state.
+        group: equal for adapters that can share a batch.
     """
 
     name: str
     policy: CompiledPolicy | ExportedPolicy
     warned: bool = False
+
+    def __post_init__(self) -> None:
+        self.group: Any = getattr(self.policy, "group", None) or object()
 
     def __str__(self) -> str:
         """Return the name."""
@@ -53,7 +62,11 @@ class ServedPolicies:
         spec: what requests must have, and what is returned.
         metadata: what the first policy's run says of its robot.
         sizes: batch sizes, ascending.
+        together: how many adapters a batch may have.
+        routing: how requests without a name find their adapter, one of `routing.MODES`.
     """
+
+    routing: str = "name"
 
     def __init__(
         self,
@@ -64,6 +77,7 @@ class ServedPolicies:
         execution: str = "naive",
         route: str = "name",
         load: Callable[[str], CompiledPolicy] | None = None,
+        together: int | None = None,
     ) -> None:
         """Check that the policies fit; `warm_up` compiles.
 
@@ -76,19 +90,22 @@ class ServedPolicies:
                 Exported policies cannot be guided.
             route: one of `routing.MODES`; "nearest" needs policies on a `SharedBase`.
             load: loads another adapter from a path, for `put`; None: adapters do not change.
+            together: how many adapters a batch may have; None: as many as there are rows.
 
         Raises:
             ValueError: the policies need different observations or are of different robots, or
                 cannot continue chunks as `execution` demands.
         """
-        self._prompt, self._route, self._load = prompt, route, load
-        self.spec: PolicySpec = _common_spec(policies, execution)
+        self._prompt, self._load = prompt, load
+        self.routing = route
+        self.spec: PolicySpec = common_spec(_descriptions(policies), execution)
         self.metadata: dict[str, Any] = dict(next(iter(policies.values())).description.metadata)
         self._adapters = {name: Adapter(name, policy) for name, policy in policies.items()}
         self._default = next(iter(policies))
         self._change = threading.Lock()
         sizes = [set(policy.description.batch_sizes) for policy in policies.values()]
         self.sizes: tuple[int, ...] = tuple(sorted(set.intersection(*sizes)))
+        self.together: int = together or self.sizes[-1]
         # The key is an argument, as a constant would make a program of its own for every seed.
         self._key = jax.random.key(seed)
         self._draw = jax.jit(jax.vmap(draw_noise, (None, 0, None)), static_argnums=2)
@@ -112,20 +129,33 @@ class ServedPolicies:
 
     def warm_up(self, say: Callable[[str], None] = lambda _: None) -> None:
         """Compile and run every program; `say` is told of each before it starts."""
-        programs = list(itertools.product(self.adapters, self.sizes))
-        for number, (adapter, size) in enumerate(programs, start=1):
-            say(f"compiling {adapter.name}, batch {size} ({number} of {len(programs)})")
-            self._try_out(adapter, size)
+        alone = [(each,) for each in self.adapters]
+        programs = [*itertools.product(alone, self.sizes), *self._mixtures(self.adapters)]
+        for number, (adapters, size) in enumerate(programs, start=1):
+            names = " with ".join(map(str, adapters))
+            say(f"compiling {names}, batch {size} ({number} of {len(programs)})")
+            self._try_out(adapters, size)
 
-    def _try_out(self, adapter: Adapter, size: int) -> None:
-        """Run a batch twice, which compiles the program if no other adapter has the same."""
-        spec = self.spec
+    def _mixtures(self, adapters: Sequence[Adapter]) -> list[tuple[tuple[Adapter, ...], int]]:
+        """Return two adapters of each group that has as many, with each size of their batches."""
+        by_group: dict[Any, list[Adapter]] = {}
+        for each in adapters:
+            by_group.setdefault(each.group, []).append(each)
+        pairs = [(*each[:2],) for each in by_group.values() if len(each) > 1 < self.together]
+        return [*itertools.product(pairs, self.sizes[1:])]
+
+    def _try_out(self, adapters: Sequence[Adapter], size: int) -> None:
+        """Run a batch twice, which compiles the program if no other adapters have the same."""
+        spec, turns = self.spec, [*itertools.islice(itertools.cycle(adapters), size)]
         picture = np.zeros((spec.image_size, spec.image_size, 3), np.uint8)
         images, state = dict.fromkeys(spec.cameras, picture), np.zeros(spec.state_dim, np.float32)
-        prompt = (self._prompt, *adapter.policy.instructions, "press the button")
-        request = Request(images, state, next(filter(None, prompt)))
+        rows = []
+        for adapter in turns:
+            prompt = (self._prompt, *adapter.policy.instructions, "press the button")
+            request = Request(images, state, next(filter(None, prompt)))
+            rows.append(self._row(adapter, request, (0, 0)))
         for _ in range(2):
-            self.run(adapter, [self._row(adapter, request, (0, 0))] * size)
+            self.run_mixed(turns, rows)
 
     def put(self, name: str, path: str) -> None:
         """Load an adapter and serve it from the next batch on, in place of one of the same name.
@@ -145,10 +175,13 @@ class ServedPolicies:
             raise ValueError(f"name must match {NAME.pattern}, got {name[:80]!r}")
         with self._change:  # one at a time
             adapter, first = Adapter(name, self._load(path)), self._adapters[self._default]
-            present = f"the present {first.name}"
-            _common_spec({present: first.policy, name: adapter.policy}, self.spec.execution)
-            for size in self.sizes:
-                self._try_out(adapter, size)
+            both = {f"the present {first.name}": first.policy, name: adapter.policy}
+            common_spec(_descriptions(both), self.spec.execution)
+            others = [each for each in self.adapters if each.name != name]
+            same = [each for each in others if each.group == adapter.group][:1]
+            alone = itertools.product([(adapter,)], self.sizes)
+            for adapters, size in (*alone, *self._mixtures([adapter, *same])):
+                self._try_out(adapters, size)
             self._adapters = self._adapters | {name: adapter}
 
     def remove(self, name: str) -> None:
@@ -163,6 +196,16 @@ class ServedPolicies:
             self._find(name)
             self._adapters = {n: each for n, each in self._adapters.items() if n != name}
 
+    def group(self, adapter: Adapter) -> Any:
+        """Return what is equal for adapters whose requests can share a batch."""
+        return adapter.group
+
+    def companions(self, name: str) -> list[str]:
+        """Return the adapters whose requests share batches with one's, see `policies.run_mixed`."""
+        group = self._find(name).group
+        found = [each.name for each in self.adapters if each.group == group and each.name != name]
+        return found if self.together > 1 else []
+
     def _find(self, name: str) -> Adapter:
         adapters = self._adapters
         if name not in adapters:
@@ -176,14 +219,14 @@ class ServedPolicies:
             ValueError: there is no such adapter, or the instruction is not clearly of one.
         """
         prompt, known = request.prompt or self._prompt, self.instructions
-        if request.adapter or self._route == "name":
+        if request.adapter or self.routing == "name":
             return self._find(request.adapter or self._default)
         if not prompt:
             raise ValueError("the request must contain a prompt, or name an adapter")
         if name := routing.exact(prompt, known):
             return self._find(name)
         said = f"{', '.join(known)} were trained for others"
-        if self._route == "nearest":
+        if self.routing == "nearest":
             name, said = routing.nearest(prompt, known, self._embed)
         if not name:
             raise ValueError(f"no adapter is for {prompt!r}: {said}; name the adapter")
@@ -215,6 +258,7 @@ class ServedPolicies:
         prompt = request.prompt or self._prompt or (known[0] if len(known) == 1 else "")
         if not prompt:
             raise ValueError("the request must contain a prompt")
+        prompt = routing.trained(prompt, known) or prompt
         rest = None
         if execution != "naive":
             rest = np.zeros((0, self.spec.action_length), np.float32)
@@ -241,11 +285,22 @@ class ServedPolicies:
 
     def run(self, adapter: Adapter, rows: Sequence[dict[str, Any]]) -> np.ndarray:
         """Return actions f32 `[B, C, J+1]`; B is one of `sizes`."""
+        return adapter.policy.run(self._batch(adapter, rows))
+
+    def run_mixed(self, adapters: Sequence[Adapter], rows: Sequence[dict[str, Any]]) -> np.ndarray:
+        """Return actions f32 `[B, C, J+1]` of the adapters of B rows, all of one group."""
+        if len({*adapters}) == 1:
+            return self.run(adapters[0], rows)
+        policies = [each.policy for each in adapters]
+        return run_mixed(policies, self._batch(adapters[0], rows))  # type: ignore[arg-type]
+
+    def _batch(self, adapter: Adapter, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        """Stack rows, and draw their noise."""
         batch = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
         description = adapter.policy.description
         shape = description.chunk, description.action_dim
         noise = self._draw(self._key, batch.pop("index"), shape)
-        return adapter.policy.run({**batch, "noise": noise})
+        return {**batch, "noise": noise}
 
 
 def draw_noise(key: jax.Array, index: jax.Array, shape: tuple[int, ...]) -> jax.Array:
@@ -261,20 +316,24 @@ def draw_noise(key: jax.Array, index: jax.Array, shape: tuple[int, ...]) -> jax.
     return jax.random.normal(key, shape)
 
 
-def _common_spec(
-    policies: Mapping[str, CompiledPolicy | ExportedPolicy], execution: str
-) -> PolicySpec:
+def _descriptions(
+    policies: Mapping[str, CompiledPolicy | ExportedPolicy],
+) -> dict[str, Description]:
+    return {name: policy.description for name, policy in policies.items()}
+
+
+def common_spec(policies: Mapping[str, Description], execution: str = "naive") -> PolicySpec:
     """Return what all policies need; raise ValueError if they differ or cannot be executed so."""
     shared = [field.name for field in dataclasses.fields(PolicyInterface)]
-    (first, expected), *_ = ((name, policy.description) for name, policy in policies.items())
-    for name, policy in policies.items():
+    first, expected = next(iter(policies.items()))
+    for name, description in policies.items():
         for key in (*shared, "metadata"):
-            a, b = getattr(expected, key), getattr(policy.description, key)
+            a, b = getattr(expected, key), getattr(description, key)
             if a != b:
                 raise ValueError(
                     f"{first} and {name} cannot be served together: their {key} is {a} and {b}"
                 )
-        if execution == "trained" and not policy.description.continues:
+        if execution == "trained" and not description.continues:
             raise ValueError(
                 f"{name} was not trained to continue chunks (--optim.rtc-max-delay): choose "
                 "another --execution"

@@ -137,7 +137,8 @@ class PolicyServer:
         self, connection: ServerConnection, request: HttpRequest
     ) -> Response | Awaitable[Response] | None:
         """Answer pages, and refuse connections without the token or beyond the limit."""
-        posted = connection.body if isinstance(connection, posting.Connection) else None
+        assert isinstance(connection, posting.Connection)
+        posted = connection.body
         if posted is not None and request.path != "/adapters":
             text = "POST is for /adapters\n"
             return connection.respond(http.HTTPStatus.METHOD_NOT_ALLOWED, text)
@@ -156,12 +157,14 @@ class PolicyServer:
             return self._watched(request.path)
         if request.path == "/metrics":
             histograms = {"request_seconds": self._seconds, "batch_seconds": self._batcher.seconds}
-            page = connection.respond(http.HTTPStatus.OK, metrics.text(self.counts, histograms))
+            text = metrics.text(self.counts, histograms, self._policy.instructions)
+            page = connection.respond(http.HTTPStatus.OK, text)
             del page.headers["Content-Type"]
             page.headers["Content-Type"] = metrics.CONTENT_TYPE
             return page
         if request.path == "/adapters":
-            return self._change_adapters(connection, posted)
+            refused = connection.refusal
+            return connection.respond(*refused) if refused else self._change(connection, posted)
         return None
 
     def _refusal(self, request: HttpRequest) -> tuple[http.HTTPStatus, str] | None:
@@ -195,7 +198,7 @@ class PolicyServer:
         more |= {"max_clients": self._max_clients, "server": SERVER, **self._adapters.state()}
         return watching.json_page(self._watch.status(**self.counts, **more))
 
-    async def _change_adapters(self, connection: ServerConnection, body: bytes | None) -> Response:
+    async def _change(self, connection: ServerConnection, body: bytes | None) -> Response:
         """Answer a GET or POST of /adapters."""
         if body is None:
             return connection.respond(http.HTTPStatus.OK, self._adapters.listed())
@@ -296,6 +299,7 @@ def describe(policy: "ServedPolicies") -> dict[str, Any]:
         "adapters": list(policy.instructions),
         "instructions": {name: list(texts) for name, texts in policy.instructions.items()},
         "execution": spec.execution,
+        "route": policy.routing,
         **policy.metadata,
     }
 

@@ -16,6 +16,7 @@ from collections.abc import AsyncIterator, Mapping, Sequence
 from typing import Any
 
 import anyio
+import anyio.to_thread
 from vla_eval.model_servers.base import SessionContext
 from vla_eval.model_servers.predict import PredictModelServer
 from vla_eval.model_servers.serve import serve_async
@@ -23,7 +24,7 @@ from vla_eval.specs import IMAGE_RGB, LANGUAGE, DimSpec
 
 from lorasp_jax.extras.serving.batching import padded
 from lorasp_jax.extras.serving.requests import Request, parse
-from lorasp_jax.extras.serving.served import Adapter, ServedPolicies
+from lorasp_jax.extras.serving.served import ServedPolicies
 
 
 class VlaEvalServer(PredictModelServer):
@@ -54,29 +55,32 @@ class VlaEvalServer(PredictModelServer):
         self._policies = policies
         self._episodes: dict[str, int] = {}
 
+    async def on_observation(self, obs: dict[str, Any], ctx: SessionContext) -> None:
+        """Answer an observation; one that has no answer is refused before it is in a batch.
+
+        Raises:
+            ValueError: the policy cannot answer it, in a sentence for the client.
+        """
+        row = await anyio.to_thread.run_sync(self._row, obs, ctx)
+        await super().on_observation(row, ctx)
+
     def predict_batch(
         self, obs_batch: list[dict[str, Any]], ctx_batch: list[SessionContext]
     ) -> list[dict[str, Any]]:
-        """Return a chunk, f32 `[C, A]`, as "actions" of each observation.
-
-        Raises:
-            ValueError: the policy cannot answer an observation, in a sentence for the client.
-        """
-        sizes, pairs = self._policies.sizes, zip(obs_batch, ctx_batch, strict=True)
-        adapters, rows = zip(*(self._row(*pair) for pair in pairs), strict=True)
-        chunks: list[Any] = []
+        """Return a chunk, f32 `[C, A]`, as "actions" of each result of `_row`."""
+        del ctx_batch
+        sizes, adapter = self._policies.sizes, obs_batch[0]["adapter"]  # there is one
+        rows, chunks = [each["row"] for each in obs_batch], []
         for start in range(0, len(rows), sizes[-1]):  # clients may raise max_batch_size
-            batch = [*rows[start : start + sizes[-1]]]
-            chunks += [*self._policies.run(adapters[0], padded(batch, sizes))[: len(batch)]]
+            batch = rows[start : start + sizes[-1]]
+            chunks += [*self._policies.run(adapter, padded(batch, sizes))[: len(batch)]]
         return [{"actions": chunk} for chunk in chunks]
 
-    def _row(
-        self, observation: Mapping[str, Any], context: SessionContext
-    ) -> tuple[Adapter, dict[str, Any]]:
+    def _row(self, observation: Mapping[str, Any], context: SessionContext) -> dict[str, Any]:
         request = read(observation, self._policies)
         index = self._episodes[context.session_id], context.step
-        adapter = self._policies.route(request)  # there is one
-        return adapter, self._policies.prepare(adapter, request, index)
+        adapter = self._policies.route(request)
+        return {"adapter": adapter, "row": self._policies.prepare(adapter, request, index)}
 
     async def on_episode_start(self, config: dict[str, Any], ctx: SessionContext) -> None:
         """Forget the last chunk; choose the episode's noise."""

@@ -24,23 +24,29 @@ TEXTS = {
 }
 
 
-def write_run(source, folder, seed, instructions=TEXTS["press"]):
-    """Write a run like that in `source`, with other adapters and instructions."""
+def write_run(source, folder, seed, instructions=TEXTS["press"], config=None, **said):
+    """Write a run like that in `source`, with other adapters and instructions.
+
+    `config` has fields of the model's config, and `said` those of the run's metadata.
+    """
     policy, metadata = export.load_policy(source), export.describe(source)
     words = loading.load_run(str(source)).words
     prompts = PromptTable.of(words, instructions, policy.model.config, num_joints=6)
     fields = {"instructions": [*instructions], "prompts": export._prompts_digest(prompts)}
     metadata["policy"] |= fields
+    metadata["policy"]["config"] |= config or {}
+    metadata |= said
     graphdef, adapters, frozen = adaptation.split(policy.model)
     model = nnx.merge(graphdef, with_noise(adapters, 0.3, seed), frozen)
     native.save_adapters(folder, model, metadata=metadata)
     return str(folder)
 
 
-def serve_runs(runs, *, capacity=None, max_batch=2, share=True, **options):
+def serve_runs(runs, *, capacity=None, max_batch=2, share=True, guidance=None, **options):
     """Return `ServedPolicies` of runs by name, on one base."""
     bases, place = Bases(), OnDevice(capacity)
-    compiled = functools.partial(CompiledPolicy, num_steps=2, max_batch=max_batch, place=place)
+    settings = {"num_steps": 2, "max_batch": max_batch, "guidance": guidance, "place": place}
+    compiled = functools.partial(CompiledPolicy, **settings)
 
     def load(run, first=False):
         model = functools.partial(bases.sampler, load=first) if share else None

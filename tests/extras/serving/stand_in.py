@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import threading
 import time
+from typing import ClassVar
 
 import numpy as np
 
@@ -19,13 +20,16 @@ class StandIn:
 
     `indices` keeps the numbers of connections and of requests on them, `gate` holds every batch
     back until it is set, `seconds` is the time a batch takes, and `failure` is raised instead of an
-    answer.
+    answer. Adapters that `groups` maps to the same name share batches.
     """
+
+    groups: ClassVar[dict[str, str]] = {}
 
     def __init__(self, spec=SPEC, *, seconds=0.0, adapters=("base",), instructions=(), metadata=()):
         self.metadata = dict(metadata)
         self.spec, self.sizes, self.seconds = spec, (1, 2, 4, 8), seconds
         self.instructions = dict.fromkeys(adapters, instructions)
+        self.routing, self.together = "name", 8
         self.gate, self.failure = threading.Event(), None
         self.batches, self.indices = [], []
         self.gate.set()
@@ -48,14 +52,25 @@ class StandIn:
         first = request.images[self.spec.cameras[0]]
         return request.state + index[1] + first.mean(dtype=np.float32)
 
-    def run(self, adapter, rows):
-        self.batches.append((adapter, len(rows)))
+    def group(self, adapter):
+        return self.groups.get(adapter, adapter)
+
+    def companions(self, adapter):
+        group = self.group(adapter)
+        return [each for each in self.instructions if self.group(each) == group and each != adapter]
+
+    def run_mixed(self, adapters, rows):
+        self.batches.append((" ".join(dict.fromkeys(map(str, adapters))), len(rows)))
         self.gate.wait()
         time.sleep(self.seconds)
         if self.failure:
             raise self.failure
-        offset = list(self.instructions).index(adapter) * 1000
-        return np.repeat(np.stack(rows)[:, None], self.spec.chunk, axis=1) + np.float32(offset)
+        offsets = [list(self.instructions).index(each) * 1000 for each in adapters]
+        chunks = np.repeat(np.stack(rows)[:, None], self.spec.chunk, axis=1)
+        return chunks + np.float32(offsets)[:, None, None]
+
+    def run(self, adapter, rows):
+        return self.run_mixed([adapter] * len(rows), rows)
 
 
 @contextlib.contextmanager

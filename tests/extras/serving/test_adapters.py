@@ -1,19 +1,24 @@
 """Test that adapters share one base, can change while others answer, and never get mixed up."""
 
+import dataclasses
 import gc
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
+from flax import nnx
 from rich.console import Console
 
+import lorasp_jax
 from lorasp_jax import models
 from lorasp_jax.adapters.io import native
 from lorasp_jax.extras.serving import __main__ as command
 from lorasp_jax.extras.serving import exported, policies
+from lorasp_jax.extras.serving.adapters import Bases
 from lorasp_jax.extras.serving.client import PolicyClient, PolicyError
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.peft import LoRA
+from lorasp_jax.peft import DoRA, LoRA
 from lorasp_jax.training import export
 from tests.extras.serving.adapter_runs import (
     TEXTS,
@@ -25,7 +30,7 @@ from tests.extras.serving.adapter_runs import (
 )
 from tests.extras.serving.stand_in import observation, serving
 from tests.extras.serving.test_policies import actions, request
-from tests.models.random_models import random_backbone
+from tests.models.random_models import random_backbone, with_noise
 
 
 @pytest.fixture(scope="module")
@@ -142,6 +147,7 @@ def test_adapters_change_by_post(runs, finished, tmp_path):
         ({"name": "dance", "remove": True}, "one of press, pour, open, got 'dance'"),
         ({"name": "a/b", "path": "x"}, "name must match"),
         ({"name": "a", "path": "nowhere"}, "there is no folder nowhere"),
+        ({"name": "a", "path": "x" * 5000}, "File name too long"),
         ({"name": "a"}, "the body must be JSON"),
         ({"name": "a", "path": "x", "remove": True}, "the body must be JSON"),
         (b"{", "the body must be JSON"),
@@ -154,6 +160,59 @@ def test_posts_that_are_refused_change_nothing(values, refusal, served):
         status, text = post(server, values)
         assert (status, refusal in text) == (400, True), text
     assert served.instructions == before
+
+
+def test_settings_of_training_and_processing_are_not_of_the_base(finished, runs, tmp_path):
+    """They were part of it once, which then was in memory twice, and refused by POST."""
+    delta = (True,) * 6 + (False,)
+    inputs = dataclasses.asdict(Pi0Config.dummy().inputs) | {"delta": delta}
+    config = {"remat": "full", "unroll": False, "inputs": inputs}
+    other = write_run(finished.folder, tmp_path / "other", 5, config=config)
+    served = serve_runs({"press": runs["press"], "other": other}, max_batch=1)
+    served.put("posted", other)
+    press, *others = (each.policy.policy for each in served.adapters)
+    assert all(each.processor.inputs.delta == delta for each in others)
+    for each in others:
+        assert [*map(id, each.model.base)] == [*map(id, press.model.base)]
+    alone = serve_runs({"other": other}, share=False, max_batch=1)
+    sent = request(served.spec, 0, TEXTS["press"][0])
+    expected = actions(alone, sent)
+    sent = dataclasses.replace(sent, adapter="posted")
+    np.testing.assert_allclose(actions(served, sent), expected, atol=1e-5)
+
+
+def test_adapters_of_another_robot_are_refused(finished, runs, tmp_path, capsys):
+    from lorasp_jax.extras.serving import export as exporting
+
+    other = write_run(finished.folder, tmp_path / "other", 5, robot="panda")
+    served = serve_runs({"press": runs["press"]}, max_batch=1)
+    for name in ("other", "press"):  # also in place of the default
+        with pytest.raises(ValueError, match=r"present press and .* together: their metadata"):
+            served.put(name, other)
+    words = [runs["press"], f"other={other}", "--out", str(tmp_path / "policy")]
+    assert exporting.main(words) == 2
+    assert "press and other cannot be served together" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "policy").exists()
+
+
+def test_quantized_bases_are_shared_only_with_equal_digests(finished, runs, tmp_path):
+    """Quantized kernels have no fingerprints that could tell them apart."""
+    paths = {n: write_run(finished.folder, tmp_path / n, 1, quantized="nf4") for n in "abc"}
+    for name, digest in {"a": "one", "b": "one", "c": "two"}.items():
+        rewrite(Path(paths[name]), base=digest)
+    a, b, c = (
+        [*map(id, each.policy.policy.model.base)]
+        for each in serve_runs(paths, max_batch=1).adapters
+    )
+    assert a == b
+    assert not {*a} & {*c}
+
+
+def test_whether_a_run_can_share_is_asked_of_a_base_that_has_moved(finished, tmp_path, dummy_base):
+    run = write_run(finished.folder, tmp_path / "run", 1, base="")
+    with pytest.raises(ValueError, match="randomly initialized"):
+        Bases.can_share(run)
+    assert Bases.can_share(run, str(dummy_base))
 
 
 def test_posts_need_the_token_of_a_server_that_has_one(served, runs):
@@ -231,10 +290,6 @@ def test_runs_of_different_bases_make_no_bundle(runs, foreign, tmp_path, capsys)
 
 
 def test_a_checkpoint_shares_its_base_with_its_adapters(dummy_base, tmp_path):
-    from flax import nnx
-
-    import lorasp_jax
-
     rules = [("q_proj", LoRA(rank=2))]
     adapted = lorasp_jax.adapt(models.load(dummy_base), rules, rngs=nnx.Rngs(0))
     native.save_adapters(tmp_path / "a", adapted)
@@ -246,6 +301,28 @@ def test_a_checkpoint_shares_its_base_with_its_adapters(dummy_base, tmp_path):
     base, a, b = (each.policy.policy.model for each in served.adapters)
     assert len(base.own) == 0 < len(a.own) == len(b.own)
     assert [*map(id, base.base)] == [*map(id, a.base)] == [*map(id, b.base)]
+    with pytest.raises(ValueError, match=r"nowhere/adapter.json is missing"):
+        served.put("c", "nowhere")
+
+
+@pytest.mark.parametrize("method", [LoRA(rank=2), DoRA(rank=2)], ids=["LoRA", "DoRA"])
+def test_a_checkpoint_takes_the_same_adapters_by_post_as_at_start(method, dummy_base, tmp_path):
+    """Also those of PEFT, although the model is no longer at hand."""
+    graphdef, adapters, frozen = lorasp_jax.split(
+        lorasp_jax.adapt(models.load(dummy_base), [("q_proj", method)], rngs=nnx.Rngs(0))
+    )
+    adapted = nnx.merge(graphdef, with_noise(adapters, 0.1), frozen)
+    folder = str(tmp_path / "theirs")
+    lorasp_jax.save_peft(folder, adapted, names=models.lerobot_names(adapted))
+    words = [str(dummy_base), "--adapter", f"a={folder}", "--max-batch", "1", "--seed", "0"]
+    served = command._load(
+        command.parser("serve").parse_args([*words, "--num-steps", "1"]), Console(quiet=True)
+    )
+    served.put("b", folder)
+    _, a, b = (each.policy.policy.model for each in served.adapters)
+    assert a.structure is b.structure
+    for ours, theirs in zip(a.own, b.own, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
 
 
 def test_a_server_with_weights_of_its_own_loads_no_adapters(runs):

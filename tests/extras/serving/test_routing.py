@@ -1,15 +1,19 @@
 """Test that instructions choose the right adapter, or none."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from envs.tasks import open_pot, pick_place, pour, press
 from lorasp_jax import models
-from lorasp_jax.extras.serving import routing
+from lorasp_jax.extras.piper.remote import Server
+from lorasp_jax.extras.serving import exported, routing
+from lorasp_jax.extras.serving.served import ServedPolicies
 from lorasp_jax.policies.tokenizer import Offline
 from tests import ROOT
 from tests.extras.serving.adapter_runs import TEXTS, serve_runs, write_run
-from tests.extras.serving.test_policies import request
+from tests.extras.serving.test_policies import actions, request
 
 TASKS = {task.TASK.name: task.TASK.instructions for task in (press, pick_place, open_pot, pour)}
 PARAPHRASES = {
@@ -127,6 +131,46 @@ def test_exact_instructions_ignore_case_and_spaces():
     assert routing.exact("open the lid", TASKS) == ""
     with pytest.raises(ValueError, match="an instruction of a, b"):
         routing.exact("go", {"a": ["go"], "b": ["go", "stop"]})
+
+
+def test_a_trained_instruction_is_found_by_its_words():
+    texts = ("open the pot", "Open the pot")
+    assert routing.trained("OPEN the  pot!", texts) == "open the pot"
+    assert routing.trained("Open the pot", texts) == "Open the pot", "these two differ in a letter"
+    assert routing.trained("open the lid", texts) == ""
+
+
+def test_exported_policies_take_other_letter_cases(folder, loaded):
+    known = loaded.instructions[0]
+    served = ServedPolicies({"base": exported.load(folder)}, route="exact")
+    expected = actions(served, request(served.spec, 0, known))
+    for prompt in (known.upper(), f" {known}. "):
+        np.testing.assert_array_equal(actions(served, request(served.spec, 0, prompt)), expected)
+    with pytest.raises(ValueError, match="no adapter is for 'dance'"):
+        actions(served, request(served.spec, 0, "dance"))
+
+
+def test_an_arm_is_warned_of_prompts_that_no_adapter_may_answer(capsys):
+    """If the server chooses by the prompt, all adapters may answer, otherwise the first."""
+
+    def warned(prompt, adapter="", **metadata):
+        client.metadata = {"adapters": ["a", "b"], "instructions": {"a": ["go"], "b": ["stop"]}}
+        client.metadata |= metadata
+        Server(client, adapter).warn([prompt])
+        return "warning" in capsys.readouterr().out
+
+    client = SimpleNamespace()
+    assert warned("stop")
+    assert not warned("stop", route="exact")
+    assert warned("dance", route="exact")
+    assert warned("stop", "a", route="exact")
+
+
+def test_only_policies_on_a_shared_base_are_nearest(finished, tmp_path):
+    run = write_run(finished.folder, tmp_path / "run", 0, TEXTS["press"])
+    served = serve_runs({"press": run}, share=False, max_batch=1, route="nearest")
+    with pytest.raises(ValueError, match="needs policies that share a base"):
+        served.route(request(served.spec, 0, "press it"))
 
 
 def test_nothing_is_near_where_nothing_is_known(embed):

@@ -7,6 +7,7 @@ import signal
 import socket
 import threading
 
+import anyio
 import numpy as np
 import pytest
 
@@ -103,10 +104,11 @@ def test_noise_differs_between_episodes_and_repeats(config):
     config["benchmarks"][0]["params"]["state"] = "state"
     for _ in range(2):
         vla_eval.evaluate(VlaEvalServer(policy, 5), config, docker=False)
-    first, second = policy.indices[:8], policy.indices[8:]
+    first, second = policy.indices[: 4 * STEPS], policy.indices[4 * STEPS :]
     assert first == second
     assert len({number for number, _ in first}) == 4
-    assert [step for _, step in first] == [0, 5] * 4
+    assert [step for _, step in first] == [*range(STEPS)] * 4
+    assert policy.batches == [("base", 1)] * 16, "at steps 0 and 5 of each episode"
     assert all(0 <= number < 2**31 for number, _ in first)
 
 
@@ -126,13 +128,49 @@ def test_the_benchmark_gets_a_sentence_about_an_observation(config, params, sent
     assert all(sentence in text for text in details)
 
 
+def test_one_bad_observation_does_not_fail_its_batch():
+    """Clients of both kinds answer at the same time, in batches of up to 8."""
+
+    class Session(SessionContext):
+        async def send_action(self, action):
+            answers.append((self.session_id, action["actions"]))
+
+    async def ask(server, name, size):
+        context = Session(name, "episode")
+        await server.on_episode_start({"task": {"name": name}}, context)
+        toy = Toy(size=size, send_wrist_image=True, send_state=True)
+        try:
+            await server.on_observation(toy.make_obs(0, {}), context)
+        except ValueError as error:
+            answers.append((name, str(error)))
+
+    async def work():
+        policy.gate.clear()
+        async with anyio.create_task_group() as tasks:
+            server = VlaEvalServer(policy, 5)
+            await server.on_serve_start(tasks)
+            async with anyio.create_task_group() as clients:
+                for name, size in {"a": 7, "bad": 8, "c": 7}.items():
+                    clients.start_soon(ask, server, name, size)
+                await anyio.sleep(0.3)
+                policy.gate.set()
+            tasks.cancel_scope.cancel()
+
+    policy, answers = StandIn(), []
+    anyio.run(work)
+    found = dict(answers)
+    assert "state must have 7 values, got 8" in found.pop("bad")
+    assert {name: actions[0] for name, actions in found.items()} == {"a": 10, "c": 10}
+
+
 def test_larger_batches_than_there_are_programs_for():
     policy = StandIn()
     server = VlaEvalServer(policy, 5)
     context = SessionContext("session", "episode")
     server._episodes["session"] = 3
     toy = Toy(send_wrist_image=True, send_state=True)
-    answers = server.predict_batch([toy.make_obs(i, {}) for i in range(11)], [context] * 11)
+    rows = [server._row(toy.make_obs(i, {}), context) for i in range(11)]
+    answers = server.predict_batch(rows, [context] * 11)
     assert [size for _, size in policy.batches] == [8, 4]
     assert [each["actions"][0, 0] for each in answers] == [10 + i for i in range(11)]
 
@@ -171,8 +209,7 @@ def test_serving_until_an_interrupt(config, monkeypatch, capsys):
     assert f"listening on ws://127.0.0.1:{port}" in lines
 
 
-def test_a_token_would_have_no_effect(tmp_path, capsys):
-    (tmp_path / "token").write_text("secret")
-    words = ["--token-file", str(tmp_path / "token"), "--vla-eval", "5"]
-    assert command.main(["runs/any", *words]) == 2
-    assert "--token-file has no effect with --vla-eval" in capsys.readouterr().err
+@pytest.mark.parametrize("words", [["--token-file", "token"], ["--max-clients", "64"]])
+def test_what_has_no_effect_is_refused(words, capsys):
+    assert command.main(["runs/any", *words, "--vla-eval", "5"]) == 2
+    assert f"{words[0]} has no effect with --vla-eval" in capsys.readouterr().err
