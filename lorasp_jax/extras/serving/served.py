@@ -77,7 +77,7 @@ class ServedPolicies:
         execution: str = "naive",
         route: str = "name",
         load: Callable[[str], CompiledPolicy] | None = None,
-        together: int | None = None,
+        together: int = 1,
     ) -> None:
         """Check that the policies fit; `warm_up` compiles.
 
@@ -90,7 +90,7 @@ class ServedPolicies:
                 Exported policies cannot be guided.
             route: one of `routing.MODES`; "nearest" needs policies on a `SharedBase`.
             load: loads another adapter from a path, for `put`; None: adapters do not change.
-            together: how many adapters a batch may have; None: as many as there are rows.
+            together: how many adapters a batch may have.
 
         Raises:
             ValueError: the policies need different observations or are of different robots, or
@@ -105,7 +105,7 @@ class ServedPolicies:
         self._change = threading.Lock()
         sizes = [set(policy.description.batch_sizes) for policy in policies.values()]
         self.sizes: tuple[int, ...] = tuple(sorted(set.intersection(*sizes)))
-        self.together: int = together or self.sizes[-1]
+        self.together: int = together
         # The key is an argument, as a constant would make a program of its own for every seed.
         self._key = jax.random.key(seed)
         self._draw = jax.jit(jax.vmap(draw_noise, (None, 0, None)), static_argnums=2)
@@ -198,7 +198,7 @@ class ServedPolicies:
 
     def group(self, adapter: Adapter) -> Any:
         """Return what is equal for adapters whose requests can share a batch."""
-        return adapter.group
+        return adapter.group if self.together > 1 else adapter.name
 
     def companions(self, name: str) -> list[str]:
         """Return the adapters whose requests share batches with one's, see `policies.run_mixed`."""

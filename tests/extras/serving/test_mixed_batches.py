@@ -58,7 +58,7 @@ def test_answers_are_those_of_batches_of_one_adapter(case, finished, tmp_path):
     paths = {
         n: write_adapter(finished.folder, tmp_path / n, method, i) for i, n in enumerate("abc")
     }
-    settings = {"execution": execution, "max_batch": 4}
+    settings = {"execution": execution, "max_batch": 4, "together": 4}
     served = serve_runs(paths, **settings, guidance=5.0 if execution == "guided" else None)
     names = ["a", "b", "c", "a"]
     assert served.companions("a") == ["b", "c"]
@@ -91,21 +91,23 @@ def test_adapters_that_make_other_programs_have_batches_of_their_own(finished, t
     }
     delta = {"inputs": dataclasses.asdict(finished.policy.model.config.inputs) | {"delta": [True]}}
     paths["delta"] = write_run(finished.folder, tmp_path / "delta", 5, config=delta)
-    served = serve_runs(paths, max_batch=2)
+    served = serve_runs(paths, max_batch=2, together=2)
     found = {name: served.companions(name) for name in paths}
     same = {"a": ["b", "padded"], "b": ["a", "padded"], "padded": ["a", "b"]}
     assert found == {name: [] for name in paths} | same
     with serving(served, token="secret") as server:
         listed = json.loads(get(server, "/adapters")[1])["adapters"]
     assert {each["name"]: each["batches_with"] for each in listed} == found
-    own = serve_runs({n: paths[n] for n in ("a", "b")}, share=False, max_batch=1)
+    served.together = 1
+    assert not any(map(served.companions, paths)), "by default, an adapter is alone in its batch"
+    own = serve_runs({n: paths[n] for n in ("a", "b")}, share=False, max_batch=1, together=2)
     assert own.companions("a") == [], "weights of their own"
 
 
 def test_mixed_batches_are_warm_before_a_request_comes(finished, tmp_path):
     """Neither the first such batch nor an adapter that was loaded later compiles anything."""
     path = lambda i: write_run(finished.folder, tmp_path / str(i), i)  # noqa: E731
-    served, said = serve_runs({"a": path(0), "b": path(1)}, max_batch=4), []
+    served, said = serve_runs({"a": path(0), "b": path(1)}, max_batch=4, together=4), []
     served.warm_up(said.append)
     assert said[-1] == "compiling a with b, batch 4 (8 of 8)"
     compiled = policies._mixed_program()._cache_size()
@@ -113,10 +115,3 @@ def test_mixed_batches_are_warm_before_a_request_comes(finished, tmp_path):
     for names in ("ab", "ca", "abcb", "cccb"):
         served.run_mixed(*rows_of(served, names))
     assert policies._mixed_program()._cache_size() == compiled
-
-
-def test_no_more_adapters_are_together_than_fit_the_device(finished, tmp_path):
-    paths = {n: write_run(finished.folder, tmp_path / n, i) for i, n in enumerate("ab")}
-    served = serve_runs(paths, capacity=1, max_batch=2, together=1)
-    served.warm_up()
-    assert (served.companions("a"), served._mixtures(served.adapters)) == ([], [])
