@@ -53,6 +53,12 @@ class Settings:
     state_age: float = 0.1
     speed: float = 0.5
 
+    def __post_init__(self) -> None:
+        """Raise ValueError unless all numbers are positive."""
+        for name, value in vars(self).items():
+            if isinstance(value, int | float) and not 0 < value < math.inf:
+                raise ValueError(f"{name} must be positive, got {value:g}")
+
 
 class Pilot:
     """Turns the newest pictures and joint states into targets. All times are of one clock [s].
@@ -182,7 +188,7 @@ class Server:
         if not self._reads_jpeg:
             images = {name: jpeg.decode(name, data) for name, data in images.items()}
         try:
-            self._client = self._client or PolicyClient(self._address, **self._options)
+            self._client = self._client or self._again()
             reply = self._client.infer({**request, "image": images})
         except Exception:
             if self._client:
@@ -192,6 +198,15 @@ class Server:
         if "actions" not in reply:
             raise PolicyError("the server's reply has no actions")
         return reply["actions"]
+
+    def _again(self) -> PolicyClient:
+        """Connect again; raise PolicyError if another policy is served now."""
+        client = PolicyClient(self._address, **self._options)
+        for name in ("robot", "action_dim", "control_dt", "cameras", "encodings"):
+            if (now := client.metadata.get(name)) != (before := self.metadata.get(name)):
+                client.close()
+                raise PolicyError(f"the server came back with {name} {now}, not {before}")
+        return client
 
 
 def connect(parameter: Callable[[str, Any], Any]) -> tuple[Server, dict[str, str], Settings]:

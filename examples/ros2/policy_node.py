@@ -29,7 +29,9 @@ def main() -> None:
     server, topics, settings = connect(
         lambda name, default: node.declare_parameter(name, default).value
     )
-    pilot, period = Pilot(server, settings), 1.0 / node.declare_parameter("rate", 50.0).value
+    if not 0 < (rate := node.declare_parameter("rate", 50.0).value) <= 1000:
+        raise ValueError(f"rate must be above 0 and at most 1000 Hz, got {rate:g}")
+    pilot, period = Pilot(server, settings), 1.0 / rate
     targets = node.create_publisher(JointState, "joint_targets", 1)
 
     def tick() -> None:

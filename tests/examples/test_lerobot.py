@@ -119,10 +119,9 @@ def test_an_error_of_its_thread_is_told(follower, bench, monkeypatch):
         patch.setattr(bench.arm, "read", lambda: next(iter(())))
         with pytest.raises(StopIteration):
             follower.run()
+    assert not follower._arms.moving, "it has braked"
     with pytest.raises(Unsafe, match="StopIteration"):
         follower.pose()
-    follower.settle()
-    assert not follower._arms.moving
 
 
 def test_it_runs_in_a_thread_until_it_is_stopped(module, bench, monkeypatch):

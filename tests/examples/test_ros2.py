@@ -22,8 +22,8 @@ class Turning(StandIn):
         self.last_request = request
         return request.state
 
-    def run(self, adapter, rows):
-        chunks = super().run(adapter, rows)
+    def run_mixed(self, adapters, rows):
+        chunks = super().run_mixed(adapters, rows)
         chunks[..., 0] += 0.03 * np.arange(1, self.spec.chunk + 1)
         return chunks
 
@@ -165,6 +165,25 @@ def test_it_holds_when_the_server_is_lost_and_goes_on_when_it_is_back(core):
     with serving(Turning(), port=port):
         arm.now += core.RETRY
         arm.moves()
+
+
+def test_it_does_not_follow_another_policy_after_the_server_was_lost(core):
+    with serving(Turning()) as server:
+        arm, port = Arm(core, server).moves(), server.port
+    while arm.tick() is not None:
+        if arm.pilot._open:
+            arm.pilot._open[0].exception(WAIT)
+    with serving(Turning(metadata={"robot": "panda"}), port=port):
+        arm.now += core.RETRY
+        arm.until(lambda target: target is not None or "panda" in arm.pilot.holding)
+        assert arm.pilot.holding
+
+
+def test_settings_must_be_positive(core):
+    for name in ("speed", "control_dt", "patience", "execute"):
+        for wrong in (-0.5, 0, np.nan, np.inf):
+            with pytest.raises(ValueError, match=name):
+                core.Settings(("side",), "turn", **{name: wrong})
 
 
 @pytest.mark.parametrize("wrong", [np.nan, "short"])

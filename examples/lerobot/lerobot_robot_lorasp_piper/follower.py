@@ -63,6 +63,7 @@ class Follower:
                 self._clock.wait_until(due)
         except BaseException as error:  # in a thread, nobody else would hear of it
             self.problem = describe_any(error)
+            self.settle()
             raise
 
     def stop(self) -> None:
@@ -73,7 +74,11 @@ class Follower:
         """Brake; the arm then holds its last target."""
         self.problem = self.problem or "the arm was told to hold"
         while self._arms.moving:
-            self._tick()
+            try:
+                self._arms.read()
+            except Exception as error:  # it brakes, whatever it can read
+                self.problem = describe_any(error)
+            self._arms.send(self._arms.brake())
             self._clock.wait_until(self._clock.now() + PERIOD)
 
     def _tick(self) -> None:

@@ -247,6 +247,7 @@ def _angles(joints: Any) -> np.ndarray:
 
 def _open(can: str, bus: str) -> Any:
     from piper_sdk import C_PiperInterface_V2, LogLevel
+    from piper_sdk.hardware_port import can_encapsulation
 
     checked = bus == "socketcan"
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
@@ -255,6 +256,8 @@ def _open(can: str, bus: str) -> Any:
             # Errors that it logs are either raised or seen as stale feedback.
             options = {"can_auto_init": False, "logger_level": LogLevel.CRITICAL}
             sdk = C_PiperInterface_V2(can, judge_flag=False, **options)
+            # It prints each frame that it cannot send, and a stalled terminal would stall the arm.
+            can_encapsulation.print = lambda *_: None  # type: ignore[attr-defined]
             sdk.CreateCanBus(can, bustype=bus, judge_flag=checked)
         except ConnectionError as error:
             raise ConnectionError(

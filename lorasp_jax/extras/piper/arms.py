@@ -52,7 +52,8 @@ class Arms:
 
     def enable(self) -> None:
         """Switch all on; raise what `PiperArm.enable` does, with the arm's name."""
-        self._in_turn(lambda index: self._arms[index].enable(self.limits))
+        on = f"; the {SIDES[0]} arm is on, and holds"
+        self._in_turn(lambda index: self._arms[index].enable(self.limits), after_first=on)
 
     def teach(self, on: bool) -> None:
         """Enter or leave hand guiding."""
@@ -81,7 +82,7 @@ class Arms:
     @property
     def readings(self) -> list[Reading]:
         """What each arm reported last."""
-        return [*self._latest.values()]
+        return [self._latest[index] for index in range(len(self._arms))]
 
     @property
     def rest(self) -> np.ndarray:
@@ -143,14 +144,23 @@ class Arms:
         """Let arms that may stand still already, for a fault of their own, hold where they are."""
         for index, reading in enumerate(self.readings):
             stands = reading.age <= MAX_AGE and (reading.arm_status or not reading.enabled)
-            if stands and index not in self._yielded:
+            if stands and (index not in self._yielded or not reading.enabled):  # it may sink
                 self._governors[index].start(reading.pose)
                 self._yielded.add(index)
 
     def step(self, target: np.ndarray, *, slow: bool = False) -> np.ndarray:
-        """Return the commands [7 N] of this tick on the way to a target [7 N]."""
-        pairs = zip(self._governors, self._split(target), strict=True)
-        return np.concatenate([governor.step(part, slow=slow) for governor, part in pairs])
+        """Return the commands [7 N] of this tick on the way to a target [7 N].
+
+        While the box blocks one arm, the others brake: they may carry the same thing.
+        """
+        blocked = any(governor.blocked for governor in self._governors)
+
+        def step(governor: Governor, part: np.ndarray) -> np.ndarray:
+            if blocked and not governor.blocked:
+                return governor.brake()
+            return governor.step(part, slow=slow)
+
+        return np.concatenate([*map(step, self._governors, self._split(target))])
 
     def brake(self) -> np.ndarray:
         """Return the commands [7 N] that slow all down at the acceleration limit, then hold."""
@@ -183,13 +193,13 @@ class Arms:
             for index in reversed(range(len(self._arms))):
                 stack.callback(act, index)
 
-    def _in_turn(self, act: Callable[[int], None]) -> None:
+    def _in_turn(self, act: Callable[[int], None], after_first: str = "") -> None:
         """Act on one arm after the other, and let errors name the arm."""
         for index, prefix in enumerate(self._prefixes):
             try:
                 act(index)
             except (ConnectionError, ValueError) as error:
-                raise type(error)(f"{prefix}{error}") from error
+                raise type(error)(f"{prefix}{error}{after_first * bool(index)}") from error
 
 
 def dimension_names(sides: Sequence[str]) -> list[str]:

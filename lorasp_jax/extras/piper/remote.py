@@ -136,14 +136,15 @@ def _period(options: argparse.Namespace, metadata: dict[str, Any], arms: int) ->
     size = metadata.get("action_dim") or 7 * arms
     expected = options.robot or own_robot(options, arms)
     robot = metadata.get("robot") or expected
+    if size != 7 * arms:
+        takes = "a PiPER takes 7" if arms == 1 else f"{arms} PiPERs take {7 * arms}"
+        remedy = ": two arms are --can left=can0 right=can1" if size == 14 else ""
+        raise ValueError(f"the policy's actions have {size} numbers, but {takes}{remedy}")
     if robot != expected:
         raise ValueError(
             f"the policy is of the robot {robot}, not of {expected}: pass --robot {robot} to "
             "run it nevertheless"
         )
-    if size != 7 * arms:
-        takes = "a PiPER takes 7" if arms == 1 else f"{arms} PiPERs take {7 * arms}"
-        raise ValueError(f"the policy's actions have {size} numbers, but {takes}")
     trained, given = metadata.get("control_dt"), options.control_dt
     if trained and given and abs(trained - given) > 1e-6:
         print(f"warning: the policy acts every {trained:g} s, not every {given:g} s", flush=True)

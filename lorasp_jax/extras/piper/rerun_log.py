@@ -23,6 +23,8 @@ TICK = 0.02
 """Time between two poses that are shown [s]."""
 MOST, MOST_WITH_PICTURES = 512, 32
 """Length of the queue beyond which messages, and pictures, are dropped."""
+LARGEST = 320
+"""Longest side of a picture that is shown [pixels]."""
 GRACE = 10.0
 """Time for what is queued at the end, and for files to be completed [s]."""
 _TIMINGS = ("policy_timing", "server_timing")  # of a reply
@@ -80,7 +82,8 @@ class Viewer:
     def observation(self, time: float, observation: Observation) -> None:
         """Show what the policy sees."""
         delay = {key: observation[key] for key in ("executed", "delay") if key in observation}
-        self._put({"t": time, "images": observation["image"], **delay}, MOST_WITH_PICTURES)
+        images = {name: _smaller(image) for name, image in observation["image"].items()}
+        self._put({"t": time, "images": images, **delay}, MOST_WITH_PICTURES)
 
     def reply(self, reply: Mapping[str, Any]) -> None:
         """Show what a server says of its answer besides the actions."""
@@ -103,7 +106,7 @@ class Viewer:
         if self.dropped:
             print(f"Rerun was too slow: {self.dropped} messages are missing", flush=True)
         if stuck or self._process.returncode:
-            reason = said or "it did not take it in time"
+            reason = said or ("it did not take it in time" if stuck else "its process has ended")
             if not self._live:
                 raise OSError(f"a recording in {self._target} is incomplete: {reason}")
             print(f"the viewer has lost the rest: {reason}", flush=True)
@@ -158,6 +161,12 @@ class WatchedLog(Log):
             super().close()
         finally:
             self._viewer.close()
+
+
+def _smaller(image: np.ndarray) -> np.ndarray:
+    """Return every k-th pixel: packing a large picture would hold Python's lock for too long."""
+    step = max(1, -(-max(image.shape[:2]) // LARGEST))
+    return np.ascontiguousarray(image[::step, ::step])
 
 
 def _numbers(values: Any) -> dict[str, float]:

@@ -262,9 +262,13 @@ class Session:
             self._say(self._untold.pop(0))
 
     def _rest(self) -> None:
-        """Move slowly to the rest pose, unless an arm itself reports a fault."""
+        """Move slowly to the rest pose, unless an arm itself reports a fault.
+
+        Two arms stay where they are: they may hold the same thing, and nothing keeps one from the
+        other.
+        """
         self._read()
-        if self._arms.fault() or self.stopped:
+        if self._arms.fault() or self.stopped or len(self._arms.readings) > 1:
             return
         self._say("moving slowly to the rest pose")
         if problem := self._go(self._arms.rest):

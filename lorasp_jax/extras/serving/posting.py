@@ -117,8 +117,12 @@ class Adapters:
     def listed(self) -> str:
         """Return the adapters as JSON, and how the last change ended."""
         adapters = [
-            {"name": n, "instructions": t, "batches_with": self._policy.companions(n)}
-            for n, t in self._policy.instructions.items()
+            {
+                "name": each.name,
+                "instructions": each.policy.instructions,
+                "batches_with": self._policy.companions(each),
+            }
+            for each in self._policy.adapters
         ]
         return json.dumps({"adapters": adapters, **self.state()}) + "\n"
 

@@ -200,11 +200,10 @@ class ServedPolicies:
         """Return what is equal for adapters whose requests can share a batch."""
         return adapter.group if self.together > 1 else adapter.name
 
-    def companions(self, name: str) -> list[str]:
+    def companions(self, adapter: Adapter) -> list[str]:
         """Return the adapters whose requests share batches with one's, see `policies.run_mixed`."""
-        group = self._find(name).group
-        found = [each.name for each in self.adapters if each.group == group and each.name != name]
-        return found if self.together > 1 else []
+        group = self.group(adapter)
+        return [x.name for x in self.adapters if self.group(x) == group and x.name != adapter.name]
 
     def _find(self, name: str) -> Adapter:
         adapters = self._adapters

@@ -178,10 +178,10 @@ class PolicyServer:
         if self._token and not hmac.compare_digest(given.encode(), self._token.encode()):
             text = "this server requires a token: Authorization: Api-Key TOKEN"
             return http.HTTPStatus.UNAUTHORIZED, text
-        if watched and not self._token and not watching.is_local(request):
+        is_page = watched or request.path in ("/metrics", "/adapters")
+        if is_page and not self._token and not watching.is_local(request):
             text = "without a token, this page is only at localhost, 127.0.0.1 or another address"
             return http.HTTPStatus.FORBIDDEN, text
-        is_page = watched or request.path in ("/metrics", "/adapters")
         if not is_page and self.counts["open_connections"] >= self._max_clients:
             text = f"this server has its maximum of {self._max_clients} connections"
             return http.HTTPStatus.SERVICE_UNAVAILABLE, text

@@ -103,6 +103,8 @@ class Watch:
         for _, adapter, milliseconds in self._latest:
             by_adapter[adapter].append(milliseconds)
         every = [x for values in by_adapter.values() for x in values]
+        places = self._policy.places
+        self._requests = Counter({name: self._requests[name] for name in places})
         robot = self._policy.metadata.get("robot")
         status = {
             **more,
@@ -117,7 +119,7 @@ class Watch:
                     "requests": self._requests[name],
                     **_percentiles(by_adapter[name], 50, 95),
                 }
-                for name, place in self._policy.places.items()
+                for name, place in places.items()
             ],
             "clients": [_describe(number, seen, now) for number, seen in self.clients.items()],
         }

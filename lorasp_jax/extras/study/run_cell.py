@@ -39,6 +39,7 @@ def run_cell(job: Job) -> dict[str, Any]:
             missing or cannot be transformed; the device computed some episodes wrongly.
     """
     cache.enable()
+    provenance()  # of the code that runs, which may change on the disk meanwhile
     try:
         return _derive(job) if isinstance(job.cell, Derived) else _train(job)
     finally:

@@ -169,8 +169,12 @@ def test_the_policys_robot_and_period_are_kept(
             ["--can", "left=a", "right=b"],
             "policy's actions have 7 numbers, but 2 PiPERs take 14",
         ),
-        ({"action_dim": 14}, ["--can", "a"], "actions have 14 numbers, but a PiPER takes 7"),
-        ({"robot": "piper"}, ["--can", "right=b", "left=a"], "of the robot piper, not of bi_piper"),
+        ({"action_dim": 14}, ["--can", "a"], "but a PiPER takes 7: two arms are --can left=can0"),
+        (
+            {"robot": "piper", "action_dim": 14},
+            ["--can", "right=b", "left=a"],
+            "of the robot piper, not of bi_piper",
+        ),
         ({"robot": "piper"}, ["--arm", "piper-x"], "of the robot piper, not of piper-x"),
     ],
 )

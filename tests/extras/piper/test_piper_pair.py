@@ -1,13 +1,16 @@
 """Two arms: one session drives both, and what goes wrong with one holds both."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
 
 from lorasp_jax.data.lerobot_export import to_lerobot
 from lorasp_jax.data.opening import open_source
-from lorasp_jax.extras.piper.arms import SIDES, dimension_names
+from lorasp_jax.extras.piper.arms import SIDES, Arms, dimension_names
 from lorasp_jax.extras.piper.recording import Recording
+from lorasp_jax.extras.piper.safety import Limits
 from lorasp_jax.extras.piper.teaching import Lesson
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.run_folder import read_metrics
@@ -130,10 +133,8 @@ def test_warnings_name_the_arm(pair):
     assert run.said[0].startswith("warning: right arm: all actions of the gripper are far beyond")
 
 
-def test_both_go_home_and_to_rest(pair, monkeypatch):
+def test_both_go_home_but_not_to_rest_by_themselves(pair):
     start = pair.arms.read()
-    rest = start + 0.1 * np.eye(14)[7]
-    monkeypatch.setattr(type(pair.arms), "rest", property(lambda _: rest))
     run = Run(pair, ask := Turning())
     assert run(0.8) is None
     assert run.session.home(start) is None
@@ -142,7 +143,49 @@ def test_both_go_home_and_to_rest(pair, monkeypatch):
     run = Run(pair, ask)
     ask.change = lambda actions: actions[:, :3]
     assert "actions must be numbers" in run(5.0)
-    np.testing.assert_allclose(bases(pair), rest[[0, 7]], atol=0.03)
+    np.testing.assert_allclose(bases(pair), start[[0, 7]], atol=0.02)
+
+
+def test_the_box_stops_both(pair):
+    """An arm that the box blocks must not be pulled on by the other."""
+    start = pair.arms.read()
+    pair.arms.start(start)
+    one = pair.arms._governors[0]
+    for tick in range(200):
+        if tick == 100:
+            low, high = np.full(3, -9.0), np.array([9.0, -5.0, 9.0])  # ever farther away
+            one.limits = dataclasses.replace(one.limits, box_low=low, box_high=high)
+        pair.arms.step(start + 0.005 * tick * np.eye(14)[[0, 7]].sum(0))
+        if tick == 99:
+            assert pair.arms.moving
+    assert one.blocked
+    assert not pair.arms.moving
+
+
+def test_an_arm_that_sinks_without_its_drivers_does_not_jump_back(pair):
+    pair.fakes[1].faults.dead_driver = 2
+    pair.wait(0.2)
+    for angle in (0.1, 0.2):
+        pair.arms.read()
+        reading = pair.arms._latest[1]
+        sunk = reading._replace(pose=reading.pose + angle * np.eye(7)[1])
+        assert not sunk.enabled
+        pair.arms._latest[1] = sunk
+        pair.arms.yield_to_faults()
+        np.testing.assert_array_equal(pair.arms.pose[7:], sunk.pose)
+
+
+def test_arms_keep_their_order_if_one_could_not_be_read_at_first(table, monkeypatch):
+    bench = Bench(table).ready()
+    expected, read = bench.arms.read(), bench.drivers[0].read
+    arms = Arms({"left": bench.drivers[0], "right": bench.drivers[1]}, Limits.of())
+    with monkeypatch.context() as patch:
+        patch.setattr(bench.drivers[0], "read", lambda: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            arms.read()
+    assert bench.drivers[0].read == read
+    np.testing.assert_allclose(arms.read(), expected, atol=2e-3)
+    bench.close()
 
 
 def test_both_are_guided_by_hand(pair, tmp_path):
@@ -169,7 +212,7 @@ def test_an_error_while_enabling_names_the_arm(table):
     bench.arms.connect()
     bench.fakes[1].faults.status = 7
     bench.wait(0.1)
-    with pytest.raises(ValueError, match=r"right arm: .*collision"):
+    with pytest.raises(ValueError, match=r"right arm: .*collision.*the left arm is on"):
         bench.arms.enable()
     bench.close()
 

@@ -242,6 +242,13 @@ def test_replies_may_be_anything():
     assert rerun_log._numbers(["a"]) == rerun_log._numbers(None) == {}
 
 
+def test_large_pictures_are_shown_small():
+    small = np.arange(320 * 240 * 3, dtype=np.uint8).reshape(240, 320, 3)
+    np.testing.assert_array_equal(rerun_log._smaller(small), small)
+    large = np.kron(small, np.ones((9, 9, 1), np.uint8))
+    np.testing.assert_array_equal(rerun_log._smaller(large), small)
+
+
 def test_joints_have_names():
     assert joint_names(7) == [*(f"joint_{i}" for i in range(1, 7)), "gripper"]
     assert joint_names(14)[6:8] == ["left/gripper", "right/joint_1"]

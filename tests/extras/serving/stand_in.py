@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import threading
 import time
+from types import SimpleNamespace
 from typing import ClassVar
 
 import numpy as np
@@ -55,9 +56,17 @@ class StandIn:
     def group(self, adapter):
         return self.groups.get(adapter, adapter)
 
+    @property
+    def adapters(self):
+        """What lists read; requests have names."""
+        make = lambda name, texts: SimpleNamespace(  # noqa: E731
+            name=name, policy=SimpleNamespace(instructions=texts)
+        )
+        return [make(*item) for item in self.instructions.items()]
+
     def companions(self, adapter):
-        group = self.group(adapter)
-        return [each for each in self.instructions if self.group(each) == group and each != adapter]
+        name, group = adapter.name, self.group(adapter.name)
+        return [each for each in self.instructions if self.group(each) == group and each != name]
 
     def run_mixed(self, adapters, rows):
         self.batches.append((" ".join(dict.fromkeys(map(str, adapters))), len(rows)))

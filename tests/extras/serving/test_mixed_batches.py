@@ -61,7 +61,7 @@ def test_answers_are_those_of_batches_of_one_adapter(case, finished, tmp_path):
     settings = {"execution": execution, "max_batch": 4, "together": 4}
     served = serve_runs(paths, **settings, guidance=5.0 if execution == "guided" else None)
     names = ["a", "b", "c", "a"]
-    assert served.companions("a") == ["b", "c"]
+    assert served.companions(served._find("a")) == ["b", "c"]
     adapters, rows = rows_of(served, names)
     if execution == "guided":
         for row in rows:
@@ -92,16 +92,16 @@ def test_adapters_that_make_other_programs_have_batches_of_their_own(finished, t
     delta = {"inputs": dataclasses.asdict(finished.policy.model.config.inputs) | {"delta": [True]}}
     paths["delta"] = write_run(finished.folder, tmp_path / "delta", 5, config=delta)
     served = serve_runs(paths, max_batch=2, together=2)
-    found = {name: served.companions(name) for name in paths}
+    found = {each.name: served.companions(each) for each in served.adapters}
     same = {"a": ["b", "padded"], "b": ["a", "padded"], "padded": ["a", "b"]}
     assert found == {name: [] for name in paths} | same
     with serving(served, token="secret") as server:
         listed = json.loads(get(server, "/adapters")[1])["adapters"]
     assert {each["name"]: each["batches_with"] for each in listed} == found
     served.together = 1
-    assert not any(map(served.companions, paths)), "by default, an adapter is alone in its batch"
+    assert not any(map(served.companions, served.adapters)), "by default, one adapter a batch"
     own = serve_runs({n: paths[n] for n in ("a", "b")}, share=False, max_batch=1, together=2)
-    assert own.companions("a") == [], "weights of their own"
+    assert not any(map(own.companions, own.adapters)), "weights of their own"
 
 
 def test_mixed_batches_are_warm_before_a_request_comes(finished, tmp_path):

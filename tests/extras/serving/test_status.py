@@ -148,7 +148,7 @@ def test_a_password_that_browsers_know_changes_and_infers_nothing():
 
 def test_without_a_token_no_foreign_name_reads_the_page(server):
     """A site may let its own name point to 127.0.0.1."""
-    for path in ("/", "/status", "/pictures/0/side"):
+    for path in ("/", "/status", "/pictures/0/side", "/adapters", "/metrics"):
         for foreign in (
             "evil.example",
             f"evil.example:{server.port}",
@@ -261,7 +261,8 @@ def test_the_page_says_when_the_server_has_gone(new_tab):
 def test_rates_and_percentiles(monkeypatch):
     clock = [100.0]
     monkeypatch.setattr(watching.time, "monotonic", lambda: clock[0])
-    watch, seen = watching.Watch(StandIn(), {}), watching.Seen("here", adapter="base")
+    policy = StandIn()
+    watch, seen = watching.Watch(policy, {}), watching.Seen("here", adapter="base")
     for number in range(watching.KEPT + 500):  # 50 a second
         clock[0] += 0.02
         watch.answered(seen, number)
@@ -276,3 +277,7 @@ def test_rates_and_percentiles(monkeypatch):
         clock[0] += 0.002
         watch.answered(seen, number)
     assert json.loads(watch.status())["requests_per_s"] == pytest.approx(500, rel=0.01)
+    texts = policy.instructions.pop("base")
+    assert json.loads(watch.status())["adapters"] == []
+    policy.instructions["base"] = texts
+    assert json.loads(watch.status())["adapters"][0]["requests"] == 0, "it is another adapter"
