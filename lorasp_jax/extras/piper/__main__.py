@@ -121,7 +121,9 @@ def _run(options: argparse.Namespace) -> int:
 
 def _buses(options: argparse.Namespace) -> dict[str, str]:
     """Return name of the arm -> interface: "" for a single arm, none in a dry run without any."""
-    given = [text for text in options.can or [] if text] or ([] if options.dry_run else ["can0"])
+    given: list[str] = [text for text in options.can or [] if text] or (
+        [] if options.dry_run else ["can0"]
+    )
     if len(given) < 2 and "=" not in "".join(given):
         return dict.fromkeys([""], given[0]) if given else {}
     buses = {name: can for name, _, can in (text.partition("=") for text in given)}
