@@ -155,12 +155,18 @@ def test_it_does_not_follow_an_old_chunk(core, server):
     arm.moves()
 
 
-def test_it_holds_when_the_server_is_lost_and_goes_on_when_it_is_back(core):
+def lose_server(core):
+    """Return an arm that holds since its server is gone, and the port of that."""
     with serving(Turning()) as server:
         arm, port = Arm(core, server).moves(), server.port
     while arm.tick() is not None:
         if arm.pilot._open:
             arm.pilot._open[0].exception(WAIT)
+    return arm, port
+
+
+def test_it_holds_when_the_server_is_lost_and_goes_on_when_it_is_back(core):
+    arm, port = lose_server(core)
     assert "no actions" in arm.pilot.holding
     with serving(Turning(), port=port):
         arm.now += core.RETRY
@@ -168,11 +174,7 @@ def test_it_holds_when_the_server_is_lost_and_goes_on_when_it_is_back(core):
 
 
 def test_it_does_not_follow_another_policy_after_the_server_was_lost(core):
-    with serving(Turning()) as server:
-        arm, port = Arm(core, server).moves(), server.port
-    while arm.tick() is not None:
-        if arm.pilot._open:
-            arm.pilot._open[0].exception(WAIT)
+    arm, port = lose_server(core)
     with serving(Turning(metadata={"robot": "panda"}), port=port):
         arm.now += core.RETRY
         arm.until(lambda target: target is not None or "panda" in arm.pilot.holding)

@@ -111,9 +111,7 @@ class Arms:
 
     def fault(self) -> str | None:
         """Say in a sentence why the arms must not be commanded now; None: they may be."""
-        found = [fault(reading, self.limits) for reading in self.readings]
-        named = zip(self._prefixes, found, strict=True)
-        return next((f"{prefix}{words}" for prefix, words in named if words), None)
+        return self._first([fault(reading, self.limits) for reading in self.readings])
 
     def check_chunk(self, actions: Any) -> np.ndarray:
         """Return actions as float64 [C, 7 N]; raise `Unsafe` if they are not."""
@@ -121,9 +119,8 @@ class Arms:
 
     def clamped(self, chunk: np.ndarray) -> str | None:
         """Say in a sentence that an arm's part of a chunk is clamped as a whole, by far."""
-        found = [clamped(part, self.limits) for part in self._split(chunk)]
-        named = zip(self._prefixes, found, strict=True)
-        return next((f"warning: {prefix}{words}" for prefix, words in named if words), None)
+        words = self._first([clamped(part, self.limits) for part in self._split(chunk)])
+        return words and f"warning: {words}"
 
     def clip(self, pose: np.ndarray) -> np.ndarray:
         """Return a pose [7 N] within the limits of joints and grippers."""
@@ -183,6 +180,11 @@ class Arms:
             degrees = " ".join(f"{angle:7.2f}" for angle in np.rad2deg(part[:6]))
             words.append(f"{prefix}{degrees} degrees, {1000 * part[6]:.1f} mm")
         return "; ".join(words)
+
+    def _first(self, found: Sequence[str | None]) -> str | None:
+        """Return the first words that are found of an arm, after its name."""
+        named = zip(self._prefixes, found, strict=True)
+        return next((f"{prefix}{words}" for prefix, words in named if words), None)
 
     def _split(self, joined: np.ndarray) -> list[np.ndarray]:
         return np.split(joined, len(self._arms), axis=-1)

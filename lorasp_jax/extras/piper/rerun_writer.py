@@ -49,7 +49,8 @@ class Writer:
         if not hasattr(rerun, "RecordingStream"):
             raise ValueError(f"the installed rerun is not that of rerun-sdk: {INSTALL}")
         self._rerun, self._target = rerun, target
-        self._live, self._recording = "://" in target, None
+        self._live = "://" in target
+        self._stream: Any = None  # the present recording
         if not self._live:
             Path(target).mkdir(parents=True, exist_ok=True)
             return
@@ -63,28 +64,27 @@ class Writer:
 
     def close(self) -> None:
         """Complete the recording; raise RuntimeError if that fails."""
-        if self._recording is None:
+        if self._stream is None:
             return
         self._send_ticks()
         self._stream.flush(timeout_sec=_WRITING)
         self._stream.disconnect()
-        self._recording = None
+        self._stream = None
 
     def write(self, message: dict[str, Any]) -> None:
         """Log a message; raise RuntimeError if that fails."""
         if "episode" in message:
             self.close()
             self._begin(message["t"], f"episode {message['episode']}")
-        if self._recording is None:
+        if self._stream is None:
             return
         self._time = message.get("t", self._time)
         if "pose" in message:
             self._ticks.append(message)
             if len(self._ticks) == _TICKS:
                 self._send_ticks()
-                self._stream.flush(
-                    timeout_sec=_WRITING
-                )  # else what a viewer does not take piles up
+                # Else what a viewer does not take piles up.
+                self._stream.flush(timeout_sec=_WRITING)
             return
         self._stream.set_time("time", duration=self._time - self._start)
         if "images" in message:
@@ -99,10 +99,6 @@ class Writer:
         if "problem" in message:
             self._say(message["problem"], "WARN")
 
-    @property
-    def _stream(self) -> Any:
-        return self._recording
-
     def _begin(self, time: float, name: str) -> None:
         """Begin a recording, as the first free file of a folder or at the viewer."""
         stream = self._rerun.RecordingStream("lorasp_jax_piper")
@@ -113,7 +109,7 @@ class Writer:
                      if path.stem[8:].isdecimal()]  # fmt: skip
             stream.save(Path(self._target) / f"episode-{max(known, default=-1) + 1:04}.rrd")
         stream.send_recording_name(name)
-        self._recording, self._start, self._time = stream, time, time
+        self._stream, self._start, self._time = stream, time, time
         self._ticks: list[dict[str, Any]] = []
         self._lanes: list[float] = []
         self._asked: float | None = None
