@@ -1,12 +1,17 @@
 """Success of a policy as recorded, and in a scene that was shifted."""
 
+import dataclasses
 import functools
 from collections.abc import Callable, Iterable
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+
 import envs
 from envs import Env, Randomization
 from envs.physics import physics
+from envs.state import State
 from lorasp_jax.evaluation.programs import Rollout, make_rollout
 from lorasp_jax.evaluation.results import evaluate
 from lorasp_jax.training.demonstrations import map_threads
@@ -26,12 +31,15 @@ SHIFT = Randomization(
 hardly any policy of a scene that never changed succeeds. Cameras turn by up to half a degree."""
 DISTRACTORS = 2
 """Unrelated objects on the table of the shifted scene."""
+CROP = 0.95
+"""Side of the pictures' middle that `judge` shows with `cropped`: that of openpi's random crop."""
 
 
-def judge(run: Run, scenes: Iterable[str] = SCENES) -> dict[str, Any]:
+def judge(run: Run, scenes: Iterable[str] = SCENES, *, cropped: bool = False) -> dict[str, Any]:
     """Return the outcomes of the policy by scene and task, such as "shifted/pour".
 
-    Both scenes have layouts that no demonstration has; policies of one seed share them.
+    Both scenes have layouts that no demonstration has; policies of one seed share them. With
+    `cropped`, the policy sees the middle of the side camera's pictures, enlarged.
     """
     policy = run.policy.with_sampler()
     settings = run.config.evaluation
@@ -39,7 +47,7 @@ def judge(run: Run, scenes: Iterable[str] = SCENES) -> dict[str, Any]:
     def one(case: tuple[str, str]) -> str:
         scene, task = case
         env, rollout = _rollout(
-            scene, task, run.config.robot, settings.worlds, run.config.image_size
+            scene, task, run.config.robot, settings.worlds, run.config.image_size, cropped
         )
         key = RandomStream.FINAL_EVALUATION.key(run.config.seed, task)
         result = evaluate(policy, env, key, settings.episodes, rollout=rollout)
@@ -59,8 +67,25 @@ def judge(run: Run, scenes: Iterable[str] = SCENES) -> dict[str, Any]:
 
 @functools.cache
 def _rollout(
-    scene: str, task: str, robot: str, worlds: int, size: int
+    scene: str, task: str, robot: str, worlds: int, size: int, cropped: bool
 ) -> tuple[Env, Callable[..., Rollout]]:
     distractors, ranges = (DISTRACTORS, SHIFT) if scene == "shifted" else (0, None)
     env = envs.make(task, robot=robot, num_envs=worlds, image_size=size, distractors=distractors)
+    if cropped:
+        env = _Cropped(
+            **{field.name: getattr(env, field.name) for field in dataclasses.fields(env)}
+        )
     return env, make_rollout(env, ranges=ranges)
+
+
+class _Cropped(Env):
+    """An environment whose side camera shows the middle of its pictures, in their full size."""
+
+    def observe(self, state: State) -> dict[str, Any]:
+        observation = super().observe(state)
+        image = observation["image"]["side"]
+        side = int(image.shape[1] * CROP)
+        inside = slice(start := (image.shape[1] - side) // 2, start + side)
+        middle = image[:, inside, inside].astype(jnp.float32)
+        resized = jax.image.resize(middle, image.shape, "linear").round().astype(image.dtype)
+        return {**observation, "image": {**observation["image"], "side": resized}}

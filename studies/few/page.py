@@ -28,6 +28,18 @@ STEPS, OTHER_STEPS = 2000, (500, 8000)
 STEPPED, STEPPED_COUNTS = "lora_r64", (10, 50, 512)
 """Method and numbers of demonstrations that train for other numbers of steps, too."""
 SEEDS = (0, 1, 2)
+PARTS = {
+    "none": "none",
+    "openpi": "openpi's",
+    "openpi_cropped": "openpi's, the camera cropped in evaluation, too",
+    "crop": "openpi's crop alone",
+    "crop_cropped": "openpi's crop alone, the camera cropped in evaluation, too",
+    "rotate": "openpi's rotation alone",
+    "color": "openpi's colors alone",
+    "no_crop": "openpi's rotation and colors",
+    "lerobot": "LeRobot's",
+}
+"""Augmentation of `STEPPED` with the most demonstrations and the first seed -> its label."""
 SCENES = {"recorded": "as recorded", "shifted": "shifted"}
 DRAWS = 2_000
 """Resamplings of policies for the interval of a correlation."""
@@ -60,7 +72,7 @@ def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
         for kind in AUGMENT
     }
     figure.write(folder / "success.svg", points)
-    made = {}
+    made = {"augmentation": _parts_table(results)}
     for backbone in BACKBONES:
         for scene in SCENES:
             made[f"{backbone} {scene}"] = _success_table(points, backbone, scene)
@@ -78,6 +90,17 @@ def _success_table(points: Mapping[Any, Any], backbone: str, scene: str) -> str:
         for kind in AUGMENT
     ]
     return page.table(head, rows)
+
+
+def _parts_table(results: Results) -> str:
+    """Return success by the parts of augmentation."""
+    rows = []
+    for part, label in PARTS.items():
+        found = [results[cell(b, STEPPED, part, COUNTS[-1], SEEDS[0])] for b in BACKBONES]
+        rates = [statistics.success(_outcomes([x], scene)) for x in found for scene in SCENES]
+        rows.append([label, *map(page.percent, rates)])
+    head = [f"{name}, {scene}" for name in BACKBONES.values() for scene in SCENES.values()]
+    return page.table(["augmentation", *head], rows)
 
 
 def _steps_table(results: Results, backbone: str) -> str:

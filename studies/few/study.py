@@ -38,6 +38,19 @@ METHODS: dict[str, tuple[Method, tuple[str, ...]]] = {
 """Method -> its settings and, if layers differ in their methods, the rules."""
 TUNED_AS = {"lora_r16": "lora_r64"}
 """Method -> the method whose rate it takes."""
+_MOVES = AugmentConfig("openpi", brightness=0.0, contrast=0.0, hue=0.0)
+_CROP = replace(_MOVES, rotation=0.0)
+_PRESETS = {"none": AugmentConfig("none"), "openpi": AugmentConfig("openpi")}
+PARTS = {
+    "openpi_cropped": _PRESETS["openpi"],
+    "crop": _CROP,
+    "crop_cropped": _CROP,
+    "rotate": replace(_MOVES, crop=1.0),
+    "color": AugmentConfig("openpi", crop=1.0, rotation=0.0),
+    "no_crop": AugmentConfig("openpi", crop=1.0),
+    "lerobot": AugmentConfig("lerobot"),
+}
+"""Augmentation of the cells that only the table of `page.PARTS` has."""
 RATES = (3e-4, 1e-3)
 """Learning rates, of which pilots choose one per backbone and method."""
 PILOT_SEED = 1000
@@ -113,9 +126,11 @@ def _cells(scale: Scale, backbone: str) -> Iterator[Cell]:
                 rate = float(name.rpartition("/")[2])
                 config = make(method, scale.pilot_count, PILOT_SEED, rate=rate)
                 yield Cell(name, config, (), f"{backbone}/{method}", evaluate=_pilot, pool=pool)
-    kinds = [(m, a, scale.counts, {"augment": a}) for m in METHODS for a in page.AUGMENT]
+    kinds = [
+        (m, a, scale.counts, {"augment": AugmentConfig(a)}) for m in METHODS for a in page.AUGMENT
+    ]
     kinds += [
-        (page.STEPPED, page.kind(a, n), scale.stepped, {"augment": a, "steps": n})
+        (page.STEPPED, page.kind(a, n), scale.stepped, {"augment": AugmentConfig(a), "steps": n})
         for a in page.AUGMENT
         for n in page.OTHER_STEPS
     ]
@@ -127,6 +142,20 @@ def _cells(scale: Scale, backbone: str) -> Iterator[Cell]:
                 config = functools.partial(_tuned, pilots, make, method, count, seed, changes)
                 group = f"{backbone}/{method}/{kind}"
                 yield Cell(name, config, pilots, group, evaluate=judge, pool=pool)
+    yield from _parts(scale, backbone, make)
+
+
+def _parts(scale: Scale, backbone: str, make: Callable[..., Config]) -> Iterator[Cell]:
+    """Yield the policies that learn with parts of augmentation."""
+    if not scale.stepped:
+        return
+    pool, seed, pilots = scale.counts[-1], scale.seeds[0], _pilots(backbone, page.STEPPED)
+    for part, augment in PARTS.items():
+        name = page.cell(backbone, page.STEPPED, part, pool, seed)
+        changes = {"augment": augment}
+        config = functools.partial(_tuned, pilots, make, page.STEPPED, pool, seed, changes)
+        shown = functools.partial(judge, cropped=part.endswith("cropped"))
+        yield Cell(name, config, pilots, f"{backbone}/{part}", evaluate=shown, pool=pool)
 
 
 def _pilots(backbone: str, method: str) -> tuple[str, ...]:
@@ -155,7 +184,7 @@ def _config(
     seed: int,
     *,
     rate: float,
-    augment: Any = "none",
+    augment: AugmentConfig = _PRESETS["none"],
     steps: int = 0,
 ) -> Config:
     """Return the config of a policy's run; 0 steps: those of the scale."""
@@ -165,7 +194,7 @@ def _config(
         peft=peft,
         adapt=rules,
         model=replace(config.model, backbone=backbone),
-        data=replace(config.data, episodes=count, augment=AugmentConfig(augment)),
+        data=replace(config.data, episodes=count, augment=augment),
         optim=replace(config.optim, learning_rate=rate, steps=steps or config.optim.steps),
         seed=seed,
     )

@@ -1,5 +1,6 @@
 """The study of few demonstrations: its cells, and what its page makes of results."""
 
+import jax
 import numpy as np
 import pytest
 from scipy import stats
@@ -8,7 +9,7 @@ from lorasp_jax.config import Config
 from lorasp_jax.extras.study import statistics
 from lorasp_jax.extras.study.held_out import AllTasks
 from lorasp_jax.peft import FullFineTuning
-from studies.few import page, study
+from studies.few import judge, page, study
 from tests.runs import random_episodes
 
 STUDY = study.get_study("accelerator")
@@ -43,6 +44,9 @@ def test_policies_differ_in_what_their_names_say(results):
         assert config.model.backbone == backbone
         assert f"n{config.data.episodes}" == count
         assert f"s{config.seed}" == seed
+        if kind in study.PARTS:
+            assert config.data.augment == study.PARTS[kind]
+            continue
         augment, _, steps = kind.partition("_")
         assert config.data.augment.preset == augment
         assert config.optim.steps == int(steps or 2000)
@@ -63,6 +67,7 @@ def test_page(results, tmp_path, monkeypatch):
     expected = [100 * min(0.9, 0.1 + 0.13 * np.log(n)) - 3 for n in page.COUNTS]
     assert rates == pytest.approx(expected, abs=1.3)
     everything = made["smolvla error"].splitlines()[-1].split("|")[2:-1]
+    assert made["augmentation"].count("\n") == 2 + len(page.PARTS)
     error, loss = (float(cell.split()[0].replace("−", "-")) for cell in everything[:2])
     assert error < -0.99 < -0.5 < loss
 
@@ -84,3 +89,17 @@ def test_demonstrations_are_measured_as_a_dataset():
         assert episode.task == group.task
         np.testing.assert_array_equal(episode.state[0], group.state[row])
     assert source.control_dt == 0.1
+
+
+def test_a_cropped_camera_shows_the_middle_of_its_pictures():
+    (whole, _), (cropped, _) = (
+        judge._rollout("recorded", "press", "piper", 2, 40, crop) for crop in (False, True)
+    )
+    state = whole.reset(jax.random.key(0))
+    given, shown = whole.observe(state)["image"], cropped.observe(state)["image"]
+    np.testing.assert_array_equal(shown["wrist"], given["wrist"])
+    assert shown["side"].shape == given["side"].shape
+    middle = np.asarray(given["side"], float)[:, 1:39, 1:39]
+    np.testing.assert_allclose(shown["side"][:, 0, 0], middle[:, 0, 0], atol=1)  # its corners
+    np.testing.assert_allclose(shown["side"][:, -1, -1], middle[:, -1, -1], atol=1)
+    assert abs(shown["side"].mean() - middle.mean()) < 0.5
