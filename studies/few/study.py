@@ -126,11 +126,9 @@ def _cells(scale: Scale, backbone: str) -> Iterator[Cell]:
                 rate = float(name.rpartition("/")[2])
                 config = make(method, scale.pilot_count, PILOT_SEED, rate=rate)
                 yield Cell(name, config, (), f"{backbone}/{method}", evaluate=_pilot, pool=pool)
-    kinds = [
-        (m, a, scale.counts, {"augment": AugmentConfig(a)}) for m in METHODS for a in page.AUGMENT
-    ]
+    kinds = [(m, a, scale.counts, {"augment": _PRESETS[a]}) for m in METHODS for a in page.AUGMENT]
     kinds += [
-        (page.STEPPED, page.kind(a, n), scale.stepped, {"augment": AugmentConfig(a), "steps": n})
+        (page.STEPPED, page.kind(a, n), scale.stepped, {"augment": _PRESETS[a], "steps": n})
         for a in page.AUGMENT
         for n in page.OTHER_STEPS
     ]
