@@ -65,7 +65,8 @@ def test_a_recording_has_what_was_predicted_and_what_was_executed(bench, tmp_pat
     log = WatchedLog(tmp_path / "log", viewer)
     episode(log, bench, 0, latency=0.02, settings={"ahead": 1})
     episode(log, bench, 1, 0.3)
-    viewer.reply({"policy_timing": {"infer_ms": 13.0}, "server_timing": {"infer_ms": 15.5}})
+    timings = {"policy_timing": {"infer_ms": 13.0}, "server_timing": {"infer_ms": 15.5}}
+    viewer.reply(timings | {"active_rank": 11.5})
     log.close()
     assert viewer.dropped == 0
     rows = read(tmp_path / "films/episode-0000.rrd")
@@ -98,6 +99,7 @@ def test_a_recording_has_what_was_predicted_and_what_was_executed(bench, tmp_pat
     rows = read(tmp_path / "films/episode-0001.rrd")
     assert line(rows["joint_1/measured"])[0][-1] < 0.4
     assert line(rows["latency_ms/server/waiting"])[1] == pytest.approx([2.5])
+    assert line(rows["active_rank"])[1] == [11.5]
 
 
 @needs_rerun
