@@ -270,9 +270,8 @@ def test_a_bundle_holds_the_base_once_and_acts_alike(served, runs, tmp_path, cap
     )
     assert bundle.instructions == served.instructions
     for name in runs:
-        np.testing.assert_allclose(
-            actions(bundle, asked(bundle, name)), actions(served, asked(served, name)), atol=ROUNDING
-        )
+        expected = actions(served, asked(served, name))
+        np.testing.assert_allclose(actions(bundle, asked(bundle, name)), expected, atol=ROUNDING)
     arrays = [each.policy._weights for each in bundle.adapters]
     ids = [{id(array) for array in each} for each in arrays]
     names = json.loads((out / "pour" / "policy.json").read_text())["weights"]
