@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from lorasp_jax.base.arguments import pair
+from lorasp_jax.base.arguments import not_negative, pair
 from lorasp_jax.base.errors import report_error, run_command
 from lorasp_jax.extras.piper import options as shared
 from lorasp_jax.extras.piper import remote
@@ -47,11 +47,12 @@ def parser(program: str) -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("--task", default="", help="one of the simulation's tasks, for its request and time limit")
-    add("--seconds", type=float, default=0.0, help="length; default: the task's limit, or 60")
+    add("--seconds", type=not_negative, default=0.0, help="length; default: the task's limit, or "
+        "60")  # fmt: skip
     add("--dry-run", action="store_true", help="print commands instead of sending them; needs no "
         "arm, unless --can names one to read")  # fmt: skip
-    add("--reset-time", type=float, metavar="S", help="time between two episodes to put the scene "
-        "back [s]; default: until you press a key")  # fmt: skip
+    add("--reset-time", type=not_negative, metavar="S", help="time between two episodes to put "
+        "the scene back [s]; default: until you press a key")  # fmt: skip
     add("--teach", choices=("hand", "leader"), help="record what a person shows the arm, guided by "
         "hand or through a leader arm, in place of a policy")  # fmt: skip
     add("--image-size", type=int, default=224, help="of recorded pictures [px] (default: 224)")
