@@ -19,7 +19,7 @@ from lorasp_jax.extras.piper import rerun_log
 from lorasp_jax.extras.piper.__main__ import main as real
 from lorasp_jax.extras.piper.fake.__main__ import main as fake
 from lorasp_jax.extras.piper.rerun_log import Viewer, WatchedLog
-from lorasp_jax.extras.piper.rerun_writer import joint_names, main
+from lorasp_jax.extras.piper.rerun_writer import Writer, joint_names, main
 from lorasp_jax.extras.serving import wire
 from tests.extras.piper.piper_runs import Run, Turning, assert_safe
 
@@ -211,7 +211,7 @@ def test_a_full_disk_is_said_at_the_end(tmp_path):
 @pytest.mark.parametrize("target", ["http://a:1/proxy", "rerun+http://a", "rerun+http://a:1"])
 def test_addresses_are_checked(target):
     with pytest.raises(ValueError, match="must be a folder or an address rerun"):
-        Viewer(target, 0.1)
+        Writer(target)
 
 
 @needs_rerun
