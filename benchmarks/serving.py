@@ -53,11 +53,13 @@ class Waiting(ServedPolicies):
         """Return the only adapter."""
         return adapter
 
-    def run_mixed(self, adapters: Sequence[str], rows: Sequence[np.ndarray]) -> np.ndarray:
+    def run_mixed(
+        self, adapters: Sequence[str], rows: Sequence[np.ndarray]
+    ) -> tuple[np.ndarray, None]:
         """Return chunks of the states."""
         del adapters
         time.sleep(self._seconds)
-        return np.repeat(np.stack(rows)[:, None], self.spec.chunk, axis=1)
+        return np.repeat(np.stack(rows)[:, None], self.spec.chunk, axis=1), None
 
 
 def serve_waiting(image_size: int, cameras: int, seconds: float) -> None:

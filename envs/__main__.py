@@ -14,6 +14,7 @@ from envs.cli import commands
 from envs.names import MODES, names
 from envs.scene import distractors
 from lorasp_jax.base import compilation_cache as cache
+from lorasp_jax.base.arguments import seed
 from lorasp_jax.base.errors import run_command
 
 _DEFAULT = "(default: %(default)s)"
@@ -81,13 +82,6 @@ def _add_command(
     sub.add_argument("--image-size", type=int, default=image_size, help=text)
     sub.add_argument("--seed", type=seed, default=0, help=f"random seed {_DEFAULT}")
     return sub.add_argument
-
-
-def seed(text: str) -> int:
-    """Parse a seed of up to 32 bits; JAX would ignore higher bits."""
-    if not 0 <= (value := int(text)) < 2**32:
-        raise argparse.ArgumentTypeError(f"must be 0 to {2**32 - 1}, got {value}")
-    return value
 
 
 def finite(text: str) -> float:

@@ -242,6 +242,11 @@ def choose_cameras(
     return {name: available[name] for name in chosen or available}, {**others, **skipped}
 
 
+def joint_names(count: int) -> list[str]:
+    """Return the names of joints that nothing else names: joint_1 to joint_J."""
+    return [f"joint_{number}" for number in range(1, count + 1)]
+
+
 def concatenate(parts: Sequence[Episodes]) -> Episodes:
     """Concatenate episodes of one task and robot in host memory, padded to the longest.
 

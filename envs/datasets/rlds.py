@@ -37,7 +37,10 @@ METADATA = "metadata.json"
 _THREADS = ThreadPoolExecutor(8)
 """Shared by all open datasets: more threads would only wait for the GIL."""
 _TYPES: dict[str, Any] = {
-    "options": {"names?": [str]},
+    "options": {
+        **{"names?": [str], "action_names?": [str]},
+        "grippers?": {"state": [int], "action": [int]},
+    },
     "parts": [int],
     "steps": int,
     "attempted": int,
@@ -130,13 +133,9 @@ class Reader:
         with _reading(self.path):
             self.control_dt: float = float(self.metadata["control_dt"])
             self.num_steps: int = self.metadata["steps"]
-            names = self.metadata["options"].get("names", [])
-            if names and self.metadata.get("widths") != 2 * [len(names)]:
-                raise ValueError(f"options.names must name all dimensions, got {len(names)}")
-            kinds = ("state", "action") if names else ()
-            self.names: dict[str, list[str]] = dict.fromkeys(kinds, names)
-            grippers = [number for number, name in enumerate(names) if "gripper" in name]
-            self.grippers: dict[str, list[int]] = dict.fromkeys(kinds, grippers)
+            self.names: dict[str, list[str]]
+            self.grippers: dict[str, list[int]]
+            self.names, self.grippers = _dimensions(self.metadata)
             self._shared: dict[str, Any] = {name: self.metadata[name] for name in SHARED}
             self._shared |= {"instructions": tuple(self.metadata["instructions"]), "attempted": 1}
             check_regular(self.path / _INFO, self.path)
@@ -172,6 +171,22 @@ class Reader:
             return episode
 
 
+def _dimensions(metadata: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the names of the dimensions and which of them are grippers, as `Reader` has them."""
+    options, widths = metadata["options"], metadata.get("widths", (0, 0))
+    states = options.get("names", [])
+    names = {"state": states, "action": options.get("action_names", states)} if states else {}
+    known = {kind: [i for i, name in enumerate(row) if "gripper" in name]
+             for kind, row in names.items()}  # fmt: skip
+    grippers = options.get("grippers", known)
+    for kind, width in zip(("state", "action"), widths, strict=True):
+        if names and len(names[kind]) != width:
+            raise ValueError(f"options.names must name all dimensions, got {len(names[kind])}")
+        if not {*grippers.get(kind, [])} <= {*range(width)}:
+            raise ValueError(f"options.grippers of {kind} must be of {width} dimensions")
+    return names, grippers
+
+
 def write(episodes: Episodes, path: str | os.PathLike[str]) -> None:
     """Write a dataset folder, which appears only once it is complete.
 
@@ -201,8 +216,9 @@ class ShardWriter:
         metadata: content of metadata.json:
 
             - the fields of `Episodes` that all shards share;
-            - `options`: how the episodes were made, and `names` of the dimensions of states and
-              actions if they are not one arm's;
+            - `options`: how the episodes were made; `names` of the dimensions of states and
+              actions if they are not one arm's, `action_names` of actions if these have others;
+              `grippers`, which of them are grippers, if the names do not say it;
             - `parts`: number of episodes in each shard;
             - `steps`, `attempted`: total number of control steps and of attempts;
             - `cameras`: height and width of each camera's images;

@@ -15,7 +15,7 @@ from PIL import Image, UnidentifiedImageError
 from tensorflow_datasets.core.example_serializer import ExampleSerializer
 from tensorflow_datasets.proto import tf_example_pb2
 
-from envs.datasets.episodes import Episodes
+from envs.datasets.episodes import Episodes, joint_names
 
 _MAIN = {"side": "image"}  # feature of the main camera; the others are <name>_image
 _COMPRESSION = 1  # level of zlib, the fastest
@@ -31,7 +31,9 @@ def features(metadata: Mapping[str, Any]) -> tfds.features.FeaturesDict:
     """Define the features of a dataset from its metadata, documenting joint names and units."""
     types = tfds.features
     state_width, action_width = metadata["widths"]
-    joints = ", ".join(f"joint_{i + 1}" for i in range(state_width - 1))
+    names = metadata["options"].get("names", [])
+    targets = metadata["options"].get("action_names", names)
+    joints = ", ".join(joint_names(state_width - 1))
     images = {
         image_feature(camera): types.Image(
             shape=(*size, 3), encoding_format="png", doc=f"{camera} camera, before the action"
@@ -41,12 +43,12 @@ def features(metadata: Mapping[str, Any]) -> tfds.features.FeaturesDict:
     state = types.Tensor(
         shape=(state_width,),
         dtype=np.float32,
-        doc=f"measured before the action: {joints} [rad], gripper opening [m]",
+        doc=", ".join(names) or f"measured before the action: {joints} [rad], gripper opening [m]",
     )
     action = types.Tensor(
         shape=(action_width,),
         dtype=np.float32,
-        doc=_ACTION[metadata["actions"]].format(joints=joints),
+        doc=", ".join(targets) or _ACTION[metadata["actions"]].format(joints=joints),
     )
     step = {
         "observation": types.FeaturesDict(images | {"state": state}),

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from lorasp_jax.base.arguments import pair
-from lorasp_jax.base.errors import one_line
+from lorasp_jax.base.errors import describe_any
 from lorasp_jax.extras.piper.interpolation import Path
 from lorasp_jax.extras.serving import jpeg
 from lorasp_jax.extras.serving.client import PolicyClient, PolicyError
@@ -148,7 +148,7 @@ class Pilot:
             self._path, self._failure = Path(state, actions, self._settings.control_dt), ""
         except Exception as error:  # whatever it is, the arm must hold
             self._path, self._retry = None, now + RETRY
-            self._failure = f"no actions: {one_line(error) or type(error).__name__}"
+            self._failure = f"no actions: {describe_any(error)}"
 
     def _without_actions(self, now: float) -> str | None:
         """Say why there are no actions for now."""

@@ -1,6 +1,7 @@
 """Types of command-line arguments, for argparse."""
 
 import argparse
+import math
 import re
 from pathlib import Path
 
@@ -13,6 +14,20 @@ def positive(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"must be a positive whole number, got {text!r}")
     return int(text)
+
+
+def seed(text: str) -> int:
+    """Parse a seed of up to 32 bits; JAX would ignore higher bits."""
+    if not 0 <= (value := int(text)) < 2**32:
+        raise argparse.ArgumentTypeError(f"must be 0 to {2**32 - 1}, got {value}")
+    return value
+
+
+def not_negative(text: str) -> float:
+    """Parse a finite number of at least 0, such as a duration."""
+    if not 0 <= (value := float(text)) < math.inf:
+        raise argparse.ArgumentTypeError(f"must be finite and at least 0, got {text!r}")
+    return value
 
 
 def indices(text: str) -> tuple[int, ...]:

@@ -89,7 +89,7 @@ def describe(error: Exception, remedy: str = "") -> str | None:
 def describe_any(error: BaseException) -> str:
     """Describe an error on one line, a bug with its type."""
     known = describe(error) if isinstance(error, Exception) else None
-    return known or f"{type(error).__name__}: {one_line(error)}"
+    return known or ": ".join(filter(None, (type(error).__name__, one_line(error))))
 
 
 def missing_group(error: ModuleNotFoundError) -> str | None:

@@ -33,7 +33,7 @@ from lorasp_jax.base.writing import atomic_folder
 from lorasp_jax.data.batches import Steps
 from lorasp_jax.data.cache_writer import Column, map_column
 from lorasp_jax.data.joined import Joined, Part, Renamed, dataset_of, parts_of
-from lorasp_jax.data.source import Progress, Source, dimension_names, grippers
+from lorasp_jax.data.source import Progress, Source, dimensions
 
 FORMAT = "lorasp-cache-2"
 HEADER = "cache.json"
@@ -109,7 +109,7 @@ class _Writer:
     def __init__(self, folder: Path, source: Source) -> None:
         self.num_steps = 0
         self._parts = parts_of(source)
-        self._dimensions = _dimensions(source)
+        self._dimensions = dimensions(source)
         self._folder, self._metadata = folder, {}
         self._tasks: list[str] = []
         self._instructions: list[str] = []
@@ -167,13 +167,6 @@ def _check_compatible(shared: dict[str, Any], episode: Episodes) -> None:
                 f"all episodes of a cache must have the same {name}, got {shared[name]!r} in the "
                 f"first episode and {value!r} in an episode of {episode.task}"
             )
-
-
-def _dimensions(source: Source) -> dict[str, Any]:
-    """Return which dimensions are grippers, and their names if they have any."""
-    names = dimension_names(source)
-    found = {kind: grippers(source, kind) for kind in ("state", "action")} if len(source) else {}
-    return {"grippers": found} | ({"names": names} if names else {})
 
 
 def _metadata(episode: Episodes) -> dict[str, Any]:

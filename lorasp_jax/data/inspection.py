@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from envs.datasets.episodes import Episodes
+from envs.datasets.episodes import Episodes, joint_names
 from envs.rendering.video import side_by_side
 from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.config import AugmentConfig, Config
@@ -80,10 +80,7 @@ def summarize(source: Source) -> Summary:
 
 def _names(episode: Episodes) -> dict[str, list[str]]:
     """Return the dimension names of an episode in this project's own formats."""
-    state, action = (
-        [f"joint_{i + 1}" for i in range(array.shape[2] - 1)]
-        for array in (episode.state, episode.action)
-    )
+    state, action = (joint_names(array.shape[2] - 1) for array in (episode.state, episode.action))
     action = _END_EFFECTOR if episode.actions == "end_effector" else action
     return {"state": [*state, "gripper"], "action": [*action, "gripper"]}
 

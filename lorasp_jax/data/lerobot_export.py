@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-from envs.datasets.episodes import Episodes
+from envs.datasets.episodes import Episodes, joint_names
 from lorasp_jax.base.locks import locked
 from lorasp_jax.base.writing import atomic_folder, write_text
 from lorasp_jax.data.source import Progress, Source, dimension_names
@@ -148,10 +148,8 @@ def _statistics(array: np.ndarray) -> dict[str, Any]:
 
 
 def _features(episode: Episodes, names: dict[str, list[str]]) -> dict[str, Any]:
-    joints = names.get("state") or [
-        *(f"joint_{i + 1}.pos" for i in range(episode.state.shape[2] - 1)),
-        "gripper.pos",
-    ]
+    own = [*joint_names(episode.state.shape[2] - 1), "gripper"]
+    joints = names.get("state") or [f"{name}.pos" for name in own]  # as LeRobot's arms have it
     same = episode.actions == "joint" and episode.action.shape[2] == len(joints)
     actions = names.get("action") or (joints if same else None)
     features: dict[str, Any] = {

@@ -2,12 +2,13 @@
 
 import os
 from pathlib import Path
+from typing import Any
 
 from envs.datasets import rlds
 from envs.datasets.episodes import concatenate
 from lorasp_jax.base.locks import locked
 from lorasp_jax.base.writing import atomic_folder
-from lorasp_jax.data.source import Progress, Source
+from lorasp_jax.data.source import Progress, Source, dimensions
 
 EPISODES_PER_FILE = 16
 """Number of episodes per file, all in memory until it is written."""
@@ -30,7 +31,7 @@ def to_rlds(source: Source, path: str | os.PathLike[str], progress: Progress) ->
     if len(tasks) > 1:  # fail now, not after hours of writing images
         raise ValueError(f"an RLDS dataset can hold only one task, got {', '.join(tasks)}")
     with locked(Path(path)), atomic_folder(path) as folder:
-        writer, done = rlds.ShardWriter(folder, {}), 0
+        writer, done = rlds.ShardWriter(folder, _options(source)), 0
         for first in range(0, len(source), EPISODES_PER_FILE):
             numbers = range(first, min(first + EPISODES_PER_FILE, len(source)))
             shard = []
@@ -40,3 +41,12 @@ def to_rlds(source: Source, path: str | os.PathLike[str], progress: Progress) ->
                 progress(done, source.num_steps)
             writer.append(concatenate(shard))
         writer.complete()
+
+
+def _options(source: Source) -> dict[str, Any]:
+    """Return what is known of the dimensions, as `rlds.ShardWriter` keeps it."""
+    known = dimensions(source)
+    options: dict[str, Any] = {"grippers": known["grippers"]}
+    if names := known.get("names"):
+        options |= {"names": names["state"], "action_names": names["action"]}
+    return options

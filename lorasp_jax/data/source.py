@@ -1,7 +1,7 @@
 """The interface that all dataset formats share."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 from envs.datasets.episodes import Episodes
 
@@ -62,6 +62,13 @@ def grippers(source: Source, kind: str = "action") -> list[int]:
     """Return which dimensions of states or actions are grippers: the last, if nothing says so."""
     known: dict[str, list[int]] = getattr(source, "grippers", {})
     return known.get(kind) or [getattr(source.episode(0, ()), kind).shape[-1] - 1]
+
+
+def dimensions(source: Source) -> dict[str, dict[str, Any]]:
+    """Return which dimensions are `grippers`, and their `names` if they have any."""
+    names = dimension_names(source)
+    found = {kind: grippers(source, kind) for kind in ("state", "action")} if len(source) else {}
+    return {"grippers": found} | ({"names": names} if names else {})
 
 
 def describe_left_out(source: Source) -> str:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.datasets.episodes import Episodes
+from envs.datasets.episodes import Episodes, joint_names
 from lorasp_jax.adapters.compress.quantization import is_quantized
 from lorasp_jax.config import VALIDATION_WINDOWS
 from lorasp_jax.data.batches import RawBatch, Steps, encode, flatten, gather
@@ -70,7 +70,7 @@ class Windows:
         if not self.targets or not (in_radians or in_metres):
             titles = self._titles([f"action {i}" for i in range(1, len(actions) + 1)])
             return [(title, 1.0) for title in titles]
-        joints = iter(f"joint {i}" for i in range(1, len(actions) + 1))
+        joints = iter(joint_names(len(actions)))
         titles = self._titles(["gripper" if gripper else next(joints) for gripper in is_gripper])
         joint, gripper = (
             (_DEGREES, 180 / np.pi) if in_radians else ("", 1.0),

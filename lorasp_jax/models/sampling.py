@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, Self
 
 import jax
@@ -72,6 +72,7 @@ class Sampler:
         noise: jax.Array | None = None,
         slots: jax.Array | None = None,
         return_aux: bool = False,
+        summarize: Callable[[ModelAux], Any] | None = None,
         prefix: jax.Array | None = None,
         prefix_length: jax.Array | int = 0,
         guidance: float | None = None,
@@ -87,6 +88,8 @@ class Sampler:
             slots: `[A]` bool, slots to sample; the others stay zero. None samples all slots.
             return_aux: also return the adapters' aux. `aux["action"]` has a step axis before the
                 layer axis. The aux of action layers that run only once is broadcast over steps.
+            summarize: return (summary, summaries) in place of aux: of what runs once, and, with a
+                leading step axis, of what runs in each flow step.
             prefix: `[B, P, A]` normalized actions that the chunk must continue, P from 1 to C: what
                 remains of the previous chunk. See `real_time_chunking.sample`.
             prefix_length: d, `[]` or `[B]`, number of actions in the prefix that the robot executes
@@ -104,11 +107,15 @@ class Sampler:
             shape = (obs.state.shape[0], self.config.chunk, self.config.action_dim)
             noise = jax.random.normal(key, shape)
         velocity, aux = self.encode(obs)
+        if summarize:
+            velocity = _summarizing(velocity, summarize)
         sample = flow_matching.sample
         if prefix is not None:
             condition = {"prefix": prefix, "length": prefix_length, "guidance": guidance}
             sample = functools.partial(real_time_chunking.sample, overlap=overlap, **condition)
         actions, action_aux = sample(velocity, noise, num_steps=num_steps, slots=slots)
+        if summarize:
+            return actions, (summarize(aux), action_aux)
         return (actions, _with_steps(aux, action_aux, num_steps)) if return_aux else actions
 
     def encode(self, obs: Observation) -> tuple[flow_matching.Velocity, ModelAux]:
@@ -121,6 +128,18 @@ class Sampler:
         """Rebuild the modules of the prefix and of the flow steps."""
         graphdefs, tree = self.structure
         return map(nnx.merge, graphdefs, jax.tree.unflatten(tree, self.weights))
+
+
+def _summarizing(
+    velocity: flow_matching.Velocity, summarize: Callable[[ModelAux], Any]
+) -> flow_matching.Velocity:
+    """Let each step return a summary: stacking all of its aux takes time."""
+
+    def summarized(x_t: jax.Array, flow_time: jax.Array) -> tuple[jax.Array, Any]:
+        v_t, aux = velocity(x_t, flow_time)
+        return v_t, summarize({"action": aux})
+
+    return summarized
 
 
 def _with_steps(aux: ModelAux, action_aux: LayerAux, num_steps: int) -> ModelAux:

@@ -43,6 +43,8 @@ def test_any_error_has_a_line_and_a_bug_its_type():
     assert describe_any(ValueError("no such\ntask")) == "no such task"
     assert describe_any(KeyError("task")) == "KeyError: 'task'"
     assert describe_any(KeyboardInterrupt("8 of\n10")) == "KeyboardInterrupt: 8 of 10"
+    assert describe_any(KeyboardInterrupt()) == "KeyboardInterrupt"
+    assert describe_any(ValueError()) == "ValueError"
 
 
 def test_an_interruption_says_what_is_left():

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tensorflow_datasets as tfds
 from PIL import Image
 
 from envs.datasets import rlds
@@ -13,6 +14,7 @@ from envs.datasets.episodes import full_name
 from lorasp_jax.data import inspection, rlds_export
 from lorasp_jax.data.__main__ import main
 from lorasp_jax.data.cache import Cache
+from lorasp_jax.data.keys import Keys
 from lorasp_jax.data.lerobot import LeRobot
 from lorasp_jax.data.opening import open_source
 from tests.data.lerobots import VERSIONS, copied, cut, digest, golden
@@ -79,7 +81,7 @@ def test_convert_between_all_formats(capsys, tmp_path):
     assert info["description"] == "Recorded episodes of dataset by piper."
 
 
-@pytest.mark.parametrize(("to", "loses"), [("rlds", True), ("lerobot", True), ("cache", False)])
+@pytest.mark.parametrize(("to", "loses"), [("rlds", False), ("lerobot", True), ("cache", False)])
 def test_grippers_that_a_format_loses_are_named(to, loses, capsys, tmp_path):
     arguments = ["convert", golden("v3"), "--to", to, "--out", tmp_path / "out"]
     code, text, _ = run(capsys, *arguments, "--grippers", "0")
@@ -96,6 +98,24 @@ def test_rlds_in_several_files(tmp_path, monkeypatch):
     found = rlds.read(tmp_path / "rlds")
     assert found.length.tolist() == [25, 33, 40, 28]
     assert len(list((tmp_path / "rlds").glob("*array_record*"))) == 2
+
+
+def test_rlds_keeps_names_and_grippers(tmp_path):
+    source = LeRobot(golden("v21"), Keys(grippers=("joint_2",)))
+    source.names["action"] = [f"target of {name}" for name in source.names["action"]]
+    rlds_export.to_rlds(source, tmp_path / "rlds", lambda *_: None)
+    found = open_source(tmp_path / "rlds")
+    assert found.names == source.names
+    assert found.grippers == {"state": [1], "action": [1]}
+    form = tfds.builder_from_directory(tmp_path / "rlds").info.features["steps"]
+    assert form["observation"]["state"].doc.desc == ", ".join(source.names["state"])
+    assert form["action"].doc.desc == ", ".join(source.names["action"])
+    header = json.loads((tmp_path / "rlds/metadata.json").read_text())
+    for key, wrong in (("action_names", ["a"]), ("grippers", {"state": [6], "action": [7]})):
+        damaged = header | {"options": header["options"] | {key: wrong}}
+        (tmp_path / "rlds/metadata.json").write_text(json.dumps(damaged))
+        with pytest.raises(ValueError, match=f"options.{key.removeprefix('action_')}"):
+            open_source(tmp_path / "rlds")
 
 
 def test_two_datasets_in_one_cache(capsys, tmp_path):

@@ -163,7 +163,7 @@ def test_units(recorded):
     assert [name for name, _ in shorter.units] == [f"action {i}" for i in range(1, 7)]
     small = dataclasses.replace(found.raw, actions=0.1 * found.raw.actions)
     two = dataclasses.replace(unnamed, raw=small, grippers=(2, 6))
-    assert [*dict(two.units)][1:4] == ["joint 2 [°]", "gripper (3) [mm]", "joint 3 [°]"]
+    assert [*dict(two.units)][1:4] == ["joint_2 [°]", "gripper (3) [mm]", "joint_3 [°]"]
     odd = ("a [x]", "a [x]", "$b$", "c\n", *"efg")
     assert [*dict(dataclasses.replace(found, names=odd).units)][:4] == [
         "a [x] (1) [°]",

@@ -125,7 +125,7 @@ def test_the_robot_of_a_real_arm_moves_brakes_and_lets_go(plugin, monkeypatch, t
     robot.connect()
     try:
         pose = robot.get_observation()
-        target = pose | {"joint1.pos": pose["joint1.pos"] + 0.04}
+        target = pose | {"joint_1.pos": pose["joint_1.pos"] + 0.04}
         assert robot.send_action(target) == pytest.approx(target)
         clock.wait_until(clock.now() + 1.0)
         assert robot.get_observation() == pytest.approx(target, abs=0.02)

@@ -23,9 +23,9 @@ class Turning(StandIn):
         return request.state
 
     def run_mixed(self, adapters, rows):
-        chunks = super().run_mixed(adapters, rows)
+        chunks, ranks = super().run_mixed(adapters, rows)
         chunks[..., 0] += 0.03 * np.arange(1, self.spec.chunk + 1)
-        return chunks
+        return chunks, ranks
 
 
 @pytest.fixture(scope="module")

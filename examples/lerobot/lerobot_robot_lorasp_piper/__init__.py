@@ -20,7 +20,7 @@ from lerobot.utils.decorators import check_if_not_connected
 
 from lerobot_robot_lorasp_piper.follower import Follower
 from lorasp_jax.extras.piper.arm import PiperArm
-from lorasp_jax.extras.piper.arms import Arms
+from lorasp_jax.extras.piper.arms import Arms, dimension_names
 from lorasp_jax.extras.piper.clock import RealClock
 from lorasp_jax.extras.piper.fake.demonstrator import Demonstrator
 from lorasp_jax.extras.piper.fake.firmware import FakePiper
@@ -28,7 +28,7 @@ from lorasp_jax.extras.piper.fake.timing import Lockstep
 from lorasp_jax.extras.piper.fake.world import World
 from lorasp_jax.extras.piper.safety import Limits
 
-JOINTS = (*(f"joint{i}.pos" for i in range(1, 7)), "gripper.pos")
+JOINTS = tuple(dimension_names([""]))  # joint_1.pos to gripper.pos, as in exported datasets
 _scene: "LoraspFakePiper | None" = None  # the fake arm of this process, which the expert plans for
 
 

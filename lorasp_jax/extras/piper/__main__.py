@@ -4,12 +4,12 @@ import argparse
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from lorasp_jax.base.arguments import pair
-from lorasp_jax.base.errors import run_command
+from lorasp_jax.base.arguments import not_negative, pair
+from lorasp_jax.base.errors import report_error, run_command
 from lorasp_jax.extras.piper import options as shared
 from lorasp_jax.extras.piper import remote
 from lorasp_jax.extras.piper.arm import NoArm, PiperArm
@@ -47,11 +47,12 @@ def parser(program: str) -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("--task", default="", help="one of the simulation's tasks, for its request and time limit")
-    add("--seconds", type=float, default=0.0, help="length; default: the task's limit, or 60")
+    add("--seconds", type=not_negative, default=0.0, help="length; default: the task's limit, or "
+        "60")  # fmt: skip
     add("--dry-run", action="store_true", help="print commands instead of sending them; needs no "
         "arm, unless --can names one to read")  # fmt: skip
-    add("--reset-time", type=float, metavar="S", help="time between two episodes to put the scene "
-        "back [s]; default: until you press a key")  # fmt: skip
+    add("--reset-time", type=not_negative, metavar="S", help="time between two episodes to put "
+        "the scene back [s]; default: until you press a key")  # fmt: skip
     add("--teach", choices=("hand", "leader"), help="record what a person shows the arm, guided by "
         "hand or through a leader arm, in place of a policy")  # fmt: skip
     add("--image-size", type=int, default=224, help="of recorded pictures [px] (default: 224)")
@@ -95,28 +96,41 @@ def _run(options: argparse.Namespace) -> int:
         raise ValueError("--record has nothing to record in a --dry-run")
     shared.settings(options, prompts[0])
     shared.limits(options)
-    seconds = options.seconds or (task.time_limit if task else 60.0)
-    with ExitStack() as stack:
-        buses = _buses(options)
-        server = None
-        if not options.teach:
-            server = stack.enter_context(remote.policy(options, len(buses)))
-        device = {"video_size": options.camera_size, "framerate": options.camera_rate}
-        if options.camera_format:
-            device["input_format"] = options.camera_format
-        look = open_cameras(_sources(options, server), stack, device)
-        if server:
-            server.warn(prompts)
-        more = {"prompt": prompts[0], "image_size": options.image_size}
-        recorder = stack.enter_context(shared.recording(options, task, [*buses], **more))
-        log = stack.enter_context(closing(shared.open_log(options, server))) if server else None
-        arms = _open(options, buses, server)
-        stack.callback(arms.close)
-        arms.connect()
-        if not (options.dry_run or options.teach == "leader"):
-            arms.enable()
-        keys = stack.enter_context(Keyboard())
-        return _episodes(options, Rig(arms, look, server, recorder, log, keys), prompts, seconds)
+    seconds, code = options.seconds or (task.time_limit if task else 60.0), 0
+    try:
+        with ExitStack() as stack:
+            rig = _connect(options, stack, task, prompts)
+            code = _episodes(options, rig, prompts, seconds)
+    except Exception as error:
+        if code != HELD:
+            raise
+        report_error(error, Console(stderr=True))  # an incomplete recording hides no problem
+    return code
+
+
+def _connect(
+    options: argparse.Namespace, stack: ExitStack, task: Any, prompts: Sequence[str]
+) -> Rig:
+    """Open all that episodes need, and enable the arms."""
+    buses = _buses(options)
+    server = None
+    if not options.teach:
+        server = stack.enter_context(remote.policy(options, len(buses)))
+    device = {"video_size": options.camera_size, "framerate": options.camera_rate}
+    if options.camera_format:
+        device["input_format"] = options.camera_format
+    look = open_cameras(_sources(options, server), stack, device)
+    if server:
+        server.warn(prompts)
+    more = {"prompt": prompts[0], "image_size": options.image_size}
+    recorder = stack.enter_context(shared.recording(options, task, [*buses], **more))
+    log = stack.enter_context(closing(shared.open_log(options, server))) if server else None
+    arms = _open(options, buses, server)
+    stack.callback(arms.close)
+    arms.connect()
+    if not (options.dry_run or options.teach == "leader"):
+        arms.enable()
+    return Rig(arms, look, server, recorder, log, stack.enter_context(Keyboard()))
 
 
 def _buses(options: argparse.Namespace) -> dict[str, str]:

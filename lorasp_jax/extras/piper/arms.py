@@ -27,7 +27,8 @@ PERIOD = 0.005
 """Time between two commands [s], as in piper_sdk's examples (200 Hz)."""
 SIDES = ("left", "right")
 """Names of two arms, in their order."""
-_DIMENSIONS = (*(f"joint_{i + 1}.pos" for i in range(6)), "gripper.pos")
+JOINTS = (*(f"joint_{i + 1}" for i in range(6)), "gripper")
+"""Names of the numbers of a pose."""
 
 
 class Arms:
@@ -206,4 +207,4 @@ class Arms:
 
 def dimension_names(sides: Sequence[str]) -> list[str]:
     """Return the names of the dimensions of a pose, as LeRobot has them: left_joint_1.pos."""
-    return [f"{side}_{name}" if side else name for side in sides for name in _DIMENSIONS]
+    return [f"{side}_{name}.pos".lstrip("_") for side in sides for name in JOINTS]

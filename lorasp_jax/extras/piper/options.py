@@ -44,7 +44,7 @@ def add_shared(parser: argparse.ArgumentParser) -> None:
     add("--episodes", type=positive, default=1, help="default: %(default)s")
     add("--record", type=Path, metavar="FOLDER", help="add the successful episodes to an RLDS "
         "dataset, which train.py takes as --data.source")  # fmt: skip
-    add("--execute", type=int, default=5, help="actions of each chunk (default: %(default)s)")
+    add("--execute", type=positive, default=5, help="actions of each chunk (default: %(default)s)")
     add("--ahead", type=int, default=0, help="actions before their end to ask for the next chunk; "
         "0: the arm waits for the answer (default: %(default)s)")  # fmt: skip
     add("--control-dt", type=float, metavar="S", help="duration of an action [s]; default: the "
@@ -92,11 +92,17 @@ def period(options: argparse.Namespace) -> float:
     return 0.1 if options.control_dt is None else options.control_dt
 
 
+def tasks() -> list[str]:
+    """Return the names of the environments' tasks, and of one for two arms, which they lack."""
+    return [*names.names("task"), "hand_over"]
+
+
 def task(name: str) -> Any:
     """Return the `Task` of this name; raise ValueError if there is none."""
-    if name == "hand_over":  # for two arms, which the environments do not have
+    if name not in tasks():
+        raise ValueError(f"unknown task {name!r}: choose from {', '.join(tasks())}")
+    if name == "hand_over":
         return importlib.import_module("lorasp_jax.extras.piper.fake.hand_over").TASK
-    names.check("task", name)
     return importlib.import_module(f"envs.tasks.{name}").TASK
 
 

@@ -28,6 +28,7 @@ LARGEST = 320
 GRACE = 10.0
 """Time for what is queued at the end, and for files to be completed [s]."""
 _TIMINGS = ("policy_timing", "server_timing")  # of a reply
+_VALUES = ("active_rank",)  # the same
 
 
 class Viewer:
@@ -88,7 +89,8 @@ class Viewer:
     def reply(self, reply: Mapping[str, Any]) -> None:
         """Show what a server says of its answer besides the actions."""
         values = {name: _numbers(reply.get(name)) for name in _TIMINGS}
-        self._put({"reply": {name: given for name, given in values.items() if given}}, MOST)
+        message = {"reply": {name: given for name, given in values.items() if given}}
+        self._put(message | _numbers({name: reply.get(name) for name in _VALUES}), MOST)
 
     def close(self) -> None:
         """Wait until all is shown, but not for a viewer that is stuck; say what was lost.

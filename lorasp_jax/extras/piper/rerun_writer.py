@@ -14,12 +14,11 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from lorasp_jax.base.errors import one_line
-from lorasp_jax.extras.piper.arms import SIDES
+from lorasp_jax.extras.piper.arms import JOINTS, SIDES
 from lorasp_jax.extras.serving import wire
 
 INSTALL = 'pip install "lorasp_jax[rerun]"'
 _ADDRESS = re.compile(r"rerun(\+https?)?://\[?(?P<host>[^/\s]+?)\]?:(?P<port>\d+)/proxy")
-_NAMES = ("joint_1", "joint_2", "joint_3", "joint_4", "joint_5", "joint_6", "gripper")
 _COLORS = {"measured": (40, 160, 80), "commanded": (240, 150, 40), "predicted": (110, 150, 220)}
 _TICKS = 25  # poses that are sent at once
 _JPEG_QUALITY = 80
@@ -28,8 +27,8 @@ _CONNECTING, _WRITING = 2.0, 5.0  # s to wait for a viewer, and for what was log
 
 def joint_names(number: int) -> list[str]:
     """Return the names of the numbers of a pose, of one arm or of two."""
-    prefixes = [f"{side}/" for side in SIDES] if number > len(_NAMES) else [""]
-    return [prefix + name for prefix in prefixes for name in _NAMES][:number]
+    prefixes = [f"{side}/" for side in SIDES] if number > len(JOINTS) else [""]
+    return [prefix + name for prefix in prefixes for name in JOINTS][:number]
 
 
 class Writer:
@@ -93,6 +92,8 @@ class Writer:
             self._predict(message)
         if "reply" in message:
             self._reply(message["reply"])
+        if "active_rank" in message:
+            self._rank(message["active_rank"])
         if "observation" in message:
             self._joints = joint_names(len(message["state"]))
             self._say(message["prompt"], "INFO")
@@ -114,6 +115,8 @@ class Writer:
         self._lanes: list[float] = []
         self._asked: float | None = None
         self._cameras: list[str] = []
+        self._joints: list[str] = []
+        self._others = ["latency_ms", "steps"]
         self._said = ""
         self._known: set[str] = set()
 
@@ -164,6 +167,14 @@ class Writer:
         if whole is not None and policy is not None:
             self._scalar("latency_ms/server/waiting", whole - policy)
 
+    def _rank(self, rank: float) -> None:
+        """Log a mean active rank, which gets a view with the first."""
+        if "active_rank" not in self._others:
+            self._others.append("active_rank")
+            if self._cameras and self._joints:
+                self._stream.send_blueprint(self._blueprint())
+        self._scalar("active_rank", rank)
+
     def _send_ticks(self) -> None:
         """Log the poses that were collected: measured, commanded, and the age of the former."""
         if not self._ticks:
@@ -199,12 +210,11 @@ class Writer:
             for name, legend in zip(self._joints, legends, strict=True)
         ]
         pictures = [views.Spatial2DView(origin=f"camera/{name}") for name in self._cameras]
-        others = ("latency_ms", "steps")
         return views.Blueprint(
             views.Horizontal(
                 views.Vertical(*pictures, views.TextLogView(origin="events")),
                 views.Grid(*joints),
-                views.Vertical(*(views.TimeSeriesView(origin=name) for name in others)),
+                views.Vertical(*(views.TimeSeriesView(origin=name) for name in self._others)),
                 column_shares=[1, 2, 1],
             ),
             collapse_panels=True,

@@ -111,7 +111,8 @@ class Limits:
         Raises:
             ValueError: the speed or the box is out of range.
         """
-        if not 0 < speed <= (fastest := float(ROBOT.speed[0])):
+        fastest = float(ROBOT.speed[0])
+        if not 0 < speed <= fastest:
             raise ValueError(
                 f"the speed must be above 0 and at most {fastest:g} rad/s, got {speed}"
             )

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lorasp_jax.base.errors import one_line
+from lorasp_jax.base.errors import describe_any, one_line
 from lorasp_jax.extras.piper.arms import PERIOD, Arms
 from lorasp_jax.extras.piper.asking import InThread
 from lorasp_jax.extras.piper.cameras import Look, NoPicture
@@ -101,7 +101,7 @@ class Session:
         self._settle()
         if self._failures:
             first = self._failures[0]
-            self._attempt(self._hold, one_line(first) or type(first).__name__)
+            self._attempt(self._hold, describe_any(first))
         self._attempt(self._tell)
         if self._failures:
             raise self._failures[0]

@@ -43,15 +43,15 @@ class _Job:
     client: int
     adapter: Any
     row: Any
-    future: Future[tuple[np.ndarray, float]] = field(default_factory=Future)
+    future: Future[tuple[np.ndarray, float, float | None]] = field(default_factory=Future)
 
     def fail(self, sentence: str) -> None:
         with contextlib.suppress(InvalidStateError):  # the other thread was faster
             self.future.set_exception(PolicyFailure(sentence))
 
-    def answer(self, chunk: np.ndarray, milliseconds: float) -> None:
+    def answer(self, chunk: np.ndarray, milliseconds: float, rank: float | None) -> None:
         with contextlib.suppress(InvalidStateError):  # `close` has given it up
-            self.future.set_result((chunk, milliseconds))
+            self.future.set_result((chunk, milliseconds, rank))
 
 
 class Batcher:
@@ -80,11 +80,14 @@ class Batcher:
         self._thread = threading.Thread(target=self._work, name="policy", daemon=True)
         self._thread.start()
 
-    async def infer(self, client: int, adapter: Any, row: Any) -> tuple[np.ndarray, float]:
+    async def infer(
+        self, client: int, adapter: Any, row: Any
+    ) -> tuple[np.ndarray, float, float | None]:
         """Run one row, in a batch with others.
 
         Returns:
-            actions f32 `[C, J+1]`, and the time that the policy took for the batch [ms].
+            actions f32 `[C, J+1]`, the time that the policy took for the batch [ms], and the row's
+            mean active rank if the adapter has an energy gate.
 
         Raises:
             PolicyFailure: the policy failed, returned values that are not finite, or will not
@@ -181,7 +184,7 @@ class Batcher:
         adapters = padded([job.adapter for job in batch], self._policy.sizes)
         start = time.perf_counter()
         try:
-            actions = self._policy.run_mixed(adapters, rows)
+            actions, ranks = self._policy.run_mixed(adapters, rows)
             self._failed = False
         except Exception:  # a failed batch must not stop the server
             self._failed = True
@@ -194,9 +197,9 @@ class Batcher:
             self.seconds.observe(name, milliseconds / 1e3)
         self._counts["batches"] += 1
         self._counts["batched_requests"] += len(batch)
-        for job, chunk in zip(batch, actions, strict=False):
+        for number, (job, chunk) in enumerate(zip(batch, actions, strict=False)):
             if np.isfinite(chunk).all():
-                job.answer(chunk, milliseconds)
+                job.answer(chunk, milliseconds, None if ranks is None else float(ranks[number]))
             else:
                 job.fail("the policy returned actions that are not finite")
 

@@ -2,10 +2,10 @@
 
 import bisect
 from collections import defaultdict
-from collections.abc import Container, Mapping
+from collections.abc import Container, Mapping, Sequence
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-_BOUNDS = (
+SECONDS = (
     0.001,
     0.002,
     0.005,
@@ -19,22 +19,26 @@ _BOUNDS = (
     2.0,
     5.0,
     10.0,
-)  # s; our choice
+)
+"""Bounds of buckets of durations [s]; our choice."""
+RANKS = tuple(map(float, (1, 2, 4, 8, 16, 32, 64, 128)))
+"""The same of mean active ranks."""
 _GAUGES = ("open_connections",)
 
 
 class Histogram:
-    """Durations by adapter."""
+    """Durations, or other values, by adapter."""
 
-    def __init__(self) -> None:
-        """Begin without any."""
-        self._counts: dict[str, list[int]] = defaultdict(lambda: [0] * (len(_BOUNDS) + 1))
+    def __init__(self, bounds: Sequence[float] = SECONDS) -> None:
+        """Begin without any; `bounds` are ascending."""
+        self._bounds = bounds
+        self._counts: dict[str, list[int]] = defaultdict(lambda: [0] * (len(bounds) + 1))
         self._sums: dict[str, float] = defaultdict(float)
 
-    def observe(self, adapter: str, seconds: float) -> None:
-        """Add a duration [s]."""
-        self._counts[adapter][bisect.bisect_left(_BOUNDS, seconds)] += 1
-        self._sums[adapter] += seconds
+    def observe(self, adapter: str, value: float) -> None:
+        """Add a value, such as a duration [s]."""
+        self._counts[adapter][bisect.bisect_left(self._bounds, value)] += 1
+        self._sums[adapter] += value
 
     def keep(self, adapters: Container[str]) -> None:
         """Forget all other adapters."""
@@ -47,7 +51,7 @@ class Histogram:
         lines = [f"# TYPE {name} histogram"]
         for adapter, counts in list(self._counts.items()):
             label, total = f'adapter="{_escape(adapter)}"', 0
-            for bound, count in zip((*_BOUNDS, "+Inf"), list(counts), strict=True):
+            for bound, count in zip((*self._bounds, "+Inf"), list(counts), strict=True):
                 total += count
                 lines.append(f'{name}_bucket{{{label},le="{bound}"}} {total}')
             lines.append(f"{name}_sum{{{label}}} {self._sums[adapter]:.6f}")

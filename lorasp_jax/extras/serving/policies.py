@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lorasp_jax.extras.serving import ranks
 from lorasp_jax.extras.serving.adapters import OnDevice, is_shared
 from lorasp_jax.extras.serving.exported import Description, sampling_options
 from lorasp_jax.extras.serving.loading import Loaded
@@ -18,6 +19,8 @@ from lorasp_jax.policies.processor import Processor
 from lorasp_jax.policies.prompt_table import Ids, PromptTable
 from lorasp_jax.policies.tokenizer import Tokenizer
 
+Answer = tuple[np.ndarray, np.ndarray | None]
+"""Actions f32 `[B, C, J+1]` and mean active ranks `[B]`, None for methods without a gate."""
 FAR = 50.0
 """Normalized states beyond this are absurd, such as degrees in place of radians; our choice."""
 CACHED_PROMPTS = 1024
@@ -83,14 +86,18 @@ class CompiledPolicy:
 
     def run(self, batch: Mapping[str, Any]) -> np.ndarray:
         """Return actions f32 `[B, C, J+1]`; see `sample`."""
+        return self.answer(batch)[0]
+
+    def answer(self, batch: Mapping[str, Any]) -> Answer:
+        """Return actions and active ranks; see `answer`."""
         steps = self.description.num_steps
-        return np.asarray(
+        return jax.device_get(
             _program()(self._place(self.policy), batch, self._guidance, num_steps=steps)
         )
 
 
-def run_mixed(policies: Sequence[CompiledPolicy], batch: Mapping[str, Any]) -> np.ndarray:
-    """Return actions f32 `[B, C, J+1]`, each row with a policy of its own; see `sample_mixed`.
+def run_mixed(policies: Sequence[CompiledPolicy], batch: Mapping[str, Any]) -> Answer:
+    """Return actions and active ranks, each row with a policy of its own; see `sample_mixed`.
 
     All must be of one group. While it runs, an adapter takes its memory on the device once more for
     each of its rows.
@@ -99,7 +106,7 @@ def run_mixed(policies: Sequence[CompiledPolicy], batch: Mapping[str, Any]) -> n
     rows = [(placed[each].model.own, placed[each].processor) for each in policies]
     model, guidance = dataclasses.replace(policies[0].policy.model, own=[]), policies[0]._guidance
     steps = policies[0].description.num_steps
-    return np.asarray(_mixed_program()(model, rows, batch, guidance, num_steps=steps))
+    return jax.device_get(_mixed_program()(model, rows, batch, guidance, num_steps=steps))
 
 
 def _group(policy: Policy) -> Any:
@@ -130,8 +137,8 @@ def _tokens(table: PromptTable, words: Tokenizer) -> Callable[[str], dict[str, n
 
 @functools.cache
 def _program() -> Any:
-    """Return the compiled `sample`, which all policies share."""
-    return jax.jit(sample, static_argnames="num_steps", compiler_options=sampling_options())
+    """Return the compiled `answer`, which all policies share."""
+    return jax.jit(answer, static_argnames="num_steps", compiler_options=sampling_options())
 
 
 @functools.cache
@@ -195,14 +202,21 @@ def without_prompts(policy: Policy) -> Policy:
     return dataclasses.replace(policy, processor=processor).with_sampler()
 
 
-def sample(
+def sample(policy: Policy, batch: Mapping[str, Any], *, num_steps: int) -> jax.Array:
+    """Return the actions of `answer`."""
+    return answer(policy, batch, num_steps=num_steps)[0]
+
+
+def answer(
     policy: Policy,
     batch: Mapping[str, Any],
     guidance: jax.Array | None = None,
     *,
     num_steps: int,
-) -> jax.Array:
-    """Sample `[B, C, J+1]`; a row's result does not depend on the other rows.
+) -> tuple[jax.Array, jax.Array | None]:
+    """Sample `[B, C, J+1]`, and mean active ranks `[B]`, None for methods without an energy gate.
+
+    A row's result does not depend on the other rows.
 
     Args:
         policy: from `without_prompts`.
@@ -220,15 +234,17 @@ def sample(
             "overlap": batch.get("overlap"),
             "guidance": guidance,
         }
-    chunk = policy.model.sample_actions(
+    rows = len(batch["state"])
+    chunk, (once, steps) = policy.model.sample_actions(
         None,
         _encode(processor, batch),
         num_steps=num_steps,
         noise=batch["noise"],
         slots=processor.flow_slots,
+        summarize=lambda aux: ranks.summed(aux, rows),
         **condition,
     )
-    return processor.decode(chunk, batch["state"])
+    return processor.decode(chunk, batch["state"]), ranks.mean(once, steps)
 
 
 def sample_mixed(
@@ -238,8 +254,8 @@ def sample_mixed(
     guidance: jax.Array | None = None,
     *,
     num_steps: int,
-) -> jax.Array:
-    """Sample `[B, C, J+1]`, each row with a policy of its own; the other arguments are `sample`'s.
+) -> tuple[jax.Array, jax.Array | None]:
+    """Do the same, each row with a policy of its own; the other arguments are those of `answer`.
 
     Args:
         model: with the base's weights.
@@ -248,10 +264,11 @@ def sample_mixed(
     adapters, processors = zip(*policies, strict=True)
     processors = jax.tree.map(lambda *leaves: jnp.stack(leaves), *processors)
 
-    def one(model: SharedSampler, row: tuple[Processor, dict[str, Any]]) -> jax.Array:
+    def one(model: SharedSampler, row: tuple[Processor, dict[str, Any]]) -> Any:
         processor, inputs = row
         inputs = jax.tree.map(lambda leaf: leaf[None], inputs)
-        return sample(Policy(model, processor), inputs, guidance, num_steps=num_steps)[0]
+        found = answer(Policy(model, processor), inputs, guidance, num_steps=num_steps)
+        return jax.tree.map(lambda leaf: leaf[0], found)
 
     return by_row(one, model, adapters, (processors, dict(batch)))
 

@@ -21,7 +21,7 @@ from lorasp_jax.extras.serving.exported import (
     PolicyInterface,
     build_row,
 )
-from lorasp_jax.extras.serving.policies import CACHED_PROMPTS, CompiledPolicy, run_mixed
+from lorasp_jax.extras.serving.policies import CACHED_PROMPTS, Answer, CompiledPolicy, run_mixed
 from lorasp_jax.extras.serving.requests import PolicySpec, Request
 
 _log = logging.getLogger(__name__)
@@ -284,14 +284,16 @@ class ServedPolicies:
 
     def run(self, adapter: Adapter, rows: Sequence[dict[str, Any]]) -> np.ndarray:
         """Return actions f32 `[B, C, J+1]`; B is one of `sizes`."""
-        return adapter.policy.run(self._batch(adapter, rows))
+        return self.run_mixed([adapter] * len(rows), rows)[0]
 
-    def run_mixed(self, adapters: Sequence[Adapter], rows: Sequence[dict[str, Any]]) -> np.ndarray:
-        """Return actions f32 `[B, C, J+1]` of the adapters of B rows, all of one group."""
-        if len({*adapters}) == 1:
-            return self.run(adapters[0], rows)
-        policies = [each.policy for each in adapters]
-        return run_mixed(policies, self._batch(adapters[0], rows))  # type: ignore[arg-type]
+    def run_mixed(self, adapters: Sequence[Adapter], rows: Sequence[dict[str, Any]]) -> Answer:
+        """Return actions and active ranks of the adapters of B rows, all of one group."""
+        batch, policies = self._batch(adapters[0], rows), [each.policy for each in adapters]
+        if len({*adapters}) > 1:
+            return run_mixed(policies, batch)  # type: ignore[arg-type]
+        if isinstance(policies[0], CompiledPolicy):
+            return policies[0].answer(batch)
+        return policies[0].run(batch), None
 
     def _batch(self, adapter: Adapter, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         """Stack rows, and draw their noise."""

@@ -102,6 +102,7 @@ class PolicyServer:
         """
         names = ("connections", "open_connections", "refused_connections", "requests", "errors")
         self._max_clients, self._seconds = max_clients, metrics.Histogram()
+        self._ranks = metrics.Histogram(metrics.RANKS)
         self.counts: Counter[str] = Counter(dict.fromkeys(names, 0))
         self._policy, self._token = policy, token
         self._batcher = Batcher(policy, self.counts)
@@ -157,6 +158,7 @@ class PolicyServer:
             return self._watched(request.path)
         if request.path == "/metrics":
             histograms = {"request_seconds": self._seconds, "batch_seconds": self._batcher.seconds}
+            histograms["active_rank"] = self._ranks
             text = metrics.text(self.counts, histograms, self._policy.instructions)
             page = connection.respond(http.HTTPStatus.OK, text)
             del page.headers["Content-Type"]
@@ -237,7 +239,7 @@ class PolicyServer:
         if isinstance(frame, str):
             raise wire.FrameError("a request must be a binary frame")
         adapter, row, actions = await asyncio.to_thread(self._read, client, frame)
-        chunk, policy_ms = await self._batcher.infer(client.number, adapter, row)
+        chunk, policy_ms, rank = await self._batcher.infer(client.number, adapter, row)
         client.previous = chunk
         timing = {"infer_ms": (time.perf_counter() - start) * 1e3}
         if client.previous_ms is not None:
@@ -247,6 +249,9 @@ class PolicyServer:
             "policy_timing": {"infer_ms": policy_ms},
             "server_timing": timing,
         }
+        if rank is not None:
+            reply["active_rank"] = client.seen.active_rank = rank
+            self._ranks.observe(str(adapter), rank)
         await connection.send(wire.pack(reply))
         client.previous_ms = (time.perf_counter() - start) * 1e3
         self._seconds.observe(str(adapter), client.previous_ms / 1e3)

@@ -60,6 +60,7 @@ class Seen:
         adapter: its adapter's name.
         asked: when it came [s, monotonic].
         last_ms: time until the last answer was sent.
+        active_rank: mean active rank of the last answer, if its adapter has an energy gate.
     """
 
     address: str
@@ -69,11 +70,12 @@ class Seen:
     adapter: str = ""
     asked: float | None = None
     last_ms: float | None = None
+    active_rank: float | None = None
 
     def keep(self, adapter: str, request: Request) -> None:
         """Remember a request."""
         self.images, self.prompt, self.adapter = request.images, request.prompt or "", adapter
-        self.asked = time.monotonic()
+        self.asked, self.active_rank = time.monotonic(), None
 
 
 class Watch:
@@ -154,6 +156,7 @@ def _describe(number: int, seen: Seen, now: float) -> dict[str, Any]:
         "cameras": [*seen.images],
         "idle_s": None if seen.asked is None else round(now - seen.asked, 1),
         "last_ms": seen.last_ms,
+        "active_rank": seen.active_rank,
     }
 
 

@@ -222,9 +222,9 @@ def test_only_servers_that_continue_chunks_are_told_how_far_the_arm_is(execution
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--task", "juggle"], "unknown task 'juggle'"),
+        (["--task", "juggle"], "unknown task 'juggle': choose from open_pot, "),
+        (["--task", "juggle"], "two_baskets, hand_over"),
         (["--latency", "0.2"], "--latency must be 0 to 0.15 s"),
-        (["--thinking", "-1"], "--thinking must be at least 0 s, got -1.0"),
         (["--speed", "9"], "at most 3 rad/s, got 9.0"),
         (["--ahead", "5"], "ahead must be 0 to 4"),
         (["--arm", "piper-x"], "the fake arm is a piper, not a piper-x"),
@@ -233,6 +233,23 @@ def test_only_servers_that_continue_chunks_are_told_how_far_the_arm_is(execution
 def test_the_fake_arm_refuses_wrong_options(words, message, tmp_path, capsys):
     assert fake(["--expert", "--log", str(tmp_path), *words]) == 2
     assert message in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (fake, ["--thinking", "nan"]),
+        (fake, ["--noise", "-1"]),
+        (fake, ["--seed", "-1"]),
+        (fake, ["--execute", "0"]),
+        (real, ["--seconds", "inf"]),
+        (real, ["--reset-time", "nan"]),
+    ],
+)
+def test_numbers_are_checked_where_they_are_typed(command, words, capsys):
+    with pytest.raises(SystemExit):
+        command(words)
+    assert f"argument {words[0]}: must be" in capsys.readouterr().err
 
 
 def test_no_server(monkeypatch, capsys):

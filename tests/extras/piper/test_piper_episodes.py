@@ -22,6 +22,7 @@ from lorasp_jax.extras.piper.arms import SIDES
 from lorasp_jax.extras.piper.fake.firmware import FakePiper
 from lorasp_jax.extras.piper.fake.timing import RealTime
 from lorasp_jax.extras.piper.keys import SIGNALS, Keyboard
+from lorasp_jax.extras.piper.log import Log
 from lorasp_jax.extras.piper.recording import Recording
 from lorasp_jax.extras.piper.session import Session
 from tests.extras.piper.benches import channel
@@ -203,6 +204,18 @@ def test_patience_is_an_option(linked, tmp_path, capsys, monkeypatch):
         assert real([*words, "--log", str(tmp_path / "log")]) == HELD
         policy.gate.set()
     assert "did not answer within 0.2 s" in capsys.readouterr().out
+
+
+def test_a_log_that_cannot_be_completed_hides_no_problem(linked, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(Session, "run", lambda *_: "no way")
+    monkeypatch.setattr(Log, "close", Mock(side_effect=OSError("a recording is incomplete")))
+    with serving(Still()) as server:
+        words = ["--server", server.address, *linked, "--dry-run", "--log"]
+        assert real([*words, str(tmp_path / "held")]) == HELD
+        assert "error: a recording is incomplete" in capsys.readouterr().err
+        monkeypatch.setattr(Session, "run", lambda *_: None)
+        assert real([*words, str(tmp_path / "done")]) == 2
+    assert "error: a recording is incomplete" in capsys.readouterr().err
 
 
 def test_a_dry_run_of_the_real_command(linked, tmp_path, capsys):

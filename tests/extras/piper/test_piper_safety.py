@@ -191,8 +191,9 @@ def test_a_target_that_is_not_finite_is_refused():
 
 
 def test_wrong_settings_are_refused():
-    with pytest.raises(ValueError, match="at most 3 rad/s, got 4"):
-        Limits.of(speed=4)
+    for speed in (4, 0, -1, np.nan):
+        with pytest.raises(ValueError, match=f"above 0 and at most 3 rad/s, got {speed}"):
+            Limits.of(speed=speed)
     with pytest.raises(ValueError, match="must not be empty"):
         Limits.of(box_low=(0.7, 0.0, 0.0))
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from websockets.exceptions import ConcurrencyError
 
+from lorasp_jax.base.errors import describe_any
 from lorasp_jax.extras.piper.cameras import NoPicture
 from lorasp_jax.extras.piper.fake import frames
 from lorasp_jax.extras.piper.keys import SIGNALS
@@ -206,7 +207,7 @@ def test_every_other_error_brakes_and_is_raised(bench, case):
     run = Run(bench, Turning(), **{name: x for name, x in part.items() if name == where})
     with pytest.raises(error, match="it broke"):
         run(30.0, work if where == "done" else lambda: False)
-    assert run.said == ["holding: it broke"]
+    assert run.said == [f"holding: {describe_any(error('it broke'))}"]
     assert_braked(run)
 
 

@@ -19,7 +19,7 @@ from lorasp_jax.extras.piper import rerun_log
 from lorasp_jax.extras.piper.__main__ import main as real
 from lorasp_jax.extras.piper.fake.__main__ import main as fake
 from lorasp_jax.extras.piper.rerun_log import Viewer, WatchedLog
-from lorasp_jax.extras.piper.rerun_writer import joint_names, main
+from lorasp_jax.extras.piper.rerun_writer import Writer, joint_names, main
 from lorasp_jax.extras.serving import wire
 from tests.extras.piper.piper_runs import Run, Turning, assert_safe
 
@@ -65,7 +65,8 @@ def test_a_recording_has_what_was_predicted_and_what_was_executed(bench, tmp_pat
     log = WatchedLog(tmp_path / "log", viewer)
     episode(log, bench, 0, latency=0.02, settings={"ahead": 1})
     episode(log, bench, 1, 0.3)
-    viewer.reply({"policy_timing": {"infer_ms": 13.0}, "server_timing": {"infer_ms": 15.5}})
+    timings = {"policy_timing": {"infer_ms": 13.0}, "server_timing": {"infer_ms": 15.5}}
+    viewer.reply(timings | {"active_rank": 11.5})
     log.close()
     assert viewer.dropped == 0
     rows = read(tmp_path / "films/episode-0000.rrd")
@@ -98,6 +99,7 @@ def test_a_recording_has_what_was_predicted_and_what_was_executed(bench, tmp_pat
     rows = read(tmp_path / "films/episode-0001.rrd")
     assert line(rows["joint_1/measured"])[0][-1] < 0.4
     assert line(rows["latency_ms/server/waiting"])[1] == pytest.approx([2.5])
+    assert line(rows["active_rank"])[1] == [11.5]
 
 
 @needs_rerun
@@ -209,7 +211,7 @@ def test_a_full_disk_is_said_at_the_end(tmp_path):
 @pytest.mark.parametrize("target", ["http://a:1/proxy", "rerun+http://a", "rerun+http://a:1"])
 def test_addresses_are_checked(target):
     with pytest.raises(ValueError, match="must be a folder or an address rerun"):
-        Viewer(target, 0.1)
+        Writer(target)
 
 
 @needs_rerun

@@ -21,7 +21,8 @@ class StandIn:
 
     `indices` keeps the numbers of connections and of requests on them, `gate` holds every batch
     back until it is set, `seconds` is the time a batch takes, and `failure` is raised instead of an
-    answer. Adapters that `groups` maps to the same name share batches.
+    answer. `ranks` are the active ranks of a batch. Adapters that `groups` maps to the same name
+    share batches.
     """
 
     groups: ClassVar[dict[str, str]] = {}
@@ -31,7 +32,7 @@ class StandIn:
         self.spec, self.sizes, self.seconds = spec, (1, 2, 4, 8), seconds
         self.instructions = dict.fromkeys(adapters, instructions)
         self.routing, self.together = "name", 8
-        self.gate, self.failure = threading.Event(), None
+        self.gate, self.failure, self.ranks = threading.Event(), None, None
         self.batches, self.indices = [], []
         self.gate.set()
 
@@ -76,10 +77,11 @@ class StandIn:
             raise self.failure
         offsets = [list(self.instructions).index(each) * 1000 for each in adapters]
         chunks = np.repeat(np.stack(rows)[:, None], self.spec.chunk, axis=1)
-        return chunks + np.float32(offsets)[:, None, None]
+        ranks = None if self.ranks is None else self.ranks[: len(rows)]
+        return chunks + np.float32(offsets)[:, None, None], ranks
 
     def run(self, adapter, rows):
-        return self.run_mixed([adapter] * len(rows), rows)
+        return self.run_mixed([adapter] * len(rows), rows)[0]
 
 
 @contextlib.contextmanager

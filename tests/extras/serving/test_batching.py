@@ -23,7 +23,7 @@ class Clients:
 
     async def ask(self, client, adapter="base"):
         row = np.full(SPEC.state_dim, client, np.float32)
-        actions, _ = await self.batcher.infer(client, adapter, row)
+        actions, *_ = await self.batcher.infer(client, adapter, row)
         return float(actions[0, 0])
 
     async def queue(self, *requests):

@@ -44,7 +44,7 @@ class Echo:
 
     def sample_actions(self, key, observation, *, noise, **options):
         self.seen.append((observation, options["slots"]))
-        return noise
+        return noise, (None, None)
 
 
 def checkpoint(folder, stats):

@@ -79,6 +79,21 @@ def test_status_says_what_the_server_does(server):
     assert status(server)["clients"] == []  # those that have gone, and their pictures
 
 
+def test_active_ranks_are_replied_and_shown():
+    policy = StandIn()
+    with serving(policy) as server, connect(server) as client:
+        assert "active_rank" not in client.infer(observation())
+        assert status(server)["clients"][0]["active_rank"] is None
+        assert "active_rank_count" not in fetch(server, "/metrics")[2].decode()
+        policy.ranks = np.float32([11.5, 7, 7, 7])
+        assert client.infer(observation())["active_rank"] == 11.5
+        assert status(server)["clients"][0]["active_rank"] == 11.5
+        series = fetch(server, "/metrics")[2].decode().splitlines()
+    assert 'lorasp_jax_active_rank_bucket{adapter="base",le="8.0"} 0' in series
+    assert 'lorasp_jax_active_rank_bucket{adapter="base",le="16.0"} 1' in series
+    assert 'lorasp_jax_active_rank_sum{adapter="base"} 11.500000' in series
+
+
 def test_the_queue_is_what_waits_and_what_runs():
     policy = StandIn()
     policy.gate.clear()

@@ -14,6 +14,7 @@ from rich.console import Console
 
 from envs.rendering.video import side_by_side, write_video
 from lorasp_jax.base import compilation_cache as cache
+from lorasp_jax.base.arguments import not_negative, seed
 from lorasp_jax.base.errors import run_command
 from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.extras.piper import options as shared
@@ -52,19 +53,16 @@ def parser(program: str) -> argparse.ArgumentParser:
         epilog="Time stands still while the policy thinks, unless --realtime is given.",
     )
     add = parser.add_argument
-    add(
-        "--task",
-        default="press",
-        help="open_pot, pick_place, pour or press, or hand_over for two arms "
-        "(default: %(default)s)",
-    )
+    add("--task", default="press", help=f"{', '.join(shared.tasks()[:-1])}, or "
+        f"{shared.tasks()[-1]} for two arms (default: %(default)s)")  # fmt: skip
     add("--expert", action="store_true", help="the scripted expert in place of a server")
-    add("--seed", type=int, default=0, help="of the first layout (default: %(default)s)")
+    add("--seed", type=seed, default=0, help="of the first layout (default: %(default)s)")
     add("--latency", type=float, default=0.0, help="of commands on their way to the motors [s], "
         f"at most {_LARGEST_LATENCY} (default: %(default)s)")  # fmt: skip
-    add("--thinking", type=float, default=0.0, help="time from observation to actions [s] "
+    add("--thinking", type=not_negative, default=0.0, help="time from observation to actions [s] "
         "(default: %(default)s)")  # fmt: skip
-    add("--noise", type=float, default=2e-4, help="of measured angles [rad] (default: %(default)s)")
+    add("--noise", type=not_negative, default=2e-4, help="of measured angles [rad] "
+        "(default: %(default)s)")  # fmt: skip
     add("--realtime", action="store_true", help="let time run while the policy thinks")
     add("--image-size", type=int, default=64, help="of pictures [px], for policies that do not "
         "say it (default: %(default)s)")  # fmt: skip
@@ -76,8 +74,6 @@ def parser(program: str) -> argparse.ArgumentParser:
 def _run(options: argparse.Namespace, console: Console) -> None:
     if not 0 <= options.latency <= _LARGEST_LATENCY:
         raise ValueError(f"--latency must be 0 to {_LARGEST_LATENCY} s, got {options.latency}")
-    if options.thinking < 0:
-        raise ValueError(f"--thinking must be at least 0 s, got {options.thinking}")
     if options.arm != "piper":
         raise ValueError(f"the fake arm is a piper, not a {options.arm}")
     task = shared.task(options.task)
