@@ -271,6 +271,11 @@ class Cache:
         """Index of each episode's dataset among `parts`, `[E]` int32."""
         return dataset_of(self)
 
+    @property
+    def episodes(self) -> np.ndarray:
+        """Number of the episode of each step, `[N]`."""
+        return np.repeat(np.arange(len(self)), self._columns["length"])
+
     def part_of(self, task: str) -> Part:
         """Return the first dataset with a task."""
         row = self.metadata["tasks"].index(task)
