@@ -29,7 +29,8 @@ from lorasp_jax.training.run_folder import ADVANTAGES
 _FOLDS = 5
 _BATCH = 32  # observations whose features are computed at once
 _MIXED = 32  # random mixtures of tokens, and of their features: 1,024 numbers an observation
-_RIDGE = 1e-2  # relative to the variance of a feature, times the number of steps
+_HIDDEN = 512  # random rectified units of the nonlinear fit
+_RIDGES = (0.01, 0.1, 1.0)  # relative to the variance of a feature, times the number of steps
 
 
 class Advantages(NamedTuple):
@@ -154,17 +155,32 @@ def _features(model: Backbone, processor: Processor, raw: RawBatch) -> jax.Array
 def _values(
     observed: np.ndarray, returns: np.ndarray, episode: np.ndarray, known: np.ndarray
 ) -> np.ndarray:
-    """Predict the return of every step by fits that leave the step's episode out, `[N]`."""
+    """Predict the return of every step by fits that leave the step's episode out, `[N]`.
+
+    Of linear and nonlinear fits of several strengths, the one with the least error is taken.
+    """
     x = (observed - observed.mean(0)) / np.maximum(observed.std(0), 1e-6)
-    mean = returns[known].mean()
+    random = np.random.default_rng(0).normal(size=(x.shape[1], _HIDDEN)) / np.sqrt(x.shape[1])
     fold = np.random.default_rng(0).permutation(episode.max() + 1)[episode] % _FOLDS
-    value = np.zeros(len(x))
+    fits = []
+    for features in (x, np.maximum(x @ random.astype(np.float32), 0)):
+        fits += _held_out_fits(features, returns, fold, known)
+    errors = [np.square(value - returns)[known].mean() for value in fits]
+    return fits[int(np.argmin(errors))]
+
+
+def _held_out_fits(
+    x: np.ndarray, returns: np.ndarray, fold: np.ndarray, known: np.ndarray
+) -> list[np.ndarray]:
+    """Return predictions `[N]` by ridge regression on `[N, F]`, for each of `_RIDGES`."""
+    mean, fits = returns[known].mean(), [np.zeros(len(x)) for _ in _RIDGES]
     for index in range(_FOLDS):
-        rows = known & (fold != index)
-        gram = x[rows].T @ x[rows] + _RIDGE * rows.sum() * np.eye(x.shape[1])
-        weights = np.linalg.solve(gram, x[rows].T @ (returns[rows] - mean))
-        value[fold == index] = mean + x[fold == index] @ weights
-    return np.clip(value, -1, 0)
+        rows, held_out = known & (fold != index), fold == index
+        gram, target = x[rows].T @ x[rows], x[rows].T @ (returns[rows] - mean)
+        for value, ridge in zip(fits, _RIDGES, strict=True):
+            weights = np.linalg.solve(gram + ridge * rows.sum() * np.eye(len(gram)), target)
+            value[held_out] = np.clip(mean + x[held_out] @ weights, -1, 0)
+    return fits
 
 
 def _rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
