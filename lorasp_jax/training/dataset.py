@@ -137,10 +137,10 @@ def load(run: Run, source: Source, free_bytes: float) -> None:
     learn = run.config.learn
     chosen = offline.choose(cache, run.config)
     among = None if learn == "imitation" else [n for n in chosen.successes if n < len(tasks)]
+    offline.check(chosen, tasks, (), learn)
     options = {"recorded": not run.simulated, "among": among}
-    run.held_out = held_out(data.validation, tasks, phrases, **options)
-    if learn != "imitation":
-        offline.check(chosen, tasks, run.held_out, learn)
+    run.held_out = [] if among == [] else held_out(data.validation, tasks, phrases, **options)
+    offline.check(chosen, tasks, run.held_out, learn)
     unused = {*run.held_out, *chosen.left_out}
     steps = corrected_only(without(cache.steps, unused), cache, {*chosen.corrected} - unused)
     run.dataset, run.chosen = mixed(steps, data), chosen

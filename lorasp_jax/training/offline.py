@@ -67,6 +67,8 @@ def choose(cache: Cache, config: Config) -> Chosen:
 
 def check(chosen: Chosen, tasks: Sequence[str], held_out: Sequence[int], learn: str) -> None:
     """Raise ValueError if nothing good is left to learn from for one of the tasks `[E]`."""
+    if learn == "imitation":
+        return
     good = {*chosen.successes, *chosen.corrected} - {*held_out}
     for task in dict.fromkeys(tasks):
         if not good & {number for number, name in enumerate(tasks) if name == task}:
