@@ -15,8 +15,6 @@ PACKAGES = [
     "lorasp_jax.peft",
     "lorasp_jax.dense",
     "lorasp_jax.adapters",
-    "lorasp_jax.augment_config",
-    "lorasp_jax.recap_config",
     "lorasp_jax.config",
     "lorasp_jax.models",
     "lorasp_jax.policies",

@@ -14,7 +14,7 @@ from lorasp_jax.config import (
     ModelConfig,
     OptimConfig,
 )
-from lorasp_jax.recap_config import RecapConfig
+from lorasp_jax.config.recap import RecapConfig
 from lorasp_jax.training import records
 from lorasp_jax.training.run_folder import CONFIG_FILE, RELATIVE, read_json, recorded_ranges
 

@@ -13,6 +13,7 @@ from envs.datasets import rlds
 from envs.datasets.episodes import Episodes
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import DataConfig
+from lorasp_jax.config.recap import RecapConfig
 from lorasp_jax.data import cache, lerobot_export
 from lorasp_jax.data.batches import gather
 from lorasp_jax.data.opening import open_source
@@ -20,7 +21,6 @@ from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
 from lorasp_jax.peft import LoRA
 from lorasp_jax.policies.tokenizer import Offline
-from lorasp_jax.recap_config import RecapConfig
 from lorasp_jax.training import advantage, finished_run, offline, setup
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.loop import train

@@ -4,10 +4,10 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from envs.scene.ranges import Randomization
-from lorasp_jax.augment_config import AugmentConfig
+from lorasp_jax.config.augment import AugmentConfig
+from lorasp_jax.config.recap import RecapConfig
 from lorasp_jax.peft import Method, fields
 from lorasp_jax.peft.auxiliary import AUXILIARY_WEIGHTS
-from lorasp_jax.recap_config import RecapConfig
 
 SCALES = ("smoke", "cpu", "accelerator")
 VALIDATION_WINDOWS = 16
