@@ -228,7 +228,7 @@ def _prompts_and_joints(
     environments: Sequence[Env],
     tokenizer: Tokenizer,
     model: BackboneConfig,
-    endings: Sequence[str],
+    endings: Sequence[str] = ("",),
 ) -> tuple[PromptTable, int]:
     """Return the prompts for all instructions, and the robot's number of joints."""
     if source is None:
