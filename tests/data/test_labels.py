@@ -1,6 +1,8 @@
 """Labels of episodes: outcomes and a person's corrections, in every format."""
 
 import dataclasses
+import json
+import shutil
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from rich.console import Console
 
 from envs.datasets import rlds
 from envs.datasets.episodes import Episodes, concatenate
+from lorasp_jax.base.digest import verify_digest, with_digest
 from lorasp_jax.data import cache, inspection, lerobot_export
 from lorasp_jax.data.keys import Keys
 from lorasp_jax.data.lerobot import LeRobot
@@ -103,6 +106,18 @@ def test_episodes_without_labels_join_those_with(formats, tmp_path):
     found = cache.Cache(tmp_path / "joined")
     assert found.success.tolist() == [1, 1, 1, *OUTCOMES]
     assert np.flatnonzero(found.corrected).tolist() == [21 + 5 + step for step in (6, 7, 8)]
+
+
+def test_a_cache_from_before_there_were_labels_is_read(formats, tmp_path):
+    shutil.copytree(formats / "cache", tmp_path / "old")
+    header = tmp_path / "old" / cache.HEADER
+    content = verify_digest(json.loads(header.read_text()))
+    for name in cache.LABELS:
+        del content["crc32"][name]
+        (tmp_path / "old" / f"{name}.npy").unlink()
+    header.write_text(json.dumps(with_digest(content)))
+    found = cache.Cache(tmp_path / "old")
+    assert found.success is found.corrected is found.episode(0, ()).success is None
 
 
 def test_a_dataset_marks_corrections_from_its_first_episode_on(tmp_path):

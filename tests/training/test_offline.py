@@ -21,7 +21,7 @@ from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
 from lorasp_jax.peft import LoRA
 from lorasp_jax.policies.tokenizer import Offline
-from lorasp_jax.training import advantage, finished_run, offline, setup
+from lorasp_jax.training import advantage, export, finished_run, offline, setup
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.overrides import parse
@@ -249,6 +249,10 @@ def test_values_know_the_outcome_and_advantages_the_fork(folder):
     assert good[::2, 0].all()
     assert not good[1::2, 0].any()
     assert good.mean() == pytest.approx(0.3, abs=0.01)
+    described = export._metadata(run)["policy"]
+    assert described["endings"] == ["+", "-", ""]
+    loaded = export._processor(described, run.policy.model.config, "")  # refuses other tokens
+    assert loaded.prompts.instructions == ("press the button",)
     told = np.bincount(run.steps.instruction, minlength=3) / good.size
     assert told[2] == pytest.approx(0.3, abs=0.07)
 
