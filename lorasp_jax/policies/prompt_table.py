@@ -123,10 +123,8 @@ class PromptTable:
         Raises:
             ValueError: the tokenizer rejects an instruction.
         """
-        max_tokens, texts = (
-            self.start.ids.shape[1],
-            [text + self.endings[0] for text in instructions],
-        )
+        max_tokens = self.start.ids.shape[1]
+        texts = [text + self.endings[0] for text in instructions]
         if self.numbers is None:
             start = tokenizer.encode(texts, max_tokens)
         else:

@@ -197,7 +197,7 @@ def _run_episode(
     Returns:
         The verdict by key, if there is one; what ended the episode; and the problem, if any.
     """
-    verdict, keys = "", KEYS + TAKE * bool(rig.recorder and rig.server)
+    verdict, keys = "", KEYS + TAKE * bool(rig.server and rig.recorder and rig.recorder.marks)
     while judging and rig.keys.pressed():
         pass  # what was typed before is no verdict
 

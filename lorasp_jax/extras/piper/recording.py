@@ -19,6 +19,7 @@ class Recording:
 
     Attributes:
         steps: control steps of the present episode.
+        marks: whether corrections can be marked, as older datasets cannot.
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class Recording:
         named = {"names": [*names]} if names else {}
         self._writer = ShardWriter(folder, {"image_size": image_size, **named})
         earlier = self._writer.metadata
+        self.marks: bool = earlier.get("corrected", not earlier["parts"])
         self._shared = {"task": task or earlier.get("task", "task"), "robot": robot}
         self._shared |= {"control_dt": control_dt, "physics_dt": physics_dt}
         for name, value in self._shared.items():  # before somebody demonstrates in vain

@@ -41,7 +41,7 @@ class Lesson:
     ) -> None:
         """Prepare a demonstration; for guiding by hand, the arms must be enabled.
 
-        With `corrects`, a person goes on with a policy's episode, as which steps are marked.
+        With `corrects`, a person goes on with a policy's episode, and its steps say so.
         """
         self._corrects = corrects
         self._arms, self._look, self._recorder = arms, look, recorder

@@ -124,12 +124,21 @@ def test_several_episodes_are_recorded_in_one_start_and_in_the_next(
 def test_a_person_takes_over_by_hand(server, linked, tmp_path, press_keys, monkeypatch, capsys):
     """What follows is marked, and ends the session: the arm obeys again after a reset."""
 
+    taught = []
+
     def teach(arm, on):
-        arm.fake.hand = arm.read().pose + np.array([0.01, 0, 0, 0, 0, 0, 0])
+        arm.fake.hand = arm.read().pose
+        taught.append(arm)
         PiperArm.teach(arm, on)
 
+    def pressed(seconds=0.0):
+        if taught:  # the hand turns the base from step to step
+            taught[0].fake.hand = taught[0].fake.hand + np.eye(7)[0] * 0.01
+        return script(seconds)
+
     monkeypatch.setattr(LinkedArm, "teach", teach, raising=False)
-    press_keys([*400 * [""], "t", *8 * [""], "s"], "")
+    keys = press_keys([*400 * [""], "t", *8 * [""], "s"], "")
+    script, keys.pressed = keys.pressed, pressed
     words = ["--server", server.address, *linked, "--seconds", "30", "--image-size", "16"]
     words += ["--record", str(tmp_path / "data"), "--log", str(tmp_path / "log")]
     assert real([*words, "--episodes", "3"]) == 0
