@@ -7,7 +7,7 @@ import math
 import numbers
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self, TypeVar
@@ -25,13 +25,16 @@ T = TypeVar("T")
 SHARED = ("task", "robot", "control_dt", "physics_dt", "actions", "instructions")
 """Fields that must be equal in order to concatenate episodes."""
 _ARRAYS = ("state", "action", "length", "instruction")
+_LABELS = ("success", "corrected")
 _METADATA = (*SHARED, "attempted")
 _IMAGE = "image/"
 _CAMERA = re.compile(r"[\w-][\w .-]{0,99}")
 
 
 @functools.partial(
-    jax.tree_util.register_dataclass, data_fields=("image", *_ARRAYS), meta_fields=_METADATA
+    jax.tree_util.register_dataclass,
+    data_fields=("image", *_ARRAYS, *_LABELS),
+    meta_fields=_METADATA,
 )
 @dataclasses.dataclass(frozen=True)
 class Episodes:
@@ -49,8 +52,10 @@ class Episodes:
         task, robot: their names.
         control_dt: time between two actions [s].
         physics_dt: time step of the simulation [s]; 0 for recordings of real robots.
-        attempted: number of attempts; these episodes are the successful ones.
+        attempted: number of attempts; without labels, these episodes are the successful ones.
         actions: action mode (see `envs.actions`).
+        success: int32 `[E]`, 1 success, 0 failure, -1 nobody said; None: no labels.
+        corrected: bool `[E, T]`, steps in which a person acted in place of a policy; None: none.
     """
 
     image: dict[str, Array]
@@ -65,13 +70,20 @@ class Episodes:
     physics_dt: float
     attempted: int
     actions: str = "joint"
+    success: Array | None = None
+    corrected: Array | None = None
 
     def __repr__(self) -> str:
-        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        arrays = {name: getattr(self, name) for name in _ARRAYS} | self._labels
         arrays |= {_IMAGE + name: images for name, images in self.image.items()}
         fields = [f"{name}={_dtype_and_shape(array)}" for name, array in arrays.items()]
         fields += [f"{name}={getattr(self, name)!r}" for name in _METADATA]
         return f"Episodes({', '.join(fields)})"
+
+    @property
+    def _labels(self) -> dict[str, Array]:
+        labels = {name: getattr(self, name) for name in _LABELS}
+        return {name: array for name, array in labels.items() if array is not None}
 
     @property
     def num_episodes(self) -> int:
@@ -96,7 +108,8 @@ class Episodes:
         self.validate()
         path = Path(path)
         header = json.dumps({name: getattr(self, name) for name in _METADATA}).encode()
-        arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
+        named = {name: getattr(self, name) for name in _ARRAYS} | self._labels
+        arrays: dict[str, Any] = {name: np.asarray(array) for name, array in named.items()}
         arrays |= {_IMAGE + name: np.asarray(images) for name, images in self.image.items()}
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_file(path) as temporary, open(temporary, "wb") as file:
@@ -187,6 +200,15 @@ class Episodes:
             integers = values.shape == (episodes,) and np.issubdtype(values.dtype, np.integer)
             in_range = integers and values.min() >= low and values.max() <= high
             yield in_range, f"{name} must be {episodes} integers from {low} to {high}, got {values}"
+        for name, array in self._labels.items():
+            values = np.asarray(array)
+            kind, size = (
+                (np.bool_, (episodes, steps)) if name == "corrected" else (np.int32, (episodes,))
+            )
+            valid = values.shape == size and values.dtype == kind
+            valid = valid and bool(np.isin(values, (-1, 0, 1)).all())
+            got = _dtype_and_shape(values)
+            yield valid, f"{name} must be {kind.__name__} {size}, got {got}"
 
 
 def _check(rules: Iterable[tuple[bool, str]]) -> None:
@@ -266,7 +288,19 @@ def concatenate(parts: Sequence[Episodes]) -> Episodes:
         return np.concatenate([_pad(x, steps) for x in arrays])
 
     attempted = sum(part.attempted for part in parts)
-    return jax.tree.map(join, *(dataclasses.replace(part, attempted=attempted) for part in parts))
+    labels = {name for part in parts for name in part._labels}
+    whole = (dataclasses.replace(part, attempted=attempted) for part in parts)
+    return jax.tree.map(join, *(labelled(part, labels) for part in whole))
+
+
+def labelled(episodes: Episodes, labels: Collection[str] = _LABELS) -> Episodes:
+    """Return episodes that have these labels, unknown where they had none."""
+    unknown: dict[str, Array] = {
+        "success": np.full(episodes.num_episodes, -1, np.int32),
+        "corrected": np.zeros(episodes.state.shape[:2], bool),
+    }
+    missing = {name: unknown[name] for name in labels if getattr(episodes, name) is None}
+    return dataclasses.replace(episodes, **missing)
 
 
 def _dtype_and_shape(array: Any) -> str:

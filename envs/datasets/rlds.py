@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 import tensorflow_datasets as tfds
 from array_record.python import array_record_module
 from array_record.python.array_record_data_source import ArrayRecordDataSource
@@ -49,7 +50,7 @@ _TYPES: dict[str, Any] = {
 _SHARD_TYPES: dict[str, Any] = {
     **{"task": str, "robot": str, "actions": str, "instructions": [str]},
     **{"cameras": {str: (int, int)}, "control_dt": float, "physics_dt": float},
-    **{"widths?": (int, int)},
+    **{"widths?": (int, int), "corrected?": bool},
 }
 """Schema of the fields that appear with the first shard."""
 _FORMAT, _SPLIT, _VERSION = "envs-rlds-1", "train", "1.0.0"
@@ -191,7 +192,7 @@ def write(episodes: Episodes, path: str | os.PathLike[str]) -> None:
     """Write a dataset folder, which appears only once it is complete.
 
     Args:
-        episodes: successful episodes, as from `envs.collect`. Their last steps get reward 1.
+        episodes: as from `envs.collect`. The last steps of those that succeed get reward 1.
         path: folder to create.
 
     Raises:
@@ -222,7 +223,8 @@ class ShardWriter:
             - `parts`: number of episodes in each shard;
             - `steps`, `attempted`: total number of control steps and of attempts;
             - `cameras`: height and width of each camera's images;
-            - `widths`: number of values in a state and in an action.
+            - `widths`: number of values in a state and in an action;
+            - `corrected`: whether steps say that a person took over.
     """
 
     def __init__(self, folder: Path, options: Mapping[str, Any]):
@@ -267,6 +269,7 @@ class ShardWriter:
             OSError: the disk is full; earlier shards are unaffected.
         """
         episodes.validate()
+        episodes = self._with_corrections(episodes)
         shared: dict[str, Any] = {name: getattr(episodes, name) for name in SHARED}
         shared["instructions"] = list(episodes.instructions)
         shared["cameras"] = {name: list(x.shape[2:4]) for name, x in episodes.image.items()}
@@ -286,6 +289,15 @@ class ShardWriter:
         self.metadata["steps"] += episodes.num_steps
         self.metadata["attempted"] += episodes.attempted
         self._save()
+
+    def _with_corrections(self, episodes: Episodes) -> Episodes:
+        """Return episodes that say where a person took over if those of the first shard do."""
+        given = episodes.corrected is not None
+        says = self.metadata.setdefault("corrected", given and not self.metadata["parts"])
+        flags = episodes.corrected if given else np.zeros(episodes.state.shape[:2], bool)
+        if np.any(flags) and not says:
+            raise ValueError(f"{self.folder} cannot mark corrections: choose another folder")
+        return replace(episodes, corrected=flags if says else None)
 
     def complete(self) -> None:
         """Write tfds's description of the shards, which completes the dataset."""

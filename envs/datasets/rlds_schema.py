@@ -17,6 +17,8 @@ from tensorflow_datasets.proto import tf_example_pb2
 
 from envs.datasets.episodes import Episodes, joint_names
 
+CORRECTED = "intervention"
+"""Feature of the steps in which a person takes over, as LeRobot names it."""
 _MAIN = {"side": "image"}  # feature of the main camera; the others are <name>_image
 _COMPRESSION = 1  # level of zlib, the fastest
 _ACTION = {
@@ -54,12 +56,16 @@ def features(metadata: Mapping[str, Any]) -> tfds.features.FeaturesDict:
         "observation": types.FeaturesDict(images | {"state": state}),
         "action": action,
         "language_instruction": types.Text(),
-        "reward": types.Scalar(np.float32, doc="1 on the last step, where the task is done"),
+        "reward": types.Scalar(np.float32, doc="1 on the last step if the task is done"),
         "discount": types.Scalar(np.float32, doc="always 1"),
         "is_first": types.Scalar(np.bool_),
         "is_last": types.Scalar(np.bool_),
-        "is_terminal": types.Scalar(np.bool_, doc="the same as is_last: the task is done"),
+        "is_terminal": types.Scalar(
+            np.bool_, doc="on the last step, unless the outcome is unknown"
+        ),
     }
+    if metadata.get("corrected"):
+        step[CORRECTED] = types.Scalar(np.bool_, doc="a person acts in place of the policy")
     return types.FeaturesDict({"steps": types.Dataset(step), "episode_metadata": _metadata()})
 
 
@@ -95,16 +101,19 @@ def record(
         for camera, array in episodes.image.items()
     }
     last = np.arange(steps) == steps - 1
+    success = 1 if episodes.success is None else int(episodes.success[number])
     columns: dict[str, Any] = {
         "observation": images | {"state": episodes.state[number, :steps]},
         "action": episodes.action[number, :steps],
         "language_instruction": [episodes.instructions[phrase].encode()] * steps,
-        "reward": last.astype(np.float32),
+        "reward": (last & (success == 1)).astype(np.float32),
         "discount": np.ones(steps, np.float32),
         "is_first": np.arange(steps) == 0,
         "is_last": last,
-        "is_terminal": last,
+        "is_terminal": last & (success >= 0),
     }
+    if episodes.corrected is not None:
+        columns[CORRECTED] = episodes.corrected[number, :steps]
     metadata: dict[str, Any] = {
         "episode_id": np.int64(episode_id),
         "instruction": np.int64(phrase),
@@ -141,6 +150,12 @@ def episode(
     if not steps or len(instruction) != 1:
         raise ValueError(f"it has {steps} steps and {len(instruction)} instructions")
 
+    def flags(name: str) -> np.ndarray:
+        values = np.array(fields[f"steps/{name}"].int64_list.value, bool)
+        if values.size != steps:
+            raise ValueError(f"{name} has {values.size} values in {steps} steps")
+        return values
+
     def rows(name: str, width: int) -> np.ndarray:
         values = np.array(fields[f"steps/{name}"].float_list.value, np.float32)
         if values.size % steps or width not in (0, values.size // steps):
@@ -153,12 +168,16 @@ def episode(
             raise ValueError(f"{len(files)} images of {camera} in {steps} steps")
         return np.stack([_decode(file, sizes[camera]) for file in files])[None]
 
+    failed = 0 if flags("is_terminal")[-1] else -1  # cut off, it has not failed
+    success = 1 if rows("reward", 1)[0, -1, 0] > 0 else failed
     return Episodes(
         image={camera: images(camera, feature) for camera, feature in cameras.items()},
         state=rows("observation/state", widths[0]),
         action=rows("action", widths[1]),
         length=np.array([steps], np.int32),
         instruction=np.array([*instruction], np.int32),
+        success=np.array([success], np.int32),
+        corrected=flags(CORRECTED)[None] if f"steps/{CORRECTED}" in fields else None,
         **metadata,
     )
 

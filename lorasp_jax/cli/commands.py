@@ -14,7 +14,7 @@ COMMANDS = {
     "train": ("lorasp_jax.cli.train", "adapt a policy to a robot"),
     "evaluate": (
         "lorasp_jax.evaluation.__main__",
-        "measure a run on recorded episodes, without a simulator",
+        "measure a run on recorded episodes, or record its own in simulation",
     ),
     "study": (
         "lorasp_jax.extras.study.__main__",

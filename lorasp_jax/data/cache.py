@@ -39,8 +39,10 @@ FORMAT = "lorasp-cache-2"
 HEADER = "cache.json"
 ROWS = ("state", "action", "length", "instruction", "task")
 """Columns other than images: state and action per step, and the others per episode."""
+LABELS = ("success", "corrected")
+"""Columns of outcomes per episode and of corrections per step, which older caches lack."""
 _IMAGE = "image_"
-_DTYPES = {"state": np.float32, "action": np.float32, "image": np.uint8}
+_DTYPES = {"state": np.float32, "action": np.float32, "image": np.uint8, "corrected": np.bool_}
 METADATA = tuple(name for name in SHARED if name not in ("task", "instructions"))
 """Fields of `Episodes` that are the same in all episodes of a cache."""
 _HEADER_TYPES: dict[str, Any] = {
@@ -144,11 +146,14 @@ class _Writer:
         for known, new in lists:
             known += [text for text in new if text not in known]
         steps = {"state": episode.state, "action": episode.action}
+        none = np.zeros((1, length), bool)
+        steps["corrected"] = none if episode.corrected is None else episode.corrected
         steps |= {_IMAGE + name: images for name, images in episode.image.items()}
         for name, array in steps.items():
             self._extend(name, np.asarray(array)[0, :length])
         row = {"length": length, "instruction": self._instructions.index(phrase)}
         row["task"] = self._tasks.index(episode.task)
+        row["success"] = -1 if episode.success is None else int(episode.success[0])
         for name, value in row.items():
             self._extend(name, np.array([value], np.int32))
         self.num_steps += length
@@ -188,6 +193,8 @@ class Cache:
         left_out: camera -> why it is not among the cameras.
         names, grippers: as in `LeRobot`; empty if the cache does not say.
         parts: the datasets that were joined, or one for all.
+        success: outcomes `[E]`, see `Episodes`; None: none is known.
+        corrected: bool `[N]`, steps in which a person took over; None: none.
     """
 
     kind = "cache"
@@ -227,7 +234,10 @@ class Cache:
             name: self._map(_IMAGE + name, (self.num_steps, *size, 3))
             for name, size in self.cameras.items()
         }
-        self._columns = {name: self._map(name) for name in ROWS}
+        labels = (name for name in LABELS if name in self.metadata["crc32"])
+        self._columns = {name: self._map(name) for name in (*ROWS, *labels)}
+        self.success: np.ndarray | None = self._known("success", -1)
+        self.corrected: np.ndarray | None = self._known("corrected", False)
         self._end = np.cumsum(self._columns["length"], dtype=np.int64)
         with as_value_error(header):
             self._check_columns()
@@ -254,6 +264,11 @@ class Cache:
         """Index of each episode's dataset among `parts`, `[E]` int32."""
         return dataset_of(self)
 
+    @property
+    def episodes(self) -> np.ndarray:
+        """Number of the episode of each step, `[N]`."""
+        return np.repeat(np.arange(len(self)), self._columns["length"])
+
     def part_of(self, task: str) -> Part:
         """Return the first dataset with a task."""
         row = self.metadata["tasks"].index(task)
@@ -271,6 +286,8 @@ class Cache:
             length=self._columns["length"][row],
             instruction=self._columns["instruction"][row],
             instructions=self.instructions,
+            success=None if self.success is None else self.success[row],
+            corrected=None if self.corrected is None else self.corrected[None, rows],
             task=self.metadata["tasks"][self._columns["task"][number]],
             attempted=1,
             **{name: self.metadata[name] for name in METADATA},
@@ -291,8 +308,9 @@ class Cache:
         """Raise ValueError unless rows, indices and values are valid, whoever wrote the cache."""
         length = self._columns["length"]
         for name, column in self._columns.items():
-            of_steps = name in ("state", "action")
-            if column.ndim != 1 + of_steps or (of_steps and len(column) != self.num_steps):
+            of_steps = name in ("state", "action", "corrected")
+            dims = 1 + (name in ("state", "action"))
+            if column.ndim != dims or (of_steps and len(column) != self.num_steps):
                 raise ValueError(f"{name} has the shape {column.shape}, which does not match")
         if not len(length) or length.min() < 1 or self._end[-1] != self.num_steps:
             raise ValueError(f"its episodes must not be empty and have {self.num_steps} steps")
@@ -310,6 +328,11 @@ class Cache:
             if named != count or not {*self.grippers.get(name, [])} <= {*range(count)}:
                 raise ValueError(f"names and grippers of {name} must be those of {count} numbers")
         self.episode(0, ()).validate_numbers()
+
+    def _known(self, name: str, unknown: int) -> np.ndarray | None:
+        """Return a column of labels, or None if it says nothing."""
+        column = self._columns.get(name)
+        return None if column is None or (column == unknown).all() else column
 
     def _map(self, name: str, shape: tuple[int, ...] | None = None) -> np.ndarray:
         """Memory-map a column; verify its checksum unless a shape is given instead."""
@@ -330,6 +353,7 @@ def _read_header(path: Path) -> dict[str, Any]:
         raise ValueError(f"control_dt must be positive and finite, got {header['control_dt']}")
     for name in header["cameras"]:
         check_camera(name)
-    if header["crc32"].keys() != {*ROWS, *(_IMAGE + name for name in header["cameras"])}:
+    columns = {*ROWS, *(_IMAGE + name for name in header["cameras"])}
+    if header["crc32"].keys() not in (columns, columns | {*LABELS}):
         raise ValueError("checksums are missing")
     return header

@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from envs.datasets.episodes import Episodes, joint_names
+from envs.datasets.episodes import Episodes, joint_names, labelled
 from envs.rendering.video import side_by_side
 from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.config import AugmentConfig, Config
@@ -46,6 +46,8 @@ class Summary:
         phrases: instruction -> number of episodes.
         robot: name of the robot.
         tasks: names of the tasks.
+        outcomes: number of successes, of failures, and of episodes without a label.
+        corrected: number of steps in which a person took over.
     """
 
     state: np.ndarray
@@ -56,6 +58,8 @@ class Summary:
     phrases: dict[str, int]
     robot: str
     tasks: tuple[str, ...]
+    outcomes: tuple[int, int, int]
+    corrected: int
 
 
 def summarize(source: Source) -> Summary:
@@ -66,6 +70,8 @@ def summarize(source: Source) -> Summary:
     """
     episodes = [source.episode(number, ()) for number in range(len(source))]
     phrases = collections.Counter(e.instructions[int(e.instruction[0])] for e in episodes)
+    labels = [labelled(e) for e in episodes]
+    outcomes = [int(e.success[0]) for e in labels if e.success is not None]
     return Summary(
         state=np.concatenate([np.asarray(e.state[0]) for e in episodes]),
         action=np.concatenate([np.asarray(e.action[0]) for e in episodes]),
@@ -75,6 +81,8 @@ def summarize(source: Source) -> Summary:
         phrases=dict(phrases.most_common()),
         robot=episodes[0].robot,
         tasks=tuple(dict.fromkeys(e.task for e in episodes)),
+        outcomes=(outcomes.count(1), outcomes.count(0), outcomes.count(-1)),
+        corrected=sum(int(e.corrected.sum()) for e in labels if e.corrected is not None),
     )
 
 
@@ -100,6 +108,11 @@ def report(source: Source, console: Console) -> None:
         f"median {np.median(summary.length):g}",
         "steps": f"{steps} at {hertz:g} Hz, {minutes:.1f} minutes",
     }
+    wins, failures, unknown = summary.outcomes
+    if wins or failures:
+        lines["outcomes"] = f"{wins} successes, {failures} failures, {unknown} without a label"
+    if summary.corrected:
+        lines["takeover"] = f"a person acts in {summary.corrected} steps"
     if not same_period(source.control_dt, Config.control_dt):
         lines["steps"] += f"; train with --control-dt {source.control_dt:.4g}, or see --every"
     if unused := describe_left_out(source):

@@ -28,6 +28,7 @@ from lorasp_jax.base.files import (
 )
 from lorasp_jax.data import lerobot_features
 from lorasp_jax.data.keys import Keys
+from lorasp_jax.data.lerobot_features import DONE, SUCCESS
 from lorasp_jax.data.lerobot_files import (
     EpisodeEntry,
     Index,
@@ -98,6 +99,8 @@ class LeRobot:
         }
         images = [key for key in self.cameras.values() if not self._is_video(key)]
         needed = (self.keys.state, self.keys.action, *_COLUMNS, *images)
+        self._marks: list[str] = lerobot_features.marks(self.index.features)
+        needed = (*needed, *self._marks)
         self._needed = list(dict.fromkeys(needed))  # state and action may be the same feature
         self._videos: dict[str, VideoReader] = {}
         self._table: tuple[Path | None, Any] = None, None
@@ -139,6 +142,7 @@ class LeRobot:
             control_dt=self.control_dt,
             physics_dt=0.0,
             attempted=1,
+            **self._labels(table, entry),
         )
         with as_value_error(Path(f"{entry.table}: episode {entry.number}")):
             episode.validate_numbers()
@@ -241,6 +245,19 @@ class LeRobot:
         steps = np.minimum(np.arange(0, len(values), every) + first, len(values) - 1)
         with np.errstate(over="ignore"):  # overflows to inf, which is rejected later
             return values[steps].astype(np.float32)
+
+    def _labels(self, table: Any, entry: EpisodeEntry) -> dict[str, Any]:
+        """Return `Episodes.success` and `corrected`, those that the dataset has."""
+        with as_value_error(entry.table):
+            marks = {name: lerobot_features.rows(table[name], 1)[:, 0] > 0 for name in self._marks}
+        labels: dict[str, Any] = {}
+        if SUCCESS in marks:
+            failed = 0 if marks.pop(DONE, np.ones(1, bool))[-1] else -1  # cut off: unknown
+            success = 1 if marks.pop(SUCCESS).any() else failed
+            labels["success"] = np.array([success], np.int32)
+        if others := [flags for name, flags in marks.items() if name != DONE]:
+            labels["corrected"] = np.any(others, axis=0)[None, :: self.keys.every]
+        return labels
 
     def _instruction(self, table: Any, entry: EpisodeEntry) -> int:
         """Return the index of the episode's instruction in `Episodes.instructions`."""

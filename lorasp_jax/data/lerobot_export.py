@@ -18,6 +18,7 @@ from PIL import Image
 from envs.datasets.episodes import Episodes, joint_names
 from lorasp_jax.base.locks import locked
 from lorasp_jax.base.writing import atomic_folder, write_text
+from lorasp_jax.data.lerobot_features import DONE, INTERVENTION, SUCCESS
 from lorasp_jax.data.source import Progress, Source, dimension_names
 from lorasp_jax.policies import statistics_files
 
@@ -85,6 +86,7 @@ class _Writer:
             "observation.state": np.asarray(episode.state[0, :length]),
             "action": np.asarray(episode.action[0, :length]),
             **{_key(c): np.asarray(images[0, :length]) for c, images in episode.image.items()},
+            **_marks(episode, length),
             "timestamp": (np.arange(length) / self.fps).astype(np.float32),
             "frame_index": np.arange(length),
             "episode_index": np.full(length, number),
@@ -159,8 +161,22 @@ def _features(episode: Episodes, names: dict[str, list[str]]) -> dict[str, Any]:
     axes = ["height", "width", "channels"]
     for camera, images in episode.image.items():
         features[_key(camera)] = {"dtype": "image", "shape": [*images.shape[2:]], "names": axes}
+    features |= {
+        name: {"dtype": "bool", "shape": [1], "names": None} for name in _marks(episode, 1)
+    }
     features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
     return features | {name: {"dtype": "int64", "shape": [1], "names": None} for name in _INDICES}
+
+
+def _marks(episode: Episodes, length: int) -> dict[str, np.ndarray]:
+    """Return the columns of success and corrections; an unknown outcome is one that is not done."""
+    marks: dict[str, np.ndarray] = {}
+    if episode.success is not None:
+        last, success = np.arange(length) == length - 1, int(episode.success[0])
+        marks = {SUCCESS: last & (success == 1), DONE: last & (success >= 0)}
+    if episode.corrected is not None:
+        marks[INTERVENTION] = np.asarray(episode.corrected[0, :length])
+    return marks
 
 
 def _key(camera: str) -> str:

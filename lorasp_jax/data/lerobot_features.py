@@ -19,6 +19,9 @@ from lorasp_jax.base.files import RefusedError, as_int
 Features = Mapping[str, Mapping[str, Any]]
 _MAX_DIM = 10_000  # limit for state and action
 _PREFIXES = ("observation.", "images.")
+SUCCESS, DONE, INTERVENTION = "next.success", "next.done", "intervention"
+"""Marks of frames: the task is done; the episode has ended and was not cut off; a person acts.
+(LeRobot 0.6.1, scripts/lerobot_eval.py and rollout/strategies/dagger.py)"""
 
 
 def pictures(features: Features) -> tuple[dict[str, str], dict[str, str]]:
@@ -35,6 +38,13 @@ def pictures(features: Features) -> tuple[dict[str, str], dict[str, str]]:
     unique = len(set(names)) == len(names)
     reasons = {key: reason for key in keys if (reason := _why_not_color(features[key]))}
     return dict(zip(names if unique else keys, keys, strict=True)), reasons
+
+
+def marks(features: Features) -> list[str]:
+    """Return the features that mark success, the end of an episode and a person's corrections."""
+    ends = (INTERVENTION, f"is_{INTERVENTION}")  # the second in HIL-SERL's recordings
+    known = (SUCCESS, DONE)
+    return [name for name in features if name in known or name.rpartition(".")[2] in ends]
 
 
 def _why_not_color(feature: Mapping[str, Any]) -> str:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from envs.datasets import rlds
-from envs.datasets.episodes import concatenate
+from envs.datasets.episodes import concatenate, labelled
 from lorasp_jax.base.locks import locked
 from lorasp_jax.base.writing import atomic_folder
 from lorasp_jax.data.source import Progress, Source, dimensions
@@ -36,7 +36,7 @@ def to_rlds(source: Source, path: str | os.PathLike[str], progress: Progress) ->
             numbers = range(first, min(first + EPISODES_PER_FILE, len(source)))
             shard = []
             for number in numbers:
-                shard.append(source.episode(number))
+                shard.append(labelled(source.episode(number)))  # RLDS takes None for success
                 done += shard[-1].num_steps
                 progress(done, source.num_steps)
             writer.append(concatenate(shard))

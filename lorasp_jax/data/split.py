@@ -11,7 +11,12 @@ _EPISODE = re.compile(r"episode_(\d+)")
 
 
 def held_out(
-    choice: Sequence[str], tasks: Sequence[str], phrases: Sequence[str] = (), *, recorded: bool
+    choice: Sequence[str],
+    tasks: Sequence[str],
+    phrases: Sequence[str] = (),
+    *,
+    recorded: bool,
+    among: Sequence[int] | None = None,
 ) -> list[int]:
     """Return the numbers of the episodes to hold out, in ascending order.
 
@@ -24,15 +29,20 @@ def held_out(
         tasks: the task of each episode.
         phrases: the instruction of each episode; empty: one for each task.
         recorded: whether the episodes were recorded rather than simulated, see "auto".
+        among: numbers of the episodes of which a share is taken; None: all.
 
     Raises:
         ValueError: the choice is none of what `DataConfig.validation` describes, names an episode
             that does not exist, or leaves none to learn from.
     """
+    named = [_EPISODE.fullmatch(name) for name in choice if not _is_number(name)]
+    if named and [*choice] != ["auto"]:
+        return _named(choice, named, tasks)
+    numbers = [*range(len(tasks))] if among is None else [*among]
+    phrases = [(phrases or tasks)[number] for number in numbers]
+    tasks = [tasks[number] for number in numbers]
     if [*choice] == ["auto"]:
         choice = [str(SHARE if recorded and len(tasks) >= MINIMUM else 0)]
-    if named := [_EPISODE.fullmatch(name) for name in choice if not _is_number(name)]:
-        return _named(choice, named, tasks)
     if len(choice) != 1:
         raise ValueError(f"data.validation must be one number or episodes' names, got {choice}")
     number = float(choice[0])
@@ -42,10 +52,10 @@ def held_out(
             f"data.validation must be a share below 1 or a number of episodes below {len(tasks)}, "
             f"which is how many there are, got {choice[0]}"
         )
-    chosen = _spread(count, tasks, phrases or tasks)
+    chosen = _spread(count, tasks, phrases)
     if count and not chosen:
         raise ValueError("data.validation can hold out nothing: every task has few episodes")
-    return chosen
+    return [numbers[index] for index in chosen]
 
 
 def _is_number(text: str) -> bool:

@@ -1,6 +1,7 @@
-"""Measure a finished run on recorded episodes: `lorasp-jax evaluate --help`."""
+"""Measure a finished run on recorded episodes, or record its own: `lorasp-jax evaluate --help`."""
 
 import argparse
+import functools
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from lorasp_jax.base.arguments import positive
 from lorasp_jax.base.errors import run_command
 from lorasp_jax.data.__main__ import add_keys, keys_of
 
@@ -20,7 +22,8 @@ if TYPE_CHECKING:
 def main(arguments: Sequence[str], program: str = "lorasp-jax evaluate") -> int:
     """Run the command and return its exit code: 0, or one of `lorasp_jax.base.errors`."""
     options = parser(program).parse_args(arguments)
-    return run_command(lambda: evaluate(options, Console()), Console(stderr=True))
+    command = record if options.record else evaluate
+    return run_command(lambda: command(options, Console()), Console(stderr=True))
 
 
 def parser(program: str) -> argparse.ArgumentParser:
@@ -29,11 +32,18 @@ def parser(program: str) -> argparse.ArgumentParser:
         prog=program,
         description="Compare the actions of a run's policy with recorded ones: errors by joint, "
         "beside those of holding still and of repeating the previous action, and a picture per "
-        "task. Nothing is simulated.",
+        "task. Or record the policy's own episodes in simulation.",
     )
     parser.add_argument("run", type=Path, help="folder of the run, such as runs/multitask")
     text = "LeRobot dataset (folder or hf://owner/name), RLDS dataset, cache, or its TOML file"
-    parser.add_argument("--data", required=True, metavar="DATASET", help=text)
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--data", metavar="DATASET", help=text)
+    text = "simulate instead, and write the policy's episodes with their outcomes to FOLDER/TASK"
+    what.add_argument("--record", type=Path, metavar="FOLDER", help=text)
+    text = "with --record: episodes per task (default: %(default)s)"
+    parser.add_argument("--rollouts", type=positive, default=64, metavar="N", help=text)
+    text = "with --record: other layouts for another number (default: %(default)s)"
+    parser.add_argument("--seed", type=int, default=0, help=text)
     text = "for which of the run's datasets the policy acts, if they differ (default: the first)"
     parser.add_argument("--dataset", default="", metavar="NAME", help=text)
     text = "numbers of the episodes (default: all, or those of --dataset in a cache of several)"
@@ -86,6 +96,30 @@ def evaluate(options: argparse.Namespace, console: Console) -> None:
     steps = {"num_steps": options.denoise_steps}
     for path in held_out_figure.write(folder, policy, source, numbers, **steps):
         console.print(f"picture: {path}", soft_wrap=True, highlight=False, markup=False)
+
+
+def record(options: argparse.Namespace, console: Console) -> None:
+    """Write episodes of a run's policy in simulation, one dataset for each of its tasks.
+
+    Raises:
+        ValueError: there is no such run, its tasks cannot be simulated, or a dataset exists.
+    """
+    from lorasp_jax.base import compilation_cache as cache
+    from lorasp_jax.base.bars import bars
+    from lorasp_jax.evaluation import recording
+    from lorasp_jax.training import export, finished_run
+
+    cache.enable()
+    config = finished_run.recorded_config(options.run)
+    policy, settings = export.load_policy(options.run), {"seed": options.seed}
+    for task in config.tasks:
+        folder = options.record / task
+        with bars(console, "episodes") as progress:
+            bar = progress.add_task(f"recording {task}", total=options.rollouts)
+            settings |= {"progress": functools.partial(progress.advance, bar)}
+            wins = recording.write(policy, config, task, folder, options.rollouts, **settings)
+        text = f"{folder}: {wins} of {options.rollouts} episodes succeeded"
+        console.print(text, soft_wrap=True, highlight=False, markup=False)
 
 
 def _check_period(options: argparse.Namespace, source: "Source", trained: float) -> None:

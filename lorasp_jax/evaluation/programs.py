@@ -168,10 +168,14 @@ class Worlds:
 
     def predict(self, call: int, *, denoise_steps: int, **previous: Any) -> tuple[jax.Array, Any]:
         """Observe the worlds and sample a chunk in each; see `predict`."""
-        observation, done = _observe(self._env, self.state), self.state.done
+        observation, done = self.observe(), self.state.done
         inputs = (self._sample_key, np.int32(call), observation, self._prompts, done)
         actions, ranks = _predict()(self._policy, *inputs, denoise_steps=denoise_steps, **previous)
         return jax.device_put(actions, self._place), ranks
+
+    def observe(self) -> RawObservation:
+        """Return what the policy observes, see `Env.observe`."""
+        return _observe(self._env, self.state)
 
     def act(self, actions: jax.Array, execute_steps: int) -> Poses:
         """Execute the first actions of chunks `[W, C, J+1]`; return poses, see `_act`."""
@@ -227,13 +231,14 @@ def compiled_rollout(run: Run, task: str) -> tuple[Env, Callable[..., Rollout]]:
     """Return the environment of a task, shared by all runs of this process, and its rollout."""
     config, settings = run.config, run.config.evaluation
     sizes = settings.worlds, config.image_size, config.control_dt
-    env = _environment(task, config.robot, *sizes)
+    env = environment(task, config.robot, *sizes)
     steps = {"execute_steps": settings.execute_steps, "denoise_steps": settings.denoise_steps}
     return env, make_rollout(env, ranges=config.ranges, **steps)
 
 
 @functools.cache
-def _environment(task: str, robot: str, worlds: int, image_size: int, control_dt: float) -> Env:
+def environment(task: str, robot: str, worlds: int, image_size: int, control_dt: float) -> Env:
+    """Return the environment of a task, shared by all runs of this process."""
     return envs.make(
         task, robot=robot, num_envs=worlds, image_size=image_size, control_dt=control_dt
     )

@@ -45,12 +45,15 @@ class PromptTable:
             -1, for values below -1. None if prompts do not contain the state.
         last: the same for the last state value, followed by the end of the prompt.
         instructions: P strings.
+        endings: texts that follow every instruction; `start` has P rows for each of them. What
+            follows the first is what a policy is asked to do.
     """
 
     start: Ids
     numbers: Ids | None = None
     last: Ids | None = None
     instructions: tuple[str, ...] = field(default=(), metadata={"static": True})
+    endings: tuple[str, ...] = field(default=("",), metadata={"static": True})
 
     @classmethod
     def of(
@@ -60,6 +63,7 @@ class PromptTable:
         config: BackboneConfig,
         *,
         num_joints: int,
+        endings: Sequence[str] = ("",),
     ) -> "PromptTable":
         """Tokenize the instructions for a backbone.
 
@@ -68,21 +72,26 @@ class PromptTable:
             instructions: P strings.
             config: the backbone's config; if `inputs.prompt_state`, prompts contain the state.
             num_joints: J, the robot's number of joints.
+            endings: texts that follow every instruction, see the class.
 
         Raises:
-            ValueError: the tokenizer rejects an instruction, gives ids beyond the backbone's
-                vocabulary, or merges state values with their neighbors.
+            ValueError: the endings do not fit into the prompts, the tokenizer rejects an
+                instruction, gives ids beyond the backbone's vocabulary, or merges state values with
+                their neighbors.
         """
+        texts = [text + ending for ending in endings for text in instructions]
         if config.inputs.prompt_state:
-            table = _with_state(tokenizer, instructions, config.max_tokens, num_joints + 1)
+            table = _with_state(tokenizer, texts, config.max_tokens, num_joints + 1)
         else:
-            table = cls(_ids(*tokenizer.encode(instructions, config.max_tokens)))
+            table = cls(_ids(*tokenizer.encode(texts, config.max_tokens)))
+        _check_endings(np.asarray(table.start.ids), endings, instructions)
         max_id = max(int(leaf.max()) for leaf in jax.tree.leaves(table))
         if max_id >= config.vocabulary:
             raise ValueError(
                 f"the tokenizer has token {max_id}, the backbone's vocabulary {config.vocabulary}"
             )
-        return dataclasses.replace(table, instructions=tuple(instructions))
+        given = {"instructions": tuple(instructions), "endings": tuple(endings)}
+        return dataclasses.replace(table, **given)
 
     def rows(self, instructions: Sequence[str]) -> np.ndarray:
         """Return the rows of these instructions, `[N]` int32.
@@ -115,10 +124,11 @@ class PromptTable:
             ValueError: the tokenizer rejects an instruction.
         """
         max_tokens = self.start.ids.shape[1]
+        texts = [text + self.endings[0] for text in instructions]
         if self.numbers is None:
-            start = tokenizer.encode(instructions, max_tokens)
+            start = tokenizer.encode(texts, max_tokens)
         else:
-            starts = [prompts.pi05_start(text) for text in instructions]
+            starts = [prompts.pi05_start(text) for text in texts]
             ids, mask = _encode_complete(tokenizer, starts, max_tokens)
             start = ids[:, :max_tokens], mask[:, :max_tokens]
         return dataclasses.replace(self, start=_ids(*start), instructions=tuple(instructions))
@@ -139,6 +149,14 @@ class PromptTable:
         order = jnp.argsort(~mask, axis=1, stable=True)  # moves the padding to the end
         order = order[:, : start.ids.shape[1]]
         return Ids(*(jnp.take_along_axis(a, order, axis=1) for a in (ids, mask)))
+
+
+def _check_endings(ids: np.ndarray, endings: Sequence[str], instructions: Sequence[str]) -> None:
+    """Raise ValueError if prompts of an instruction are equal, because their ends are cut off."""
+    rows = ids.reshape(len(endings), len(instructions), -1)
+    for number, text in enumerate(instructions):
+        if len(np.unique(rows[:, number], axis=0)) < len(endings):
+            raise ValueError(f"{text!r} leaves no room for {endings[0]!r} in {ids.shape[1]} tokens")
 
 
 def _with_state(

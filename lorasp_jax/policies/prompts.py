@@ -9,6 +9,10 @@ STATE_BINS = 256
 """Number of equal bins over [-1, 1] for the state in pi0.5's prompt."""
 EDGES = np.linspace(-1, 1, STATE_BINS + 1)[:-1]
 """Lower edges of the bins, exact in fp32."""
+ADVANTAGE = (", Advantage: positive", ", Advantage: negative", "")
+"""What follows an instruction if the action is good, bad, or the policy is not told (RECAP)."""
+ADVANTAGE_SHORT = ("+", "-", "")
+"""The same in one token, for the offline tokenizer, which would spell the words."""
 PI05_END = ";\nAction: "
 """Text after the state in the prompt of pi0.5."""
 

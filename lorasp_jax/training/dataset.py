@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from lorasp_jax.data.split import held_out
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.policies.images import resize_with_pad, to_unit
 from lorasp_jax.policies.processor import robot_slots
+from lorasp_jax.training import offline
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.run import Run
 from lorasp_jax.training.run_folder import CACHE, record_dataset
@@ -133,9 +134,17 @@ def load(run: Run, source: Source, free_bytes: float) -> None:
     facts = (metadata[name] for name in ("tasks", "robot", "physics_dt"))
     run.recordings, run.simulated = cache, is_simulated(*facts)
     tasks, phrases = _labels(cache, data)
-    run.held_out = held_out(data.validation, tasks, phrases, recorded=not run.simulated)
-    run.dataset = mixed(without(cache.steps, run.held_out), data)
-    run.episodes = outline(cache, run.held_out)
+    learn = run.config.learn
+    chosen = offline.choose(cache, run.config)
+    among = None if learn == "imitation" else [n for n in chosen.successes if n < len(tasks)]
+    offline.check(chosen, tasks, (), learn)
+    options = {"recorded": not run.simulated, "among": among}
+    run.held_out = [] if among == [] else held_out(data.validation, tasks, phrases, **options)
+    offline.check(chosen, tasks, run.held_out, learn)
+    unused = {*run.held_out, *chosen.left_out}
+    steps = corrected_only(without(cache.steps, unused), cache, {*chosen.corrected} - unused)
+    run.dataset, run.chosen = mixed(steps, data), chosen
+    run.episodes = outline(cache, unused, chosen.corrected)
     identity = {name: metadata[name] for name in ("crc32", "instructions")}
     if run.held_out:
         identity["held_out"] = run.held_out
@@ -147,6 +156,7 @@ def load(run: Run, source: Source, free_bytes: float) -> None:
         run.config, robot=metadata["robot"], tasks=tuple(metadata["tasks"])
     )
     _describe(run, cache, identity.get("datasets", []))
+    offline.describe(chosen, cache, learn, run.console)
 
 
 def _labels(cache: Cache, data: DataConfig) -> tuple[list[str], list[str]]:
@@ -198,10 +208,13 @@ def as_cache(source: Source, folder: Path, progress: Progress) -> Cache:
     return Cache(folder / CACHE)
 
 
-def outline(dataset: Cache, left_out: Collection[int] = ()) -> dict[str, Episodes]:
+def outline(
+    dataset: Cache, left_out: Collection[int] = (), corrected: Collection[int] = ()
+) -> dict[str, Episodes]:
     """Return the episodes of each task; one image per camera stands in for all others.
 
-    Those that are left out, and tasks that have no others, are missing.
+    Those that are left out, and tasks that have no others, are missing. Of those in `corrected`,
+    each run of corrected steps is an episode.
     """
     episodes = {n: dataset.episode(n, ()) for n in range(len(dataset)) if n not in left_out}
     groups: dict[str, Episodes] = {}
@@ -209,7 +222,8 @@ def outline(dataset: Cache, left_out: Collection[int] = ()) -> dict[str, Episode
         indices = [index for index, episode in episodes.items() if episode.task == task]
         if not indices:
             continue
-        group = concatenate([episodes[index] for index in indices])
+        parts = (_runs(x) if n in corrected else [x] for n, x in episodes.items() if n in indices)
+        group = concatenate([part for pieces in parts for part in pieces])
         image = {
             name: np.broadcast_to(x[0, 0], (*group.state.shape[:2], *x.shape[2:]))
             for name, x in dataset.episode(indices[0]).image.items()
@@ -218,11 +232,24 @@ def outline(dataset: Cache, left_out: Collection[int] = ()) -> dict[str, Episode
     return groups
 
 
-def by_dataset(dataset: Cache, held_out: Collection[int]) -> list[list[Episodes]]:
+def _runs(episode: Episodes) -> Iterator[Episodes]:
+    """Yield the runs of corrected steps of an episode, each as an episode."""
+    flags = np.pad(np.asarray(episode.corrected)[0], 1)
+    for first, end in np.flatnonzero(flags[1:] != flags[:-1]).reshape(-1, 2):
+        cut = {name: getattr(episode, name)[:, first:end] for name in ("state", "action")}
+        flags_of_run = {"corrected": np.ones((1, end - first), bool)}
+        length = np.array([end - first], np.int32)
+        yield dataclasses.replace(episode, length=length, **cut, **flags_of_run)
+
+
+def by_dataset(run: Run) -> list[list[Episodes]]:
     """Return the episodes to train on of each dataset, as `outline` does."""
-    index = dataset.dataset.tolist()
+    dataset, chosen = run.recordings, run.chosen
+    assert dataset is not None
+    assert chosen is not None
+    index, unused = dataset.dataset.tolist(), {*run.held_out, *chosen.left_out}
     others = ({n for n, i in enumerate(index) if i != part} for part in range(len(dataset.parts)))
-    return [[*outline(dataset, {*held_out, *left_out}).values()] for left_out in others]
+    return [[*outline(dataset, unused | rest, chosen.corrected).values()] for rest in others]
 
 
 def without(steps: Steps, held_out: Collection[int]) -> Steps:
@@ -232,6 +259,18 @@ def without(steps: Steps, held_out: Collection[int]) -> Steps:
     episode = np.unique(steps.end, return_inverse=True)[1]
     starts = np.flatnonzero(~np.isin(episode, [*held_out])).astype(np.int32)
     return dataclasses.replace(steps, starts=starts)
+
+
+def corrected_only(steps: Steps, cache: Cache, episodes: Collection[int]) -> Steps:
+    """Return steps whose windows, in some episodes, start and end within runs of corrections."""
+    if not episodes:
+        return steps
+    assert cache.corrected is not None
+    rows, end = np.isin(cache.episodes, [*episodes]), np.asarray(steps.end)
+    starts = np.arange(len(end), dtype=np.int32) if steps.starts is None else steps.starts
+    end = np.where(rows, offline.run_ends(cache.corrected, end), end)
+    kept = starts[(~rows | cache.corrected)[starts]]
+    return dataclasses.replace(steps, starts=kept, end=end)
 
 
 def mixed(steps: Steps, data: DataConfig) -> Steps:

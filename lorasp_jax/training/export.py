@@ -106,12 +106,18 @@ def _metadata(run: Run) -> dict[str, Any]:
             "tokenizer": hub.portable_path(config.model.tokenizer),
             "prompts": _prompts_digest(processor.prompts),
             "instructions": list(processor.prompts.instructions),
+            **_endings(processor.prompts),
             "num_joints": len(processor.state_slots) - 1,
             "action_length": len(processor.action_slots),
             **(robots[default] if default else _robot(processor)),
             **({"dataset": default, "datasets": robots} if robots else {}),
         },
     }
+
+
+def _endings(prompts: PromptTable) -> dict[str, Any]:
+    """Describe the endings of prompts, if there are any."""
+    return {"endings": list(prompts.endings)} if any(prompts.endings) else {}
 
 
 def _robot(processor: Processor) -> dict[str, Any]:
@@ -257,7 +263,8 @@ def _processor(policy: Mapping[str, Any], config: BackboneConfig, words: str) ->
         loaded = tokenizer.load_tokenizer(words or hub.resolve_portable(policy["tokenizer"]))
     except ValueError as error:
         raise ValueError(f"{error}; pass words= if the policy's tokenizer has moved") from error
-    prompts = PromptTable.of(loaded, policy["instructions"], config, num_joints=joints)
+    more = {"num_joints": joints, "endings": policy.get("endings", ("",))}
+    prompts = PromptTable.of(loaded, policy["instructions"], config, **more)
     if _prompts_digest(prompts) != policy["prompts"]:
         raise ValueError(
             f"the tokenizer {words or policy['tokenizer'] or 'of this version'} produces "

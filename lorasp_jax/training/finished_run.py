@@ -14,6 +14,7 @@ from lorasp_jax.config import (
     ModelConfig,
     OptimConfig,
 )
+from lorasp_jax.config.recap import RecapConfig
 from lorasp_jax.training import records
 from lorasp_jax.training.run_folder import CONFIG_FILE, RELATIVE, read_json, recorded_ranges
 
@@ -63,6 +64,8 @@ def _from_json(recorded: Mapping[str, Any], tasks: tuple[str, ...]) -> Config:
     fields["peft"] = recorded_method(fields["peft"])
     if scene := recorded_ranges(recorded):
         fields["scene"] = scene
+    if "recap" in fields:
+        fields["recap"] = RecapConfig(**fields["recap"])
     lists = {name: tuple(fields.get(name, ())) for name in ("targets", "adapt")}
     return Config(**fields | {"tasks": tasks, **lists})
 

@@ -21,6 +21,10 @@ class RandomStream(enum.IntEnum):
     EVALUATION = 10
     """Evaluations before and during training."""
     FINAL_EVALUATION = 11
+    CONDITION = 13
+    """Steps of which a policy is not told whether they are good."""
+    RECORDING = 12
+    """Recorded episodes of a policy; the seed is not the run's."""
 
     def key(self, seed: int, name: str = "") -> jax.Array:
         """Return the key of the stream, or of its part `name`, such as a task."""

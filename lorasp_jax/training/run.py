@@ -18,6 +18,7 @@ from lorasp_jax.data.cache import Cache
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training import records
 from lorasp_jax.training.distributed import processes
+from lorasp_jax.training.offline import Chosen
 from lorasp_jax.training.run_folder import TIMES_FILE, read_json, write_json
 
 
@@ -31,6 +32,7 @@ class Run:
         dataset: all steps of a dataset, stored on disk; None: train on `episodes`.
         recordings: the dataset; None: train on `episodes`.
         held_out: numbers of its episodes that are not trained on.
+        chosen: which of its episodes and steps count.
         streams: whether batches are read from disk because the dataset does not fit on the device.
         devices: devices to train on; None: all.
         simulated: whether the tasks can be evaluated in simulation.
@@ -50,6 +52,7 @@ class Run:
     dataset: Steps | None = None
     recordings: Cache | None = None
     held_out: Sequence[int] = ()
+    chosen: Chosen | None = None
     streams: bool = False
     devices: Sequence[Any] | None = None
     simulated: bool = True

@@ -32,6 +32,8 @@ VALIDATION = "validation.json"
 """File with the final measurements on held-out episodes."""
 CACHE = Path("cache", "steps")
 """The dataset of a run, converted."""
+ADVANTAGES = "advantages.npz"
+"""Values and advantages of recorded steps."""
 STOPPED = "stopped.json"
 """File with the reason why training stopped; removed when training continues."""
 
@@ -74,6 +76,10 @@ def to_json(config: Config) -> dict[str, Any]:
         del data["validation"], fields["keep"], fields["evaluation"]["validate_every"]
     if not config.adapt:
         del fields["adapt"]
+    if config.learn != "recap":
+        del fields["recap"]
+    if config.learn == "imitation":
+        del fields["learn"]
     scene = fields.pop("scene")
     if changed := config.scene.changed():
         fields["scene"] = {name: scene[name] for name in changed}
@@ -174,7 +180,7 @@ def _files(folder: Path) -> set[Path]:
 def _results(folder: Path) -> set[Path]:
     """Return the files of a run that are more than its beginning."""
     unfinished = {*folder.glob(f".*{TEMPORARY_SUFFIX}")}  # left by a killed process
-    begun = {folder / name for name in (CONFIG_FILE, TIMES_FILE, DATASET_FILE)}
+    begun = {folder / name for name in (CONFIG_FILE, TIMES_FILE, DATASET_FILE, ADVANTAGES)}
     return _files(folder) - unfinished - begun
 
 

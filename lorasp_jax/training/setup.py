@@ -26,11 +26,12 @@ from lorasp_jax.data.source import Source, describe_left_out
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig
+from lorasp_jax.policies import prompts
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor, robot_slots
 from lorasp_jax.policies.prompt_table import PromptTable
-from lorasp_jax.policies.tokenizer import Tokenizer, load_tokenizer
-from lorasp_jax.training import dataset, rules
+from lorasp_jax.policies.tokenizer import Offline, Tokenizer, load_tokenizer
+from lorasp_jax.training import advantage, dataset, rules
 from lorasp_jax.training.base import base_model, quantized, with_config
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.demonstrations import Demonstrations, Progress, demonstrations, in_thread
@@ -104,7 +105,11 @@ def build(
     source = dataset.open_dataset(config, base.config, folder) if config.data.source else None
     if source and not base.config.inputs.masks_missing:
         base = with_config(base, cameras=base.config.cameras[: len(source.cameras)])
-    prompts, joints = _prompts_and_joints(source, environments, tokenizer, base.config)
+    endings = ("",)
+    if config.learn == "recap":
+        short = isinstance(tokenizer, Offline)
+        endings = prompts.ADVANTAGE_SHORT if short else prompts.ADVANTAGE
+    table, joints = _prompts_and_joints(source, environments, tokenizer, base.config, endings)
     _check_sizes(config, base.config.chunk)
     if not source:
         robot_slots(joints, base.config.inputs)
@@ -122,7 +127,7 @@ def build(
         if abstract
         else _adapt(config, base, rules.rules(config, as_saved=True))
     )
-    found = (base, base_hash, model, prompts, joints, environments, source)
+    found = (base, base_hash, model, table, joints, environments, source)
     return RunSetup(*found, memory, available, free_bytes)
 
 
@@ -158,8 +163,12 @@ def prepare(
     inputs = processor(groups, model.config, built.prompts, cameras=cameras)
     if run.recordings and (parts := run.recordings.parts)[1:]:
         each = config.data.statistics == "each"
-        groups = dataset.by_dataset(run.recordings, run.held_out) if each else ()
+        groups = dataset.by_dataset(run) if each else ()
         inputs = of_datasets(inputs, model.config, parts, groups)
+    if config.learn == "recap":
+        assert run.dataset is not None
+        rows = advantage.prompt_rows(run, model, inputs)
+        run.dataset = dataclasses.replace(run.dataset, instruction=rows)
     if any(method.needs_statistics for method in rules.methods(config)):
         moments = input_moments(run, quantized(base, config.model.base_dtype), inputs)
         model = _adapt(config, base, rules.rules(config), moments)
@@ -219,6 +228,7 @@ def _prompts_and_joints(
     environments: Sequence[Env],
     tokenizer: Tokenizer,
     model: BackboneConfig,
+    endings: Sequence[str] = ("",),
 ) -> tuple[PromptTable, int]:
     """Return the prompts for all instructions, and the robot's number of joints."""
     if source is None:
@@ -228,11 +238,12 @@ def _prompts_and_joints(
     first = source.episode(0, ())
     joints = first.state.shape[-1] - 1
     try:
-        prompts = PromptTable.of(tokenizer, first.instructions, model, num_joints=joints)
+        more: Any = {"num_joints": joints, "endings": endings}
+        table = PromptTable.of(tokenizer, first.instructions, model, **more)
     except ValueError as error:
         need = "need a different --model.tokenizer or --model.max-tokens"
         raise ValueError(f"the dataset's instructions {need}: {error}") from error
-    return prompts, joints
+    return table, joints
 
 
 def _check_sizes(config: Config, chunk: int) -> None:

@@ -185,7 +185,7 @@ def test_randomized_rollouts():
 
 
 def test_the_config_says_whether_to_randomize(monkeypatch):
-    monkeypatch.setattr(programs, "_environment", lambda *_: ROOMS[0])
+    monkeypatch.setattr(programs, "environment", lambda *_: ROOMS[0])
     ranges = Randomization(turn=(0.5, 0.5))
     plain = dataclasses.replace(CONFIG, evaluation=EvaluationConfig(execute_steps=3))
     for config, draw in ((plain, None), (dataclasses.replace(plain, scene=ranges), 0.5)):

@@ -10,6 +10,7 @@ import pytest
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.policies import prompts, tokenizer
 from lorasp_jax.policies.prompt_table import PromptTable
+from lorasp_jax.policies.prompts import pad
 from tests import GOLDEN
 
 GOLDEN = GOLDEN / "tokenizers"
@@ -91,3 +92,27 @@ def test_tokenizer_of_a_different_model(few_bins, config):
     words = tokenizer.load_tokenizer(SMOLVLM)
     with pytest.raises(ValueError, match="vocabulary 320"):
         PromptTable.of(words, ["press the red button"], config, num_joints=6)
+
+
+class Letters:
+    """A tokenizer of letters that cuts what is too long."""
+
+    vocabulary = 128
+
+    def encode(self, texts, max_tokens, *, complete=False):
+        rows = [[ord(letter) for letter in text][:max_tokens] for text in texts]
+        return pad(texts, rows, max_tokens, pad=0)
+
+
+@pytest.mark.filterwarnings("ignore:.*truncated:UserWarning")
+def test_endings_follow_every_instruction_and_must_fit():
+    """A policy is asked to do what follows the first."""
+    config = dataclasses.replace(Pi0Config.dummy(), max_tokens=6)
+    table = PromptTable.of(Letters(), ["lift", "go"], config, num_joints=6, endings=("+", "-", ""))
+    said = ["".join(map(chr, row[row > 0])) for row in np.asarray(table.start.ids)]
+    assert said == ["lift+", "go+", "lift-", "go-", "lift", "go"]
+    assert table.rows(["go"]).tolist() == [1]
+    asked = table.with_instructions(Letters(), ["put"]).start.ids[0]
+    assert "".join(map(chr, np.asarray(asked)[:4])) == "put+"
+    with pytest.raises(ValueError, match=r"'release' leaves no room for '[+]' in 6 tokens"):
+        PromptTable.of(Letters(), ["release"], config, num_joints=6, endings=("+", "-", ""))

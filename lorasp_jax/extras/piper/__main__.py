@@ -28,6 +28,8 @@ HELD = 3
 """Exit code after a problem in which the arm held."""
 KEYS = "sfaq"
 """Keyboard of a person's verdict on an episode, which also end it."""
+TAKE = "t"
+"""Key with which a person takes over from a recorded policy, by hand."""
 QUESTION = "success (s), failure (f), again (a) or quit (q)?"
 
 
@@ -163,34 +165,29 @@ def _open(
 
 
 def _episodes(options: argparse.Namespace, rig: Rig, prompts: Sequence[str], seconds: float) -> int:
-    """Run until enough episodes were judged, or recorded; return the exit code."""
+    """Run until enough episodes were judged, or demonstrated; return the exit code."""
     start, judged, kept = rig.arms.read(), 0, 0
     judging = bool(rig.recorder) or options.episodes > 1
     work: Session | Lesson | None = None
     while True:
-        prompt = prompts[(kept if rig.recorder else judged) % len(prompts)]
+        prompt = prompts[(kept if options.teach else judged) % len(prompts)]
         before, work = work, _prepare(options, rig, prompt)
         shared.stop_on_signals(work)
         if rig.log:
             rig.log.line(RealClock().now(), episode=judged)
         if before and before.stopped:  # meanwhile
             break
-        verdict = ""
-        while judging and rig.keys.pressed():
-            pass  # what was typed before is no verdict
-
-        def done() -> bool:
-            nonlocal verdict
-            verdict = verdict or (key if judging and (key := rig.keys.pressed()) in KEYS else "")
-            return bool(verdict)
-
-        if _execute(work, seconds, done):
+        verdict, work, problem = _run_episode(options, rig, work, seconds, judging=judging)
+        if problem:
             return HELD
         if judging:
             verdict = _keep(rig, verdict)
-            judged, kept = judged + (verdict in "sf"), kept + (verdict == "s")
-        enough = (kept if rig.recorder else judged) >= options.episodes
+            judged, kept = judged + (verdict in ("s", "f")), kept + (verdict == "s")
+        enough = (kept if options.teach else judged) >= options.episodes
         if not judging or enough or work.stopped or verdict == "q" or rig.keys.ended:
+            break
+        if rig.server and isinstance(work, Lesson):
+            print("the policy can go on after a reset of the arm: see docs/robot.md")
             break
         if isinstance(work, Session) and work.home(start):
             return HELD
@@ -199,6 +196,36 @@ def _episodes(options: argparse.Namespace, rig: Rig, prompts: Sequence[str], sec
     if options.episodes > 1:
         print(f"{kept} of {judged} succeeded")
     return 0
+
+
+def _run_episode(
+    options: argparse.Namespace,
+    rig: Rig,
+    work: Session | Lesson,
+    seconds: float,
+    *,
+    judging: bool,
+) -> tuple[str, Session | Lesson, str | None]:
+    """Run an episode, which a person may take over from a recorded policy.
+
+    Returns:
+        The verdict by key, if there is one; what ended the episode; and the problem, if any.
+    """
+    verdict, keys = "", KEYS + TAKE * bool(rig.server and rig.recorder and rig.recorder.marks)
+    while judging and rig.keys.pressed():
+        pass  # what was typed before is no verdict
+
+    def done() -> bool:
+        nonlocal verdict
+        verdict = verdict or (key if judging and (key := rig.keys.pressed()) in keys else "")
+        return bool(verdict)
+
+    problem = _execute(work, seconds, done)
+    if verdict == TAKE and not problem:
+        verdict, keys, work = "", KEYS, _take_over(options, rig)
+        shared.stop_on_signals(work)
+        problem = _execute(work, seconds, done)
+    return verdict, work, problem
 
 
 def _reset(options: argparse.Namespace, rig: Rig) -> bool:
@@ -227,6 +254,14 @@ def _prepare(options: argparse.Namespace, rig: Rig, prompt: str) -> Session | Le
     return Lesson(rig.arms, rig.look, rig.recorder, clock, **way)
 
 
+def _take_over(options: argparse.Namespace, rig: Rig) -> Lesson:
+    """Return the rest of a policy's episode, in which a person guides the arm by hand."""
+    assert rig.recorder
+    print(f"take over: guide the arm by hand, then press a key: {QUESTION}", flush=True)
+    how = {"way": "hand", "control_dt": shared.period(options), "corrects": True}
+    return Lesson(rig.arms, rig.look, rig.recorder, RealClock(), **how)
+
+
 def _execute(work: Session | Lesson, seconds: float, done: Callable[[], bool]) -> str | None:
     """Run an episode; return the problem in a sentence, if there is one."""
     if isinstance(work, Session):
@@ -240,9 +275,9 @@ def _execute(work: Session | Lesson, seconds: float, done: Callable[[], bool]) -
 
 
 def _keep(rig: Rig, verdict: str) -> str:
-    """Return a person's verdict on the episode, after recording it if it succeeded.
+    """Return a person's verdict on the episode, after recording it with its outcome.
 
-    An episode that nobody can judge is kept, and is the last.
+    A demonstration that failed is not kept. An episode that nobody can judge is, and is the last.
 
     Raises:
         KeyboardInterrupt: Ctrl-C in place of an answer; the episode is not kept.
@@ -251,16 +286,16 @@ def _keep(rig: Rig, verdict: str) -> str:
     try:
         verdict = verdict or rig.keys.ask(QUESTION, KEYS)
     except EOFError as error:
-        verdict, note = "s", f"nobody answers ({error}), so the episode is kept: "
+        verdict, note = "", f"nobody answers ({error}), so the episode is kept: "
         rig.keys.ended = True
     except KeyboardInterrupt as stop:
         raise KeyboardInterrupt("the episode is not kept") from stop
-    if recorder and verdict == "f":
+    if recorder and verdict == "f" and not (rig.server and recorder.steps):
         recorder.fail()
-    elif recorder and verdict in "aq":
+    elif recorder and verdict in ("a", "q"):
         recorder.discard()
     elif recorder:
-        recorder.keep()
+        recorder.keep({"s": True, "f": False}.get(verdict))
         print(f"{note}{recorder.num_episodes} episodes recorded")
     return verdict
 

@@ -42,8 +42,8 @@ def add_shared(parser: argparse.ArgumentParser) -> None:
         "100, for slow links; default: as they are")  # fmt: skip
     add = parser.add_argument_group("execution").add_argument
     add("--episodes", type=positive, default=1, help="default: %(default)s")
-    add("--record", type=Path, metavar="FOLDER", help="add the successful episodes to an RLDS "
-        "dataset, which train.py takes as --data.source")  # fmt: skip
+    add("--record", type=Path, metavar="FOLDER", help="add the episodes and their outcomes to an "
+        "RLDS dataset, which train.py takes as --data.source")  # fmt: skip
     add("--execute", type=positive, default=5, help="actions of each chunk (default: %(default)s)")
     add("--ahead", type=int, default=0, help="actions before their end to ask for the next chunk; "
         "0: the arm waits for the answer (default: %(default)s)")  # fmt: skip

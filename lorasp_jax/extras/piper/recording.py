@@ -19,6 +19,7 @@ class Recording:
 
     Attributes:
         steps: control steps of the present episode.
+        marks: whether corrections can be marked, as older datasets cannot.
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class Recording:
         named = {"names": [*names]} if names else {}
         self._writer = ShardWriter(folder, {"image_size": image_size, **named})
         earlier = self._writer.metadata
+        self.marks: bool = earlier.get("corrected", not earlier["parts"])
         self._shared = {"task": task or earlier.get("task", "task"), "robot": robot}
         self._shared |= {"control_dt": control_dt, "physics_dt": physics_dt}
         for name, value in self._shared.items():  # before somebody demonstrates in vain
@@ -74,13 +76,24 @@ class Recording:
         """Number of control steps of the present episode."""
         return len(self._actions)
 
-    def step(self, images: Mapping[str, np.ndarray], state: np.ndarray, action: np.ndarray) -> None:
-        """Add a control step: pictures uint8 [H, W, 3], measured pose and action [7 N]."""
+    def step(
+        self,
+        images: Mapping[str, np.ndarray],
+        state: np.ndarray,
+        action: np.ndarray,
+        *,
+        corrected: bool = False,
+    ) -> None:
+        """Add a control step: pictures uint8 [H, W, 3], measured pose and action [7 N].
+
+        `corrected` says that a person acted in place of a policy.
+        """
         for name, image in images.items():
             square = to_square(name, image, self._image_size)
             self._images.setdefault(name, []).append(square)
         self._states.append(state)
         self._actions.append(action)
+        self._corrected.append(corrected)
 
     def say(self, prompt: str) -> None:
         """Set the phrasing of the present episode, which is added to the dataset's if it is new."""
@@ -98,9 +111,13 @@ class Recording:
         self._images: dict[str, list[np.ndarray]] = {}
         self._states: list[np.ndarray] = []
         self._actions: list[np.ndarray] = []
+        self._corrected: list[bool] = []
 
-    def keep(self) -> None:
-        """Write the present episode, which succeeded, and complete the dataset.
+    def keep(self, success: bool | None = None) -> None:
+        """Write the present episode, and complete the dataset.
+
+        Args:
+            success: its outcome; None: nobody said.
 
         Raises:
             ValueError: the episode is empty, or differs from the dataset's in cameras.
@@ -115,6 +132,8 @@ class Recording:
             action=np.stack(self._actions)[None].astype(np.float32),
             length=np.array([self.steps], np.int32),
             instruction=np.array([instructions.index(self._prompt)], np.int32),
+            success=np.array([-1 if success is None else success], np.int32),
+            corrected=np.array([self._corrected]),
             attempted=1 + self._failures,
             **self._shared,
         )

@@ -37,8 +37,13 @@ class Lesson:
         *,
         way: Way,
         control_dt: float,
+        corrects: bool = False,
     ) -> None:
-        """Prepare a demonstration; for guiding by hand, the arms must be enabled."""
+        """Prepare a demonstration; for guiding by hand, the arms must be enabled.
+
+        With `corrects`, a person goes on with a policy's episode, and its steps say so.
+        """
+        self._corrects = corrects
         self._arms, self._look, self._recorder = arms, look, recorder
         self._clock, self._way, self._dt = clock, way, control_dt
         self.stopped = False
@@ -67,14 +72,15 @@ class Lesson:
 
     def _record(self, seconds: float, done: Callable[[], bool]) -> None:
         start = due = self._clock.now()
-        before = shown = None
+        before, shown, first = None, None, self._recorder.steps
         while self._clock.now() - start < seconds and not self.stopped and not done():
             pose = self._read()
             target = self._target(pose)
             if before is not None:
                 shown = target if shown is None else shown
-                if np.abs(target - shown).max() > _STILL or self._recorder.steps:
-                    self._recorder.step(*before, self._arms.clip(target))
+                if np.abs(target - shown).max() > _STILL or self._recorder.steps > first:
+                    action = self._arms.clip(target)
+                    self._recorder.step(*before, action, corrected=self._corrects)
             before = self._look(), pose
             due += self._dt
             self._clock.wait_until(due)

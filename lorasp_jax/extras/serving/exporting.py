@@ -141,7 +141,8 @@ def _write_texts(
 def _tokens(policy: Policy) -> dict[str, Any]:
     """Return the tokens of each instruction as JSON values."""
     prompts = policy.processor.prompts
-    ids, mask = (np.asarray(array).tolist() for array in prompts.start)
+    own = slice(len(prompts.instructions))  # further rows have other endings
+    ids, mask = (np.asarray(array)[own].tolist() for array in prompts.start)
     rows = zip(prompts.instructions, ids, mask, strict=True)
     return {text: {"ids": ids, "mask": mask} for text, ids, mask in rows}
 

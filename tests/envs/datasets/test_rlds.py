@@ -17,7 +17,9 @@ from tests.envs.datasets.test_episodes import assert_equal, make
 
 
 def trimmed(episodes: Episodes) -> Episodes:
-    """Return episodes as they are read: padded with zeros to the longest one."""
+    """Return episodes as they are read: padded with zeros to the longest one, all successes."""
+    successes = np.ones(episodes.num_episodes, np.int32)
+    episodes = dataclasses.replace(episodes, success=successes)
     longest = int(np.max(episodes.length))
 
     def blank(array):
@@ -57,6 +59,7 @@ def test_one_episode_at_a_time(path):
             state=one.state[:, :length],
             action=one.action[:, :length],
             attempted=1,
+            success=np.ones(1, np.int32),
         )
         assert_equal(found.episode(number), short)
         assert_equal(found.episode(number, ()), dataclasses.replace(short, image={}))

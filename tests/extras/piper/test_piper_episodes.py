@@ -100,25 +100,59 @@ def test_the_real_command_with_an_arm_on_the_bus(server, linked, tmp_path, press
 def test_several_episodes_are_recorded_in_one_start_and_in_the_next(
     server, linked, tmp_path, press_keys, capsys
 ):
-    """One fails, one is done again, and two succeed, with prompts that take turns."""
+    """One fails, one is done again, and one succeeds, with prompts that take turns."""
     words = ["--server", server.address, *linked, "--seconds", "0.3", "--image-size", "16"]
     words += ["--record", str(tmp_path / "data"), "--episodes", "2"]
     words += ["--prompt", "press it", "--prompt", "tap it"]
-    keys = press_keys("", "f\na\ns\ns")
+    keys = press_keys("", "f\na\ns")
     assert real([*words, "--log", str(tmp_path / "log")]) == 0
     printed = capsys.readouterr().out
-    assert printed.count("moving slowly to the start pose") == 3
-    assert "2 of 3 succeeded" in printed
-    assert sum("scene" in question for question in keys.questions) == 3
+    assert printed.count("moving slowly to the start pose") == 2
+    assert "1 of 2 succeeded" in printed
+    assert sum("scene" in question for question in keys.questions) == 2
     press_keys("", "q")  # a person who ends the next session at once
     assert real([*words, "--log", str(tmp_path / "log2")]) == 0
-    press_keys("", "s\nf\nq")
+    press_keys("", "s\nq")
     assert real([*words, "--log", str(tmp_path / "log3")]) == 0
     source = open_source(tmp_path / "data")
     episodes = [source.episode(i) for i in range(len(source))]
     said = [e.instructions[int(e.instruction[0])] for e in episodes]
     assert said == ["press it", "tap it", "press it"]
-    assert source.metadata["attempted"] == 4
+    assert [int(e.success[0]) for e in episodes] == [0, 1, 1]
+    assert source.metadata["attempted"] == 3
+
+
+def test_a_person_takes_over_by_hand(server, linked, tmp_path, press_keys, monkeypatch, capsys):
+    """What follows is marked, and ends the session: the arm obeys again after a reset."""
+
+    taught = []
+
+    def teach(arm, on):
+        arm.fake.hand = arm.read().pose
+        taught.append(arm)
+        PiperArm.teach(arm, on)
+
+    def pressed(seconds=0.0):
+        if taught:  # the hand turns the base from step to step
+            taught[0].fake.hand = taught[0].fake.hand + np.eye(7)[0] * 0.01
+        return script(seconds)
+
+    monkeypatch.setattr(LinkedArm, "teach", teach, raising=False)
+    keys = press_keys([*400 * [""], "t", *8 * [""], "s"], "")
+    script, keys.pressed = keys.pressed, pressed
+    words = ["--server", server.address, *linked, "--seconds", "30", "--image-size", "16"]
+    words += ["--record", str(tmp_path / "data"), "--log", str(tmp_path / "log")]
+    assert real([*words, "--episodes", "3"]) == 0
+    printed = capsys.readouterr().out
+    assert "take over: guide the arm by hand" in printed
+    assert "after a reset of the arm" in printed
+    source = open_source(tmp_path / "data")
+    assert len(source) == 1
+    episode = source.episode(0)
+    assert int(episode.success[0]) == 1
+    flags = episode.corrected[0]
+    assert 2 <= flags.sum() < len(flags)
+    assert flags[-flags.sum() :].all()  # the person acts until the end
 
 
 def test_a_key_ends_an_episode(server, linked, tmp_path, press_keys, capsys):
@@ -297,7 +331,7 @@ def test_an_episode_that_nobody_judges_is_not_lost(number, tmp_path, capsys, ter
                 with pytest.raises(KeyboardInterrupt, match="not kept"):
                     command._keep(rig, "")
             else:
-                assert command._keep(rig, "") == "s"
+                assert command._keep(rig, "") == ""
                 assert rig.keys.ended
     finally:
         for each, handler in handlers.items():

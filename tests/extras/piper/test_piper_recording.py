@@ -1,5 +1,7 @@
 """Recording episodes: of a policy, of a hand, of a leader; the dataset feeds training."""
 
+import json
+
 import can
 import numpy as np
 import pytest
@@ -150,6 +152,16 @@ def test_other_settings_or_nothing_are_refused(tmp_path):
     with pytest.raises(ValueError, match="no step"):
         recording(tmp_path / "data").keep()
     assert len(open_source(tmp_path / "data")) == 1
+
+
+def test_an_older_dataset_cannot_mark_corrections(tmp_path):
+    filled(recording(tmp_path / "data")).keep(success=True)
+    assert recording(tmp_path / "data").marks
+    metadata = tmp_path / "data" / "metadata.json"
+    content = json.loads(metadata.read_text())
+    assert content.pop("corrected")
+    metadata.write_text(json.dumps(content))
+    assert not recording(tmp_path / "data").marks
 
 
 def test_a_new_phrasing_is_added(tmp_path):

@@ -27,6 +27,7 @@ from lorasp_jax.extras.piper.fake.firmware import PERIOD, FakePiper
 from lorasp_jax.extras.piper.fake.hand_over import TASK, HandOver
 from lorasp_jax.extras.piper.fake.timing import Lockstep, RealTime
 from lorasp_jax.extras.piper.fake.world import TIMESTEP, World
+from lorasp_jax.extras.piper.recording import Recording
 from lorasp_jax.extras.piper.session import Session
 from lorasp_jax.extras.serving.client import ServerGone
 
@@ -118,18 +119,26 @@ def _episodes(
         wins += world.success
         if film:
             film += [_framed(film[-1], world.success)] * round(_PAUSE * _VIDEO_RATE)
-        if recorder and world.success:
-            recorder.keep()
-        elif recorder:
-            recorder.discard()
-        if server and server.ended and not (world.success or session.stopped):
+        stopped = world.success or session.stopped
+        ended = "" if stopped or not server else server.ended
+        if recorder:
+            _keep(recorder, world.success, failed=bool(server) and not (ended or session.stopped))
+        if ended:
             before = f"before, {_result(wins, episode)}" if episode else "no episode was judged"
-            raise ServerGone(f"stopped in episode {episode}, as {server.ended}; {before}")
+            raise ServerGone(f"stopped in episode {episode}, as {ended}; {before}")
         outcome = "success" if world.success else f"failure: {problem}" if problem else "failure"
         console.print(f"episode {episode}: {outcome}", markup=False, highlight=False)
         if session.stopped:
             raise KeyboardInterrupt
     console.print(_result(wins, options.episodes))
+
+
+def _keep(recorder: Recording, success: bool, *, failed: bool) -> None:
+    """Record a success, or a policy's failure; forget what was cut short, or the expert's."""
+    if recorder.steps and (success or failed):
+        recorder.keep(success)
+    else:
+        recorder.discard()
 
 
 def _result(wins: int, episodes: int) -> str:

@@ -1,9 +1,11 @@
 """Experiment config as frozen dataclasses; files in `configs/` return a `Config` per scale."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 from envs.scene.ranges import Randomization
+from lorasp_jax.config.augment import AugmentConfig
+from lorasp_jax.config.recap import RecapConfig
 from lorasp_jax.peft import Method, fields
 from lorasp_jax.peft.auxiliary import AUXILIARY_WEIGHTS
 
@@ -85,75 +87,6 @@ class ModelConfig:
     def __post_init__(self) -> None:
         fields.check_fields(self)
         _at_least(0, self, "max_tokens", "chunk")
-
-
-_AUGMENT = {
-    "openpi": {"crop": 0.95, "rotation": 5.0, "brightness": 0.3, "contrast": 0.4, "hue": 0.1},
-    "lerobot": {"rotation": 5.0, "translation": 0.05, "brightness": 0.2, "contrast": 0.2}
-    | {"saturation": 0.5, "hue": 0.05, "sharpness": 0.5, "at_most": 3},
-}
-"""Presets of `AugmentConfig`: openpi's models/model.py with augmax's default hue, and LeRobot's
-datasets/transforms.py."""
-
-
-@dataclass(frozen=True)
-class AugmentConfig:
-    """Random changes of training images. A number that is not given is the preset's."""
-
-    preset: Literal["auto", "none", "openpi", "lerobot"] = "auto"
-    """The recipe of openpi or LeRobot; auto: openpi for recordings, none for simulated episodes."""
-    crop: float | None = None
-    """Side of a random crop, relative to the image's (openpi, not for wrist cameras)."""
-    rotation: float | None = None
-    """Largest rotation [degrees] (not for wrist cameras in openpi)."""
-    translation: float | None = None
-    """Largest shift, relative to the image's side (LeRobot)."""
-    brightness: float | None = None
-    """Largest change of brightness."""
-    contrast: float | None = None
-    """Largest change of contrast."""
-    saturation: float | None = None
-    """Largest change of saturation (LeRobot)."""
-    hue: float | None = None
-    """Largest change of hue [turns of the color circle]."""
-    sharpness: float | None = None
-    """Largest change of sharpness (LeRobot)."""
-    at_most: int | None = None
-    """Number of kinds of change applied to an image (LeRobot)."""
-
-    @property
-    def given(self) -> dict[str, float]:
-        """The numbers that are not the preset's."""
-        return {name: x for name, x in vars(self).items() if name != "preset" and x is not None}
-
-    @property
-    def numbers(self) -> dict[str, float]:
-        """The numbers of the recipe."""
-        return {**_AUGMENT[self.preset], **self.given}
-
-    def chosen(self, *, simulated: bool) -> "AugmentConfig | None":
-        """Return the recipe for recordings or simulated episodes; None if images stay as they are.
-
-        Raises:
-            ValueError: a number is given that the recipe does not have.
-        """
-        preset = {"auto": "none" if simulated else "openpi"}.get(self.preset, self.preset)
-        if preset != self.preset:
-            return replace(self, preset=preset).chosen(simulated=simulated)
-        valid = _AUGMENT.get(preset, {})
-        for name in self.given.keys() - valid:
-            names = ", ".join(valid) or "no numbers"
-            raise ValueError(f"data.augment.{name}: preset {preset} has {names}")
-        return None if preset == "none" else self
-
-    def __post_init__(self) -> None:
-        fields.check_fields(self)
-        for name, value in self.given.items():
-            _require(value >= 0, f"data.augment.{name} must be at least 0", value)
-        crop = 1 if self.crop is None else self.crop
-        _require(0 < crop <= 1, "data.augment.crop must lie in (0, 1]", crop)
-        if self.preset != "auto":
-            self.chosen(simulated=False)
 
 
 @dataclass(frozen=True)
@@ -348,6 +281,11 @@ class Config:
     evaluation. Equal ends fix a value; the defaults change nothing."""
     data: DataConfig = field(default_factory=DataConfig)
     """Training data."""
+    learn: Literal["imitation", "filtered", "recap"] = "imitation"
+    """What to learn from recordings: all that was done (imitation); what succeeded or a person
+    corrected (filtered); or all, told good from bad by the advantage (recap)."""
+    recap: RecapConfig = field(default_factory=RecapConfig)
+    """Settings of learn recap."""
     optim: OptimConfig = field(default_factory=OptimConfig)
     """Optimizer and schedule."""
     auxiliary: AuxiliaryConfig = field(default_factory=AuxiliaryConfig)
@@ -394,6 +332,8 @@ class Config:
         _require(self.control_dt > 0, "control_dt must be above 0", self.control_dt)
         _require(0 <= self.seed < 2**32, "seed must lie in [0, 2**32)", self.seed)
         self.scene.check(self.control_dt)
+        if self.learn != "imitation" and not self.data.source:
+            raise ValueError(f"learn {self.learn} needs recordings with outcomes: add data.source")
         every, rule = self.data.fresh_every, "data.fresh_every must be a multiple of log_every"
         _require(every % self.log_every == 0, rule, f"{every} and {self.log_every}")
         unique = 0 < len(self.tasks) == len(set(self.tasks))

@@ -1,0 +1,27 @@
+"""Settings of advantage-conditioned learning (RECAP, arXiv 2511.14759)."""
+
+from dataclasses import dataclass
+
+from lorasp_jax.peft import fields
+
+
+@dataclass(frozen=True)
+class RecapConfig:
+    """Which actions count as good, and how the policy is told."""
+
+    steps: int = 10
+    """Control steps whose effect on the value is an action's advantage."""
+    share: float = 0.3
+    """Share of a task's steps with the highest advantage, which count as good; demonstrations and
+    corrections always do."""
+    dropout: float = 0.3
+    """Share of the steps that the policy learns without being told which are good."""
+
+    def __post_init__(self) -> None:
+        fields.check_fields(self)
+        if self.steps < 1:
+            raise ValueError(f"recap.steps must be at least 1, got {self.steps}")
+        if not 0 < self.share < 1:
+            raise ValueError(f"recap.share must lie in (0, 1), got {self.share}")
+        if not 0 <= self.dropout < 1:
+            raise ValueError(f"recap.dropout must lie in [0, 1), got {self.dropout}")
