@@ -19,7 +19,8 @@ class AugmentConfig:
     """Random changes of training images. A number that is not given is the preset's."""
 
     preset: Literal["auto", "none", "openpi", "lerobot"] = "auto"
-    """The recipe of openpi or LeRobot; auto: openpi for recordings, none for simulated episodes."""
+    """The recipe of openpi or LeRobot; auto: openpi's without its crop, which cost success in
+    studies/few, for recordings, none for simulated episodes."""
     crop: float | None = None
     """Side of a random crop, relative to the image's (openpi, not for wrist cameras)."""
     rotation: float | None = None
@@ -55,14 +56,15 @@ class AugmentConfig:
         Raises:
             ValueError: a number is given that the recipe does not have.
         """
-        preset = {"auto": "none" if simulated else "openpi"}.get(self.preset, self.preset)
-        if preset != self.preset:
-            return replace(self, preset=preset).chosen(simulated=simulated)
-        valid = _AUGMENT.get(preset, {})
+        if self.preset == "auto":
+            if simulated:
+                return replace(self, preset="none").chosen(simulated=True)
+            return replace(self, preset="openpi", crop=1.0 if self.crop is None else self.crop)
+        valid = _AUGMENT.get(self.preset, {})
         for name in self.given.keys() - valid:
             names = ", ".join(valid) or "no numbers"
-            raise ValueError(f"data.augment.{name}: preset {preset} has {names}")
-        return None if preset == "none" else self
+            raise ValueError(f"data.augment.{name}: preset {self.preset} has {names}")
+        return None if self.preset == "none" else self
 
     def __post_init__(self) -> None:
         fields.check_fields(self)
