@@ -155,8 +155,8 @@ def override(config: Config, arguments: Sequence[str], program: str = "") -> Con
         prog=program,
         config=(tyro.conf.AvoidSubcommands,),
     )
-    names = (field.name for field in dataclasses.fields(Config))
-    return Config(**{name: getattr(parsed, name) for name in names})
+    names = (field.name for field in dataclasses.fields(config))
+    return type(config)(**{name: getattr(parsed, name) for name in names})
 
 
 def _check_rules(config: Config, arguments: Sequence[str]) -> None:
@@ -199,7 +199,7 @@ def _with_rank_of(current: peft.Method, name: str) -> peft.Method:
 
 
 def _concrete(config: Config) -> type[Config]:
-    """Return a `Config` class whose `peft` has the chosen method's type, to expose its fields.
+    """Return a config class whose `peft` has the chosen method's type, to expose its fields.
 
     `scale` is hidden, because it only selects defaults.
     """
@@ -209,7 +209,7 @@ def _concrete(config: Config) -> type[Config]:
             ("peft", type(config.peft), dataclasses.field()),
             ("scale", tyro.conf.Suppress[str], dataclasses.field()),
         ],
-        bases=(Config,),
+        bases=(type(config),),
         frozen=True,
         kw_only=True,
     )
