@@ -24,6 +24,7 @@ from lorasp_jax.reinforce.rollout import Rollout
 from lorasp_jax.reinforce.update import Batch, Learner
 from lorasp_jax.training import best
 from lorasp_jax.training.checkpoint import Checkpoints
+from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.guard import Guard, summarize
 from lorasp_jax.training.interrupt import deferred
@@ -92,6 +93,7 @@ def _set_up(run: Run) -> tuple[Setting, Learner, Any]:
     assert isinstance(config, ReinforceConfig)
     learning, evaluation = config.learn, config.evaluation
     environments = {task: _environment(config, task) for task in config.tasks}
+    check_memory(config, environments)
     mesh = meshes.make_mesh(config.fsdp, run.devices)
     graphdef, adapters, parameters = adaptation.split(run.policy.model)
     methods = adaptation.methods(run.policy.model).values()
@@ -134,6 +136,18 @@ def _environment(config: ReinforceConfig, task: str) -> Env:
         reward=config.learn.reward,
         discount=config.learn.discount,
     )
+
+
+def check_memory(config: ReinforceConfig, environments: Mapping[str, Env]) -> None:
+    """Raise ValueError if the pictures of an iteration exceed the memory of the devices."""
+    calls = sum(-(-x.max_steps // config.evaluation.execute_steps) for x in environments.values())
+    pictures = len(Env.cameras) * config.image_size**2 * 3
+    needed = calls * config.learn.worlds * pictures / jax.local_device_count()
+    if needed > (available := preflight.available_bytes()):
+        raise ValueError(
+            f"the pictures of {config.learn.worlds} worlds (learn.worlds) take "
+            f"{needed / 2**30:.1f} GiB per device of {available / 2**30:.1f}: choose fewer worlds"
+        )
 
 
 def _critics(config: ReinforceConfig, environments: Mapping[str, Env]) -> dict[str, Critic]:
