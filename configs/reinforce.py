@@ -6,7 +6,7 @@
 Base, robot, tasks and adapters are the start run's. See docs/reinforce.md.
 """
 
-from lorasp_jax.config import AuxiliaryConfig, EvaluationConfig, OptimConfig
+from lorasp_jax.config import EvaluationConfig, OptimConfig
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.reinforce.config import Learning, ReinforceConfig
 
@@ -20,7 +20,6 @@ def get_config(scale: str) -> ReinforceConfig:
         scale=scale,
         peft=LoRASP(),
         tasks=("press",),
-        auxiliary=AuxiliaryConfig(spectral=0, balance=0, z=0, orthogonality=0),
         optim=OptimConfig(
             steps={"smoke": 2, "cpu": 40, "accelerator": 300}[scale],
             batch_size={"smoke": 64, "cpu": 256, "accelerator": 2048}[scale],

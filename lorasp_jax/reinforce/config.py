@@ -11,22 +11,20 @@ from lorasp_jax.peft import fields
 
 @dataclass(frozen=True)
 class Learning:
-    """Proximal policy optimization (PPO, arXiv 1707.06347) of a flow policy with Gaussian noise."""
+    """How a flow policy learns from its own episodes, in which Gaussian noise explores."""
 
     start: Annotated[str, tyro.conf.arg(name="from", prefix_name=False)] = ""
     """Finished run to start from: its base, robot, adapters and, unless given, tasks. Empty: the
     base in model with new adapters, as `train.py` would start."""
     adapters: Literal["continue", "merge"] = "continue"
     """Train the adapters of the start run, or merge them into its base and train new ones."""
+    method: Literal["imitate", "ppo"] = "imitate"
+    """Imitate the policy's own successful episodes by its flow-matching loss, or proximal policy
+    optimization with a critic (ppo, arXiv 1707.06347)."""
     worlds: int = 64
     """Parallel worlds per task, one episode each in every iteration."""
     std: float = 0.05
     """Standard deviation of exploration [normalized action units]."""
-    advantages: Literal["critic", "group"] = "critic"
-    """Advantages from a critic on the simulator's full state, which is thrown away after training,
-    or relative to the other episodes of the same layout (group, arXiv 2402.03300)."""
-    group: int = 8
-    """Episodes per layout with group advantages."""
     reward: Literal["sparse", "dense"] = "sparse"
     """1 on success, or that and the progress of the task's stages."""
     discount: float = 0.98
@@ -56,9 +54,6 @@ class Learning:
         for name in ("discount", "trace"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"learn.{name} must lie in (0, 1], got {getattr(self, name)}")
-        if self.advantages == "group" and (self.group < 2 or self.worlds % self.group):
-            sizes = f"{self.worlds} and {self.group}"
-            raise ValueError(f"learn.worlds must be a multiple of learn.group >= 2, got {sizes}")
 
 
 @dataclass(frozen=True)
@@ -70,3 +65,7 @@ class ReinforceConfig(Config):
 
     learn: Learning = field(default_factory=Learning)
     """What is learned, and how."""
+
+    def evaluates(self, step: int) -> bool:
+        """Whether to evaluate after an iteration: as the config says, and after the last one."""
+        return step == self.optim.steps or super().evaluates(step)

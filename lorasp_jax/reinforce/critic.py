@@ -1,4 +1,4 @@
-"""A critic on the simulator's full state, and advantages with it or without it.
+"""A critic on the simulator's full state, and the advantages that follow.
 
 It sees what the policy cannot see, since it is thrown away after training (asymmetric actor-critic,
 arXiv 1710.06542), and uses no adapters.
@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from lorasp_jax.reinforce.config import Learning
 from lorasp_jax.reinforce.rollout import Steps
 
 _WIDTH, _BATCH, _STEPS = 64, 512, 100  # our choice, as in examples/ppo.py
@@ -87,19 +88,21 @@ def generalized_advantages(
 
 
 def learn(
-    critic: Critic,
-    steps: Steps,
-    last: jax.Array,
-    key: jax.Array,
-    *,
-    discount: float,
-    trace: float,
-    rate: float,
+    critic: Critic, steps: Steps, last: jax.Array, key: jax.Array, learning: Learning
 ) -> tuple[jax.Array, Critic, dict[str, jax.Array]]:
-    """Return the advantages `[T, W]` of steps, the critic after learning from them, and metrics.
+    """Return advantages of steps, the critic after learning from the steps, and metrics.
 
-    `last` `[W, D]` is the state after the steps. The critic learns to predict returns with `trace`;
-    the advantages are those before it learned.
+    The critic learns to predict returns with λ; the advantages are those before it learned.
+
+    Args:
+        critic: of the task.
+        steps: T steps in W worlds.
+        last: `[W, D]`, the full state after them.
+        key: chooses the states of the critic's steps.
+        learning: γ, λ and the critic's learning rate.
+
+    Returns:
+        `[T, W]` advantages, of mean 0 and variance 1 where an episode runs, and 0 elsewhere.
     """
     running = ~steps.done
     count = jnp.sum(running)
@@ -114,9 +117,10 @@ def learn(
         jnp.where(new, std, critic.std),
     )
     values = critic(steps.state)
-    rewards = steps.reward, steps.ended
-    advantages = generalized_advantages(values, critic(last), *rewards, discount, trace)
+    outcome = steps.reward, steps.ended, learning.discount, learning.trace
+    advantages = generalized_advantages(values, critic(last), *outcome)
     targets = advantages + values
+    optimizer = optax.adam(learning.critic_learning_rate)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (steps.state, targets, running))
 
     def step(carry: tuple[Any, Any], key: jax.Array) -> tuple[Any, jax.Array]:
@@ -129,7 +133,7 @@ def learn(
             return jnp.mean(jnp.square(predicted - wanted))
 
         error, gradient = jax.value_and_grad(loss)(layers)
-        updates, opt_state = optax.adam(rate).update(gradient, opt_state)
+        updates, opt_state = optimizer.update(gradient, opt_state)
         return (optax.apply_updates(layers, updates), opt_state), error
 
     learned = (critic.layers, critic.opt_state)
@@ -139,17 +143,7 @@ def learn(
         "critic_error": jnp.mean(errors),
         "explained_variance": 1 - variance(targets - values) / (variance(targets) + 1e-8),
     }
-    return advantages, Critic(layers, opt_state, critic.mean, critic.std), metrics
-
-
-def group_advantages(
-    success: jax.Array, count: jax.Array, group: int, discount: float
-) -> jax.Array:
-    """Return advantages `[W]` against the mean of the others with the same layout.
-
-    This is REINFORCE with a leave-one-out baseline (RLOO, arXiv 2402.14740), of success discounted
-    by the steps that it took: faster is better. It is 0 where all have the same return.
-    """
-    returns = (success * discount ** count.astype(jnp.float32)).reshape(-1, group)
-    others = (jnp.sum(returns, axis=1, keepdims=True) - returns) / (group - 1)
-    return (returns - others).reshape(-1)
+    centered = advantages - jnp.mean(advantages, where=running)
+    scaled = centered / (jnp.std(advantages, where=running) + 1e-8)
+    new = Critic(layers, opt_state, critic.mean, critic.std)
+    return jnp.where(running, scaled, 0), new, metrics

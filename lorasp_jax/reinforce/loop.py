@@ -4,55 +4,26 @@ import contextlib
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import nnx
 
-import envs
-from envs.env import Env
-from lorasp_jax.adapters import adaptation
 from lorasp_jax.base.bars import bars
-from lorasp_jax.policies.policy import Policy
 from lorasp_jax.reinforce import critic, noise, rollout, update
-from lorasp_jax.reinforce.config import Learning, ReinforceConfig
-from lorasp_jax.reinforce.critic import Critic
+from lorasp_jax.reinforce.config import ReinforceConfig
 from lorasp_jax.reinforce.rollout import Rollout
+from lorasp_jax.reinforce.setting import Setting, prepare
 from lorasp_jax.reinforce.update import Batch, Learner
-from lorasp_jax.training import best
+from lorasp_jax.training import best, records
 from lorasp_jax.training.checkpoint import Checkpoints
-from lorasp_jax.training.cost import preflight
-from lorasp_jax.training.distributed import mesh as meshes
-from lorasp_jax.training.guard import Guard, summarize
+from lorasp_jax.training.guard import summarize
 from lorasp_jax.training.interrupt import deferred
 from lorasp_jax.training.loop import RunError
-from lorasp_jax.training.optim import make_optimizer
-from lorasp_jax.training.program import Frozen
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Callback, Run
-from lorasp_jax.training.run_folder import MetricsLog, read_metrics
-
-
-class Setting(NamedTuple):
-    """What does not change during a run.
-
-    Attributes:
-        environments: by task.
-        start: the adapters at the start, from which the KL divergence is measured.
-        policy: from adapters to the policy.
-        shardings: of the state.
-    """
-
-    config: ReinforceConfig
-    environments: Mapping[str, Env]
-    programs: update.Programs
-    frozen: Frozen
-    start: Any
-    policy: Callable[[Any], Policy]
-    shardings: Learner
+from lorasp_jax.training.run_folder import MetricsLog, read_json, read_metrics
 
 
 def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False) -> None:
@@ -64,103 +35,29 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
         RunError: too many consecutive updates were skipped.
         KeyboardInterrupt: a signal stopped the run; the state is saved first.
     """
-    setting, initial, shapes = _set_up(run)
+    fixed, initial, shapes = prepare(run)
     checkpoints = Checkpoints(run.folder, run.base_hash, run.console)
     restored = checkpoints.restore(shapes) if resume else None
     if restored is None:
         for callback in callbacks:
             callback.on_start(run)
+        before = read_json(run.folder / "before.json", records.BEFORE)
+        _keep_best(run, 0, {f"success/{task}": x["success"] for task, x in before.items()})
     try:
         with run.timed("train"):
-            state = _loop(run, setting, restored or initial, checkpoints, callbacks)
+            state = _loop(run, fixed, restored or initial, checkpoints, callbacks)
     except RunError as error:
         for callback in callbacks:
             callback.on_stop(run, str(error))
         raise
     finally:
         checkpoints.close()
-    run.policy = setting.policy(state.adapters)
+    run.policy = fixed.policy(state.adapters)
     if best.error(run.folder) < float("inf"):
         step, run.policy = best.load(run.folder, run.policy)
         run.console.print(f"kept the adapters of iteration {step}, the best that were evaluated")
     for callback in callbacks:
         callback.on_end(run)
-
-
-def _set_up(run: Run) -> tuple[Setting, Learner, Any]:
-    """Return the setting, the initial state, and the state's shapes."""
-    config = run.config
-    assert isinstance(config, ReinforceConfig)
-    learning, evaluation = config.learn, config.evaluation
-    environments = {task: _environment(config, task) for task in config.tasks}
-    check_memory(config, environments)
-    mesh = meshes.make_mesh(config.fsdp, run.devices)
-    graphdef, adapters, parameters = adaptation.split(run.policy.model)
-    methods = adaptation.methods(run.policy.model).values()
-    chunks = sum(
-        env.num_envs * -(-env.max_steps // evaluation.execute_steps)
-        for env in environments.values()
-    )
-    most = config.optim.steps * learning.epochs * -(-chunks // config.optim.batch_size)
-    optimizer = make_optimizer(dataclasses.replace(config.optim, steps=most), methods)
-    zero = jnp.zeros((), jnp.int32)
-    critics = _critics(config, environments)
-    adapters = jax.tree.map(jnp.copy, adapters)
-    state = Learner(zero, adapters, optimizer.init(adapters), Guard.initial(), critics)
-    shardings = meshes.shardings(state, mesh)
-    state = jax.device_put(state, shardings)
-    processor = run.policy.processor
-    frozen = Frozen(parameters, processor.shared())
-    frozen = jax.device_put(frozen, meshes.shardings(frozen, mesh))
-    start = jax.tree.map(jnp.copy, state.adapters)
-    weights = {name: getattr(config.auxiliary, name) for name in vars(config.auxiliary)}
-    options = learning, evaluation.denoise_steps, weights, config.optim.spike
-    programs = update.Programs(graphdef, optimizer, *options, shardings)
-
-    def policy(adapters: Any) -> Policy:
-        return Policy(nnx.merge(graphdef, adapters, frozen.parameters), processor)
-
-    run.policy = policy(start)
-    shapes = jax.tree.map(meshes.with_sharding, jax.eval_shape(lambda: state), shardings)
-    setting = Setting(config, environments, programs, frozen, start, policy, shardings)
-    return setting, state, shapes
-
-
-def _environment(config: ReinforceConfig, task: str) -> Env:
-    return envs.make(
-        task,
-        robot=config.robot,
-        num_envs=config.learn.worlds,
-        image_size=config.image_size,
-        control_dt=config.control_dt,
-        reward=config.learn.reward,
-        discount=config.learn.discount,
-    )
-
-
-def check_memory(config: ReinforceConfig, environments: Mapping[str, Env]) -> None:
-    """Raise ValueError if the pictures of an iteration exceed the memory of the devices."""
-    calls = sum(-(-x.max_steps // config.evaluation.execute_steps) for x in environments.values())
-    pictures = len(Env.cameras) * config.image_size**2 * 3
-    needed = calls * config.learn.worlds * pictures / jax.local_device_count()
-    if needed > (available := preflight.available_bytes()):
-        raise ValueError(
-            f"the pictures of {config.learn.worlds} worlds (learn.worlds) take "
-            f"{needed / 2**30:.1f} GiB per device of {available / 2**30:.1f}: choose fewer worlds"
-        )
-
-
-def _critics(config: ReinforceConfig, environments: Mapping[str, Env]) -> dict[str, Critic]:
-    if config.learn.advantages == "group":
-        return {}
-    return {
-        task: Critic.init(
-            RandomStream.CRITIC.key(config.seed, task),
-            max(part.stop for part in env.full_state_layout.values()) + 1,
-            config.learn.critic_learning_rate,
-        )
-        for task, env in environments.items()
-    }
 
 
 def _loop(
@@ -259,57 +156,38 @@ def _keep_best(run: Run, step: int, values: Mapping[str, float]) -> None:
 def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]]:
     """Collect and learn once; return the state and the metrics, with the environment `steps`."""
     config, step = setting.config, int(state.step)
-    learning, evaluation = config.learn, config.evaluation
-    policy, critics, values = setting.policy(state.adapters).with_sampler(), {}, {}
-    batches: list[Batch] = []
+    execute = config.evaluation.execute_steps
+    policy = setting.policy(state.adapters).with_sampler()
+    batches, critics, values = [], {}, {"steps": 0.0}
     for task, env in setting.environments.items():
         key = jax.random.fold_in(RandomStream.ROLLOUTS.key(config.seed, task), step)
         found = rollout.collect(
             env,
             policy,
             key,
-            learning.std,
-            execute_steps=evaluation.execute_steps,
-            denoise_steps=evaluation.denoise_steps,
-            group=learning.group if learning.advantages == "group" else 1,
+            config.learn.std,
+            execute_steps=execute,
+            denoise_steps=config.evaluation.denoise_steps,
             ranges=config.ranges,
         )
-        advantages, critics[task], metrics = _advantages(
-            learning, state.critics.get(task), found, key
-        )
-        batches.append(_batch(found, advantages, evaluation.execute_steps))
-        values |= {f"{name}/{task}": float(x) for name, x in metrics.items()}
+        advantages, valid = jnp.ones(found.steps.done.shape), rollout.of_successes(found.steps)
+        if old := state.critics.get(task):
+            valid = ~found.steps.done
+            learned = _learn(old, found.steps, found.last, key, config.learn)
+            advantages, critics[task], metrics = learned
+            values |= {f"{name}/{task}": float(x) for name, x in metrics.items()}
+        batches.append(_batch(found, advantages, valid, execute))
         values[f"rollout/{task}"] = float(jnp.mean(found.success))
-        values["steps"] = values.get("steps", 0) + float(jnp.sum(~found.steps.done))
+        values["steps"] += float(jnp.sum(~found.steps.done))
     batch = jax.tree.map(lambda *x: jnp.concatenate(x), *batches)
-    rng = np.random.default_rng([config.seed, step])
-    sizes = rng, config.optim.batch_size, learning.epochs
-    state, batch, rows = update.improve(setting.programs, state, setting.frozen, batch, *sizes)
+    key = jax.random.fold_in(RandomStream.TRAINING.key(config.seed), step)
+    state, rows = update.improve(setting.programs, state, setting.frozen, batch, key)
     values |= _summary(setting, state, batch, rows)
-    critics = {task: x for task, x in critics.items() if x is not None}
     state = dataclasses.replace(state, step=state.step + 1, critics=critics)
     return jax.device_put(state, setting.shardings), values
 
 
-def _advantages(
-    learning: Learning, old: Critic | None, found: Rollout, key: jax.Array
-) -> tuple[jax.Array, Critic | None, dict[str, jax.Array]]:
-    """Return advantages `[T, W]` normalized over the task, the critic and its metrics."""
-    running = ~found.steps.done
-    if old is None:
-        count = jnp.argmax(found.steps.ended, axis=0) + 1
-        each = critic.group_advantages(found.success, count, learning.group, learning.discount)
-        advantages, new, metrics = jnp.broadcast_to(each, running.shape), None, {}
-    else:
-        options = {"discount": learning.discount, "trace": learning.trace}
-        rate = learning.critic_learning_rate
-        advantages, new, metrics = _learn(old, found.steps, found.last, key, **options, rate=rate)
-        advantages -= jnp.mean(advantages, where=running)
-    scale = jnp.sqrt(jnp.mean(jnp.square(advantages), where=running)) + 1e-8
-    return jnp.where(running, advantages / scale, 0), new, metrics
-
-
-def _batch(found: Rollout, advantages: jax.Array, execute_steps: int) -> Batch:
+def _batch(found: Rollout, advantages: jax.Array, valid: jax.Array, execute_steps: int) -> Batch:
     """Arrange steps `[calls x S, W]` as chunks `[calls x W, S]`."""
     worlds = advantages.shape[1]
 
@@ -317,7 +195,7 @@ def _batch(found: Rollout, advantages: jax.Array, execute_steps: int) -> Batch:
         return jnp.moveaxis(x.reshape(-1, execute_steps, worlds), 1, 2).reshape(-1, execute_steps)
 
     means = jnp.zeros_like(found.chunks.actions)
-    return Batch(found.chunks, means, arrange(advantages), arrange(~found.steps.done))
+    return Batch(found.chunks, arrange(advantages), arrange(valid), means)
 
 
 def _summary(
@@ -335,7 +213,7 @@ def _summary(
     slots = noise.action_slots(setting.frozen.processor)
     kl = noise.divergence(now, start, setting.config.learn.std, slots)
     extra = {"start_kl": float(jnp.mean(kl)), "in_a_row": float(rows["in_a_row"][-1])}
-    return values | extra | {"updates": len(rows["loss"]), "last_kl": float(rows["kl"][-1])}
+    return values | extra | {"updates": len(rows["loss"])}
 
 
-_learn = functools.partial(jax.jit, static_argnames=("discount", "trace", "rate"))(critic.learn)
+_learn = functools.partial(jax.jit, static_argnums=4)(critic.learn)

@@ -79,7 +79,6 @@ def collect(
     *,
     execute_steps: int,
     denoise_steps: int,
-    group: int = 1,
     ranges: Randomization | None = None,
 ) -> Rollout:
     """Act in every world until the time limit.
@@ -91,18 +90,15 @@ def collect(
         std: standard deviation of exploration [normalized action units].
         execute_steps: S, actions executed from each chunk.
         denoise_steps: Euler steps.
-        group: number of worlds in a row with the same layout and start, a divisor of W. From 2 on,
-            they do not restart.
         ranges: as in `env.reset`.
     """
     worlds = Worlds(env, policy, key, ranges)
     rows = jnp.asarray(policy.processor.prompts.rows(env.instructions))
-    first = np.repeat(np.arange(0, env.num_envs, group), group)
-    worlds.state = _spread(jax.tree.map(lambda x: x[first], worlds.state), policy)
+    worlds.state = _spread(worlds.state, policy)
     chunks, steps = [], []
     for call in range(-(-env.max_steps // execute_steps)):
         now = jax.random.fold_in(worlds.sample_key, call)
-        if group == 1 and call:
+        if call:
             worlds.state = _restart(env, worlds.state, now, ranges)
         prompts = rows[worlds.state.info["instruction"]]
         inputs = now, worlds.observe(), prompts, np.float32(std), denoise_steps, execute_steps
@@ -115,6 +111,16 @@ def collect(
     end = jnp.argmax(joined.ended, axis=0)
     success = jnp.take_along_axis(joined.success, end[None], axis=0)[0]
     return Rollout(jax.tree.map(join, *chunks), joined, _full_state(env, worlds.state), success)
+
+
+def of_successes(steps: Steps) -> jax.Array:
+    """Return which steps belong to episodes that end in success, `[T, W]` bool."""
+
+    def body(later: jax.Array, step: Steps) -> tuple[jax.Array, jax.Array]:
+        succeeds = jnp.where(step.ended & ~step.done, step.success, later)
+        return succeeds, succeeds & ~step.done
+
+    return jax.lax.scan(body, jnp.zeros_like(steps.done[0]), steps, reverse=True)[1]
 
 
 def _spread(tree: Any, policy: Policy) -> Any:

@@ -1,6 +1,7 @@
-"""The update: proximal policy optimization of the adapters on the chunks of one iteration."""
+"""The update of the adapters on the chunks of one iteration, by one of two losses."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -11,12 +12,13 @@ import numpy as np
 import optax
 from flax import nnx
 
-from lorasp_jax.peft.auxiliary import auxiliary_losses
+from lorasp_jax.data.batches import Batch as Demonstrations
+from lorasp_jax.peft.auxiliary import AUXILIARY_WEIGHTS, auxiliary_losses
 from lorasp_jax.reinforce import noise
-from lorasp_jax.reinforce.config import Learning
+from lorasp_jax.reinforce.config import ReinforceConfig
 from lorasp_jax.reinforce.critic import Critic
 from lorasp_jax.reinforce.rollout import Chunks
-from lorasp_jax.training import compilation
+from lorasp_jax.training import compilation, step
 from lorasp_jax.training import guard as guards
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.guard import Guard
@@ -33,7 +35,7 @@ class Learner:
         step: `[]` int32, number of iterations.
         adapters: trainable parameters, an `nnx.State`.
         guard: statistics that decide which updates to skip.
-        critics: by task; empty without critics.
+        critics: by task; empty unless the method is ppo.
     """
 
     step: jax.Array
@@ -47,44 +49,89 @@ class Batch(NamedTuple):
     """N chunks, of which S actions each were executed.
 
     Attributes:
-        means: `[N, S, A]` means of the policy that acted.
-        advantages: `[N, S]`, of mean 0 and variance 1.
-        valid: `[N, S]` bool, False after the end of an episode.
+        advantages: `[N, S]`, of mean 0 and variance 1; or ones.
+        valid: `[N, S]` bool, the actions to learn from.
+        means: `[N, S, A]` means of the policy that acted, for ppo.
     """
 
     chunks: Chunks
-    means: jax.Array
     advantages: jax.Array
     valid: jax.Array
+    means: jax.Array
 
 
-def surrogate(ratio: jax.Array, advantages: jax.Array, clip: float) -> jax.Array:
-    """Return PPO's clipped objective (arXiv 1707.06347, eq. 7), which is to rise."""
-    return jnp.minimum(ratio * advantages, jnp.clip(ratio, 1 - clip, 1 + clip) * advantages)
+Loss = Callable[[Any, Frozen, Batch, jax.Array], tuple[jax.Array, Metrics]]
+"""(adapters, frozen, batch, key) -> loss and metrics."""
 
 
-def loss_fn(
+def make_loss(config: ReinforceConfig, graphdef: Any) -> Loss:
+    """Return the loss of the method that the config names."""
+    weights: dict[str, Any] = {x: getattr(config.auxiliary, x) for x in AUXILIARY_WEIGHTS}
+    if config.learn.method == "imitate":
+        noise_std = config.optim.state_noise
+        return functools.partial(
+            imitation_loss, graphdef=graphdef, weights=weights, state_noise=noise_std
+        )
+    return functools.partial(
+        surrogate_loss,
+        graphdef=graphdef,
+        weights=weights,
+        std=config.learn.std,
+        clip=config.learn.clip,
+        denoise_steps=config.evaluation.denoise_steps,
+    )
+
+
+def imitation_loss(
     adapters: Any,
     frozen: Frozen,
-    graphdef: Any,
     batch: Batch,
-    learning: Learning,
-    denoise_steps: int,
-    weights: dict[str, float],
+    key: jax.Array,
+    *,
+    graphdef: Any,
+    weights: dict[str, Any],
+    state_noise: float,
 ) -> tuple[jax.Array, Metrics]:
-    """Return the loss over the executed actions, with one probability ratio per action."""
-    mean, aux = _means(adapters, frozen, graphdef, batch.chunks, denoise_steps)
-    slots, std = noise.action_slots(frozen.processor), learning.std
+    """Return the flow-matching loss of the valid actions, as in training from demonstrations."""
+    chunks, processor = batch.chunks, frozen.processor
+    state_key, loss_key = jax.random.split(key)
+    jitter = jax.random.normal(state_key, (len(chunks.prompts), processor.statistics.dim))
+    observation = processor.encode(
+        chunks.observation, chunks.prompts, state_noise=state_noise * jitter
+    )
+    rest = chunks.noise.shape[1] - chunks.actions.shape[1]  # never executed
+    valid = jnp.pad(batch.valid, ((0, 0), (0, rest)))[..., None] & processor.flow_slots
+    actions = jnp.pad(chunks.actions, ((0, 0), (0, rest), (0, 0)))
+    own = Demonstrations(observation, actions, valid)
+    return step.loss_fn(adapters, frozen.parameters, graphdef, own, loss_key, weights)
+
+
+def surrogate_loss(
+    adapters: Any,
+    frozen: Frozen,
+    batch: Batch,
+    key: jax.Array,  # noqa: ARG001
+    *,
+    graphdef: Any,
+    weights: dict[str, Any],
+    std: float,
+    clip: float,
+    denoise_steps: int,
+) -> tuple[jax.Array, Metrics]:
+    """Return PPO's loss (arXiv 1707.06347, eq. 7), with one probability ratio per action."""
+    mean, aux = means(adapters, frozen, batch.chunks, graphdef, denoise_steps)
+    slots = noise.action_slots(frozen.processor)
     new, old = (noise.log_prob(x, batch.chunks.actions, std, slots) for x in (mean, batch.means))
-    ratio = jnp.exp(new - old)
+    ratio, advantages = jnp.exp(new - old), batch.advantages
     average = lambda x: jnp.sum(x * batch.valid) / jnp.maximum(jnp.sum(batch.valid), 1)  # noqa: E731
-    policy = -average(surrogate(ratio, batch.advantages, learning.clip))
+    clipped = jnp.clip(ratio, 1 - clip, 1 + clip)
     losses = auxiliary_losses(aux)
-    total = policy + sum(weights[name] * value for name, value in losses.items())
+    total = -average(jnp.minimum(ratio * advantages, clipped * advantages))
+    total += sum(weights[name] * value for name, value in losses.items())
     metrics = {
         "loss": total,
         "kl": average(noise.divergence(mean, batch.means, std, slots)),
-        "clipped": average(jnp.abs(ratio - 1) > learning.clip),
+        "clipped": average(clipped != ratio),
         "ratio": average(ratio),
         **losses,
         **active_ranks(aux),
@@ -92,8 +139,8 @@ def loss_fn(
     return total, metrics
 
 
-def _means(
-    adapters: Any, frozen: Frozen, graphdef: Any, chunks: Chunks, denoise_steps: int
+def means(
+    adapters: Any, frozen: Frozen, chunks: Chunks, graphdef: Any, denoise_steps: int
 ) -> tuple[jax.Array, Any]:
     """Return the means of the executed actions `[N, S, A]`, and the adapters' aux."""
     model = nnx.merge(graphdef, adapters, frozen.parameters)
@@ -103,7 +150,7 @@ def _means(
 
 
 class Programs:
-    """The jitted programs of an update. All take indices of chunks, `[n]`.
+    """The jitted programs of an update. They take indices of chunks, `[n]`.
 
     The means of the policy that acted are computed as the update computes them, and not where it
     acted: probability ratios are then exactly 1 before the first update.
@@ -111,42 +158,41 @@ class Programs:
 
     def __init__(
         self,
+        config: ReinforceConfig,
         graphdef: Any,
         optimizer: optax.GradientTransformation,
-        learning: Learning,
-        denoise_steps: int,
-        weights: dict[str, float],
-        spike: float,
         shardings: Learner,
     ) -> None:
-        """`shardings` are those of the state; `spike` as in `guard.check_step`."""
-        mesh = shardings.step.mesh
-        rows = meshes.batch_sharding(mesh)
-        take = lambda tree, index: jax.lax.with_sharding_constraint(  # noqa: E731
-            jax.tree.map(lambda x: x[index], tree), rows
-        )
+        """`shardings` are those of the state."""
+        mesh, loss = shardings.step.mesh, make_loss(config, graphdef)
+        self.config: ReinforceConfig = config
 
-        def means(adapters: Any, frozen: Frozen, chunks: Chunks, index: jax.Array) -> jax.Array:
-            return _means(adapters, frozen, graphdef, take(chunks, index), denoise_steps)[0]
+        def take(tree: Any, index: jax.Array) -> Any:
+            rows = jax.tree.map(lambda x: x[index], tree)
+            return jax.lax.with_sharding_constraint(rows, meshes.batch_sharding(mesh))
+
+        def old(adapters: Any, frozen: Frozen, chunks: Chunks, index: jax.Array) -> jax.Array:
+            steps = config.evaluation.denoise_steps
+            return means(adapters, frozen, take(chunks, index), graphdef, steps)[0]
 
         def update(
-            state: Learner, frozen: Frozen, batch: Batch, index: jax.Array
+            state: Learner, frozen: Frozen, batch: Batch, index: jax.Array, key: jax.Array
         ) -> tuple[Learner, Metrics]:
-            options = (frozen, graphdef, take(batch, index), learning, denoise_steps, weights)
-            gradient, metrics = jax.grad(loss_fn, has_aux=True)(state.adapters, *options)
-            norm = optax.tree.norm(gradient)
+            inputs = state.adapters, frozen, take(batch, index), key
+            gradient, metrics = jax.grad(loss, has_aux=True)(*inputs)
+            norm, spike = optax.tree.norm(gradient), config.optim.spike
             accept, guard = guards.check_step(state.guard, metrics["loss"], norm, spike)
             updates, opt_state = optimizer.update(gradient, state.opt_state, state.adapters)
             adapters = optax.apply_updates(state.adapters, updates)
             after = dataclasses.replace(state, adapters=adapters, opt_state=opt_state, guard=guard)
             before = dataclasses.replace(state, guard=guard)
-            within = metrics["kl"] <= learning.max_kl
+            within = metrics.get("kl", 0.0) <= jnp.asarray(config.learn.max_kl)
             metrics |= {"grad_norm": norm, "in_a_row": guard.in_a_row, "within": within}
             return guards.select(accept & within, after, before), metrics
 
         options = compilation.step_options(mesh.size)
-        self.means: Callable = jax.jit(means, compiler_options=options)
-        self.update: Callable = jax.jit(
+        self.means: Callable[..., Any] = jax.jit(old, compiler_options=options)
+        self.update: Callable[..., Any] = jax.jit(
             update,
             donate_argnames="state",
             out_shardings=(shardings, meshes.replicated(mesh)),
@@ -155,43 +201,36 @@ class Programs:
 
 
 def improve(
-    programs: Programs,
-    state: Learner,
-    frozen: Frozen,
-    batch: Batch,
-    rng: np.random.Generator,
-    size: int,
-    epochs: int,
-) -> tuple[Learner, Batch, dict[str, np.ndarray]]:
-    """Take gradient steps on minibatches of chunks until the policy has changed enough.
+    programs: Programs, state: Learner, frozen: Frozen, batch: Batch, key: jax.Array
+) -> tuple[Learner, dict[str, np.ndarray]]:
+    """Take gradient steps on minibatches of chunks, for ppo until the policy has changed enough.
 
     Args:
         batch: chunks with any means.
-        rng: orders the chunks.
-        size: chunks per gradient step.
-        epochs: most passes over the chunks.
+        key: orders the chunks; for their noise.
 
     Returns:
-        The state, the batch with the means of the policy that acted, and the metrics of all steps.
+        The state, and the metrics of all steps; none if no action is valid.
     """
-    # Finished worlds idle, and equal advantages of 0 teach nothing.
+    config = programs.config
+    size, rows = config.optim.batch_size, []
     useful = np.flatnonzero(np.any(batch.valid & (batch.advantages != 0), axis=1))
     if not len(useful):
-        return state, batch, {}
-    padded = np.resize(useful, -(-len(useful) // size) * size)
-    means = batch.means
-    for index in padded.reshape(-1, size):
-        found = programs.means(state.adapters, frozen, batch.chunks, index)
-        means = means.at[index].set(found)
-    batch, rows = batch._replace(means=means), []
-    for _ in range(epochs):
-        order = np.resize(rng.permutation(useful), len(padded))
-        for index in order.reshape(-1, size):
-            state, metrics = programs.update(state, frozen, batch, index)
+        return state, {}
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    length = -(-len(useful) // size) * size
+    if config.learn.method == "ppo":
+        for index in np.resize(useful, length).reshape(-1, size):
+            found = programs.means(state.adapters, frozen, batch.chunks, index)
+            batch = batch._replace(means=batch.means.at[index].set(found))
+    for _ in range(config.learn.epochs):
+        for index in np.resize(rng.permutation(useful), length).reshape(-1, size):
+            step_key = jax.random.fold_in(key, len(rows))
+            state, metrics = programs.update(state, frozen, batch, index, step_key)
             rows.append(jax.device_get(metrics))
             if not rows[-1]["within"]:
-                return state, batch, _stack(rows)
-    return state, batch, _stack(rows)
+                return state, _stack(rows)
+    return state, _stack(rows)
 
 
 def _stack(rows: list[Metrics]) -> dict[str, np.ndarray]:

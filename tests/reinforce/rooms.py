@@ -66,7 +66,7 @@ class Room:
 
 def config(**changes) -> ReinforceConfig:
     fields = {field.name: getattr(CONFIG, field.name) for field in dataclasses.fields(CONFIG)}
-    learn = Learning(worlds=8, std=0.2, epochs=2, max_kl=1.0)
+    learn = Learning(method="ppo", worlds=8, std=0.2, epochs=2, max_kl=1.0)
     optim = OptimConfig(
         steps=4, batch_size=8, learning_rate=1e-3, final_learning_rate=1e-3, warmup_steps=0
     )

@@ -48,21 +48,18 @@ def test_steps_follow_the_worlds(policy):
     np.testing.assert_array_equal(steps.reward * ~steps.done, steps.success & ~steps.done)
 
 
-def test_groups_start_alike_and_act_differently(policy):
-    found = collect(policy, rooms.Room(), group=4)
-    first = found.steps.state[0].reshape(2, 4, 8)
-    np.testing.assert_array_equal(first[:, :1] + 0 * first, first)
-    assert not np.array_equal(first[0], first[1])
-    actions = found.chunks.actions[:8].reshape(2, 4, -1)
-    assert len(np.unique(np.asarray(actions[0]), axis=0)) == 4
-
-
-def test_finished_worlds_restart_unless_they_are_a_group(policy):
-    room = rooms.Room(max_steps=2)
-    object.__setattr__(room, "max_steps", 2)
-    long = rooms.Room(max_steps=8)
-    found = collect(policy, long)
+def test_finished_worlds_restart(policy):
+    found = collect(policy, rooms.Room(max_steps=8))
     ended = np.asarray(found.steps.ended & ~found.steps.done)
     assert (ended.sum(0) >= 1).all()  # the first episode of every world is complete
-    again = collect(policy, long, group=2)
-    assert (np.asarray(again.steps.ended & ~again.steps.done).sum(0) == 1).all()
+    assert ended.sum() > 8
+
+
+def test_steps_of_successes():
+    """World 0 succeeds, restarts and fails; world 1 fails; world 2 is cut off."""
+    ended = jnp.array([[0, 1, 1, 0, 1], [0, 0, 0, 1, 1], [0, 0, 0, 0, 0]], bool).T
+    done = jnp.array([[0, 0, 1, 0, 0], [0, 0, 0, 0, 1], [0, 0, 0, 0, 0]], bool).T
+    success = jnp.array([[0, 1, 1, 0, 0], [0, 0, 0, 0, 0], [0, 0, 0, 0, 0]], bool).T
+    steps = rollout.Steps(jnp.zeros((5, 3, 1)), done, ended, success, jnp.zeros((5, 3)))
+    expected = [[1, 1, 0, 0, 0], [0] * 5, [0] * 5]
+    np.testing.assert_array_equal(rollout.of_successes(steps).T, np.array(expected, bool))

@@ -7,12 +7,15 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from flax import nnx
 from rich.console import Console
 
+from lorasp_jax import models
+from lorasp_jax.adapters import adaptation
 from lorasp_jax.cli.train import _resolved
 from lorasp_jax.config import ModelConfig
 from lorasp_jax.peft import LoRA
-from lorasp_jax.reinforce import loop, start
+from lorasp_jax.reinforce import setting, start
 from lorasp_jax.reinforce.config import Learning, ReinforceConfig
 from lorasp_jax.training import export
 from lorasp_jax.training.export import load_policy
@@ -34,11 +37,11 @@ def few(tmp_path_factory):
     model = ModelConfig(size="dummy", checkpoint=str(base))
     config = dataclasses.replace(CONFIG, peft=LoRA(rank=4), model=model, tasks=("press",))
     run = make_run(folder / "few", config)
-    graphdef, adapters, frozen = start.adaptation.split(run.policy.model)
+    graphdef, adapters, frozen = adaptation.split(run.policy.model)
     rng = np.random.default_rng(0)
     adapters = jax.tree.map(lambda x: x + 0.03 * rng.normal(size=x.shape).astype("f"), adapters)
-    run.policy = dataclasses.replace(run.policy, model=loop.nnx.merge(graphdef, adapters, frozen))
-    start.models.save(base, start.adaptation.merge(_without(run.policy.model)))
+    run.policy = dataclasses.replace(run.policy, model=nnx.merge(graphdef, adapters, frozen))
+    models.save(base, adaptation.merge(_without(run.policy.model)))
     write_json(run.folder / "config.json", to_json(config))
     write_json(run.folder / "results.json", RESULTS)
     export.write(run)
@@ -47,8 +50,8 @@ def few(tmp_path_factory):
 
 def _without(model):
     """Return the base of an adapted model: adapters that add nothing merge to it."""
-    graphdef, adapters, frozen = start.adaptation.split(model)
-    return loop.nnx.merge(graphdef, jax.tree.map(lambda x: 0 * x, adapters), frozen)
+    graphdef, adapters, frozen = adaptation.split(model)
+    return nnx.merge(graphdef, jax.tree.map(lambda x: 0 * x, adapters), frozen)
 
 
 def resolve(*arguments) -> ReinforceConfig:
@@ -86,7 +89,7 @@ def test_a_run_is_recorded_and_read_again(few, tmp_path):
         (["--learn.std", 0], "learn.std must be above 0, got 0.0"),
         (["--learn.worlds", 0], "learn.worlds must be at least 1, got 0"),
         (["--learn.discount", 1.5], "learn.discount must lie in \\(0, 1\\], got 1.5"),
-        (["--learn.advantages", "group", "--learn.group", 5], "must be a multiple of learn.group"),
+        (["--learn.method", "grpo"], "method"),
         (["--dry-run"], "--dry-run is not for reinforcement learning: drop it"),
         (["--fit", "16GB"], "--fit is not for reinforcement learning: drop it"),
     ],
@@ -133,7 +136,7 @@ def test_adapters_are_merged_under_new_ones(few, tmp_path):
     run = load(config, tmp_path / "run")
     assert config.peft.rank == 2
     np.testing.assert_allclose(outputs(run.policy), outputs(load_policy(few)), atol=0.05)
-    adapters = leaves(start.adaptation.split(run.policy.model)[1])
+    adapters = leaves(adaptation.split(run.policy.model)[1])
     assert any(not leaf.any() for leaf in adapters.values())  # new ones add nothing
     start.Export().on_end(run)
     np.testing.assert_array_equal(outputs(load_policy(run.folder)), outputs(run.policy))
@@ -142,7 +145,7 @@ def test_adapters_are_merged_under_new_ones(few, tmp_path):
 def test_worlds_that_do_not_fit_are_refused():
     learn = Learning(worlds=2**22)
     with pytest.raises(ValueError, match=r"4194304 worlds .* choose fewer"):
-        loop.check_memory(rooms.config(learn=learn), {"press": rooms.Room(num_envs=2**22)})
+        setting.check_memory(rooms.config(learn=learn), {"press": rooms.Room(num_envs=2**22)})
 
 
 def test_configs_files_load(tmp_path):

@@ -10,7 +10,9 @@ import pytest
 from flax import nnx
 
 from lorasp_jax.adapters import adaptation
+from lorasp_jax.config import AuxiliaryConfig
 from lorasp_jax.dense import AdapterParam
+from lorasp_jax.models import flow_matching
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.reinforce import noise, update
 from lorasp_jax.reinforce.config import Learning
@@ -21,9 +23,17 @@ from lorasp_jax.training.guard import Guard
 from lorasp_jax.training.program import Frozen
 from tests.reinforce import rooms
 
-LEARNING = Learning(std=0.1, epochs=4, max_kl=0.1)
-WEIGHTS = {"spectral": 0.0, "balance": 0.0, "z": 0.0}
+STD = 0.1
 CHUNKS, EXECUTED = 64, 2
+KEY = jax.random.key(9)
+
+
+def settings(size=32, epochs=4, **changes):
+    learn = Learning(method="ppo", std=STD, epochs=epochs, max_kl=0.1)
+    optim = dataclasses.replace(rooms.config().optim, batch_size=size)
+    auxiliary = AuxiliaryConfig(0, 0, 0, 0)
+    learn = dataclasses.replace(learn, **changes)
+    return rooms.config(learn=learn, optim=optim, auxiliary=auxiliary)
 
 
 class Bandit(nnx.Module):
@@ -40,25 +50,34 @@ class Bandit(nnx.Module):
         return (x_t - self.chunk) / flow_time[:, None, None], {}
 
 
+class Flow(Bandit):
+    """The same with the loss of a backbone."""
+
+    def loss(self, key, obs, actions, *, action_mask, **_):
+        def velocity(x_t, flow_time):
+            return self.run_suffix(None, obs, x_t, flow_time)
+
+        return flow_matching.loss(velocity, key, actions)[0], {}
+
+
 @pytest.fixture(scope="module")
 def processor(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     return rooms.start(folder, rooms.config()).policy.processor.shared()
 
 
-def make(model, processor, learning=LEARNING, rate=3e-2):
+def make(model, processor, config=None, rate=3e-2):
     graphdef, adapters, parameters = adaptation.split(model)
     optimizer = optax.adam(rate)
     zero = jnp.zeros((), jnp.int32)
     adapters = jax.tree.map(jnp.copy, adapters)
     state = Learner(zero, adapters, optimizer.init(adapters), Guard.initial(), {})
     shardings = meshes.shardings(state, meshes.make_mesh(devices=jax.devices()[:1]))
-    options = graphdef, optimizer, learning, 2, WEIGHTS, 0.0, shardings
-    state = jax.device_put(state, shardings)
-    return update.Programs(*options), state, Frozen(parameters, processor)
+    programs = update.Programs(config or settings(), graphdef, optimizer, shardings)
+    return programs, jax.device_put(state, shardings), Frozen(parameters, processor)
 
 
-def chunks(processor, means, key, std=LEARNING.std, count=CHUNKS):
+def chunks(processor, means, key, std=STD, count=CHUNKS):
     """Return chunks whose actions are drawn around `means`, `[S, A]`."""
     rng, config = np.random.default_rng(0), Pi0Config.dummy()
     image = rng.integers(0, 255, (count, 32, 32, 3), np.uint8)
@@ -72,7 +91,7 @@ def chunks(processor, means, key, std=LEARNING.std, count=CHUNKS):
 
 def batch(chunks, advantages, valid=None):
     valid = jnp.ones(advantages.shape, bool) if valid is None else valid
-    return Batch(chunks, jnp.zeros_like(chunks.actions), advantages, valid)
+    return Batch(chunks, advantages, valid, jnp.zeros_like(chunks.actions))
 
 
 def test_a_bandit_finds_its_optimum(processor):
@@ -86,10 +105,8 @@ def test_a_bandit_finds_its_optimum(processor):
         rewards = -jnp.sum(jnp.square(data.actions - target), axis=-1)
         advantages = rewards - rewards.mean(0)
         advantages = advantages / advantages.std()
-        rng = np.random.default_rng(step)
-        state, _, rows = update.improve(
-            programs, state, frozen, batch(data, advantages), rng, 32, LEARNING.epochs
-        )
+        key = jax.random.key(step)
+        state, rows = update.improve(programs, state, frozen, batch(data, advantages), key)
         assert rows["kl"][0] == 0
     found = np.asarray(state.adapters["chunk"].get_value())
     np.testing.assert_allclose(found[:EXECUTED], target, atol=0.1)
@@ -104,9 +121,10 @@ def test_gradients_are_those_of_the_log_probability(processor):
     data = chunks(processor, jnp.zeros((EXECUTED, 8)), jax.random.key(0))
     advantages = jax.random.normal(jax.random.key(2), (CHUNKS, EXECUTED))
     valid = jax.random.bernoulli(jax.random.key(3), 0.7, advantages.shape)
-    options = frozen, graphdef, batch(data, advantages, valid), LEARNING, 2, WEIGHTS
-    gradient = jax.grad(update.loss_fn, has_aux=True)(state.adapters, *options)[0]["chunk"]
-    weighted = (advantages * valid)[..., None] * data.actions / LEARNING.std**2
+    loss = update.make_loss(settings(), graphdef)
+    inputs = frozen, batch(data, advantages, valid), KEY
+    gradient = jax.grad(loss, has_aux=True)(state.adapters, *inputs)[0]["chunk"]
+    weighted = (advantages * valid)[..., None] * data.actions / STD**2
     np.testing.assert_allclose(
         gradient.get_value()[:EXECUTED], -weighted.sum(0) / valid.sum(), rtol=1e-4, atol=1e-6
     )
@@ -120,10 +138,9 @@ def test_gradients_of_a_backbone_match_finite_differences(processor, tmp_path):
     )
     frozen = Frozen(parameters, processor)
     data = chunks(processor, jnp.zeros((EXECUTED, 8)), jax.random.key(0), std=0.5, count=4)
-    learning = dataclasses.replace(LEARNING, std=2.0, clip=100.0)
     full = batch(data, jax.random.normal(jax.random.key(2), (4, EXECUTED)))
-    options = frozen, graphdef, full, learning, 2, WEIGHTS
-    loss = jax.jit(lambda x: update.loss_fn(x, *options)[0])
+    of_config = update.make_loss(settings(std=2.0, clip=100.0), graphdef)
+    loss = jax.jit(lambda x: of_config(x, frozen, full, KEY)[0])
     gradient = jax.jit(jax.grad(loss))(adapters)
     direction = jax.tree.map(lambda x: x / optax.tree.norm(gradient), gradient)
     move = lambda h: jax.tree.map(lambda x, d: x + h * d, adapters, direction)  # noqa: E731
@@ -133,11 +150,10 @@ def test_gradients_of_a_backbone_match_finite_differences(processor, tmp_path):
 
 def test_without_learning_the_ratio_is_exactly_one(processor, tmp_path):
     policy = rooms.start(tmp_path, rooms.config()).policy
-    programs, state, frozen = make(policy.model, processor, rate=0.0)
+    programs, state, frozen = make(policy.model, processor, settings(8, 2), rate=0.0)
     data = chunks(processor, jnp.zeros((EXECUTED, 8)), jax.random.key(0), count=24)
     advantages = jax.random.normal(jax.random.key(2), (24, EXECUTED))
-    rng = np.random.default_rng(0)
-    _, _, rows = update.improve(programs, state, frozen, batch(data, advantages), rng, 8, 2)
+    _, rows = update.improve(programs, state, frozen, batch(data, advantages), KEY)
     assert len(rows["ratio"]) == 6
     np.testing.assert_array_equal(rows["ratio"], 1)
     np.testing.assert_array_equal(rows["clipped"], 0)
@@ -148,10 +164,9 @@ def test_an_iteration_ends_when_the_policy_has_changed_enough(processor):
     before = np.asarray(state.adapters["chunk"].get_value())
     data = chunks(processor, jnp.zeros((EXECUTED, 8)), jax.random.key(0))
     advantages = jax.random.normal(jax.random.key(2), (CHUNKS, EXECUTED))
-    rng = np.random.default_rng(0)
-    state, _, rows = update.improve(programs, state, frozen, batch(data, advantages), rng, 32, 4)
+    state, rows = update.improve(programs, state, frozen, batch(data, advantages), KEY)
     assert rows["within"].tolist() == [True, False]  # the second step is undone
-    assert rows["kl"][1] > LEARNING.max_kl
+    assert rows["kl"][1] > 0.1
     change = np.abs(np.asarray(state.adapters["chunk"].get_value()) - before).max()
     assert change == pytest.approx(1.0, rel=1e-3)  # that of Adam's first step
 
@@ -160,14 +175,32 @@ def test_a_step_that_is_not_finite_is_skipped(processor):
     programs, state, frozen = make(Bandit(), processor)
     data = chunks(processor, jnp.zeros((EXECUTED, 8)), jax.random.key(0))
     advantages = jnp.full((CHUNKS, EXECUTED), jnp.nan)
-    rng = np.random.default_rng(0)
-    state, _, rows = update.improve(programs, state, frozen, batch(data, advantages), rng, 32, 1)
-    assert rows["in_a_row"].tolist() == [1, 2]
+    state, rows = update.improve(programs, state, frozen, batch(data, advantages), KEY)
+    assert rows["in_a_row"].tolist() == [*range(1, 9)]
     assert not np.asarray(state.adapters["chunk"].get_value()).any()
 
 
 def test_equal_advantages_teach_nothing(processor):
     programs, state, frozen = make(Bandit(), processor)
     data = chunks(processor, jnp.zeros((EXECUTED, 8)), jax.random.key(0))
-    zeros, rng = jnp.zeros((CHUNKS, EXECUTED)), np.random.default_rng(0)
-    assert update.improve(programs, state, frozen, batch(data, zeros), rng, 32, 1)[2] == {}
+    zeros = jnp.zeros((CHUNKS, EXECUTED))
+    assert update.improve(programs, state, frozen, batch(data, zeros), KEY)[1] == {}
+
+
+def test_imitation_learns_the_valid_actions_alone(processor):
+    """The flow of a bandit with one chunk: its optimum is the mean of the imitated actions."""
+    config = settings(method="imitate")
+    programs, state, frozen = make(Flow(), processor, config, rate=5e-2)
+    slots = noise.action_slots(processor)
+    good, bad = (x * jnp.ones((EXECUTED, 8)) * slots for x in (0.5, -3.0))
+    data = chunks(processor, jnp.zeros((EXECUTED, 8)), jax.random.key(0))
+    valid = jnp.arange(CHUNKS)[:, None] % 2 == jnp.zeros((1, EXECUTED), int)
+    data = data._replace(actions=jnp.where(valid[..., None], good, bad))
+    ones = jnp.ones((CHUNKS, EXECUTED))
+    for step in range(60):
+        key = jax.random.key(step)
+        state, rows = update.improve(programs, state, frozen, batch(data, ones, valid), key)
+    assert len(rows["loss"]) == 4  # an epoch of the 32 chunks is one step
+    found = np.asarray(state.adapters["chunk"].get_value())
+    np.testing.assert_allclose(found[:EXECUTED], good, atol=0.1)
+    assert not found[EXECUTED:].any()
