@@ -1,4 +1,4 @@
-"""Improve a finished run by trial in simulation: PPO of its adapters, from sparse success.
+"""Improve a finished run by trial in simulation, from success alone.
 
     python train.py --config configs/single_task.py --data.episodes 8 --name few
     python train.py --config configs/reinforce.py --from runs/few
@@ -12,24 +12,24 @@ from lorasp_jax.reinforce.config import Learning, ReinforceConfig
 
 
 def get_config(scale: str) -> ReinforceConfig:
-    """Return the config at `scale`: smoke, cpu (ten minutes for press) or accelerator."""
-    worlds = {"smoke": 16, "cpu": 64, "accelerator": 256}[scale]
-    rate = 5e-5
+    """Return the config at `scale`: smoke, cpu or accelerator."""
+    worlds = {"smoke": 16, "cpu": 128, "accelerator": 256}[scale]
+    episodes = {"smoke": 16, "cpu": 64, "accelerator": 256}[scale]
+    rate = 1e-3
     return ReinforceConfig(
         name="reinforce",
         scale=scale,
         peft=LoRASP(),
         tasks=("press",),
         optim=OptimConfig(
-            steps={"smoke": 2, "cpu": 40, "accelerator": 300}[scale],
-            batch_size={"smoke": 64, "cpu": 256, "accelerator": 2048}[scale],
+            steps={"smoke": 2, "cpu": 12, "accelerator": 100}[scale],
+            batch_size={"smoke": 16, "cpu": 64, "accelerator": 256}[scale],
             learning_rate=rate,
             final_learning_rate=rate,
             warmup_steps=10,
-            weight_decay=0.0,
         ),
-        evaluation=EvaluationConfig(episodes=worlds, num_envs=worlds, denoise_steps=2, every=10),
-        learn=Learning(worlds=worlds, std=0.1, epochs=4),
+        evaluation=EvaluationConfig(episodes=episodes, num_envs=episodes, every=2),
+        learn=Learning(worlds=worlds),
         log_every=1,
-        checkpoint_every=10,
+        checkpoint_every={"smoke": 1, "cpu": 1, "accelerator": 10}[scale],
     )

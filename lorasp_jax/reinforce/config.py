@@ -33,7 +33,7 @@ class Learning:
     """λ of generalized advantage estimation (arXiv 1506.02438)."""
     clip: float = 0.2
     """Largest deviation of the probability ratio of an action from 1 that is rewarded."""
-    epochs: int = 2
+    epochs: int = 8
     """Passes over the chunks of an iteration."""
     max_kl: float = 0.02
     """An iteration ends when an action's mean KL divergence from the policy that acted exceeds
