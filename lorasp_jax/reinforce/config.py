@@ -38,7 +38,7 @@ class Learning:
     max_kl: float = 0.02
     """An iteration ends when an action's mean KL divergence from the policy that acted exceeds
     this."""
-    max_start_kl: float = 20.0
+    max_start_kl: float = 300.0
     """The run stops when an action's mean KL divergence from the start policy exceeds this."""
     critic_learning_rate: float = 1e-3
     """Learning rate of the critic."""

@@ -124,7 +124,9 @@ class _Clock:
         return values | {"environment_steps": self._steps, "minutes": minutes}
 
     def collapse(self, config: ReinforceConfig, values: Mapping[str, float]) -> str:
-        """Say in a sentence why the policy has collapsed; "" if it has not."""
+        """Say in a sentence why going on is useless; "" if it is not."""
+        if not values["updates"]:
+            return "no episode succeeded: start from a run that succeeds more often"
         if (kl := values.get("start_kl", 0)) > config.learn.max_start_kl:
             return (
                 f"the KL divergence from the start policy is {kl:.1f}, above "

@@ -103,16 +103,21 @@ def test_a_policy_far_from_the_start_stops_the_run(tmp_path):
 
 def test_lost_success_stops_the_run():
     config = rooms.config()
-    values = {"rollout/press": 0.5, "steps": 3.0}
+    values = {"rollout/press": 0.5, "steps": 3.0, "updates": 1}
     clock = loop._Clock.__new__(loop._Clock)
     clock._steps, clock._first, clock._began = 0, {}, 0.0
     assert not clock.collapse(config, clock.count(values))
-    assert "fell from 50 % to 20 %" in clock.collapse(config, {"rollout/press": 0.2})
+    assert "fell from 50 % to 20 %" in clock.collapse(config, {"rollout/press": 0.2, "updates": 1})
 
 
 def test_imitation_of_successes_needs_no_critic(tmp_path):
-    learn = Learning(worlds=8, std=0.5)
-    train(tmp_path, learn=learn)
+    train(tmp_path, learn=Learning(worlds=8, std=5.0, max_start_kl=1e9))
     rows = read_metrics(tmp_path)
     assert not any("explained_variance/press" in row for row in rows)
     assert any("task" in row for row in rows)
+
+
+def test_a_run_without_any_success_stops(tmp_path):
+    run = train(tmp_path, learn=Learning(worlds=8, std=1e-3))
+    assert len(read_metrics(tmp_path)) == 1
+    assert "no episode succeeded" in run.console.file.getvalue()
