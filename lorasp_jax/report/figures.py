@@ -97,10 +97,11 @@ def reinforcement(rows: Rows, episodes: int) -> Figure:
     steps.legend(frameon=False, loc="lower right")
     _line(right, rows, "start_kl", COLORS["vision"], "from the start")
     _line(right, rows, "kl", COLORS["before"], "in an iteration")
-    right.set_yscale("log")
+    if right.lines:
+        right.set_yscale("log")
+        right.legend(frameon=False)
     right.set_title("KL divergence per action", loc="left")
     right.set_xlabel("iteration")
-    right.legend(frameon=False)
     return figure
 
 
