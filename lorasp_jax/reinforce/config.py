@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from lorasp_jax.config import Config
+from lorasp_jax.config import Config, OptimConfig
 from lorasp_jax.peft import fields
 
 
@@ -65,6 +65,12 @@ class ReinforceConfig(Config):
 
     learn: Learning = field(default_factory=Learning)
     """What is learned, and how."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("accumulate", "ema"):
+            if getattr(self.optim, name) != getattr(OptimConfig, name):
+                raise ValueError(f"optim.{name} is not for reinforcement learning: drop it")
 
     def evaluates(self, step: int) -> bool:
         """Whether to evaluate after an iteration: as the config says, and after the last one."""

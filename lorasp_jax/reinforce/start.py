@@ -59,8 +59,8 @@ def load(config: ReinforceConfig, folder: Path, console: Console, started: float
     """Return a run with the policy that it starts with.
 
     Raises:
-        ValueError: see `load_policy` and `setup.build`; or the start run trained its base, or has
-            adapters that cannot be merged.
+        ValueError: see `load_policy`, `setup.build` and `setup.check_sizes`; or the start run
+            trained its base, or has adapters that cannot be merged.
     """
     if not config.learn.start:
         return setup.prepare(config, folder, console, started)
@@ -75,6 +75,7 @@ def load(config: ReinforceConfig, folder: Path, console: Console, started: float
         base_hash = models.weights_hash(merged)
         rngs = nnx.Rngs(RandomStream.ADAPTERS.key(config.seed))
         policy = Policy(adaptation.adapt(merged, rules.rules(config), rngs=rngs), policy.processor)
+    setup.check_sizes(config, policy.model.config.chunk)
     run = Run(config, folder, console, base_hash, started)
     run.policy = policy
     console.print(setup.headline(config, policy.model))

@@ -13,6 +13,7 @@ import optax
 from flax import nnx
 
 from lorasp_jax.data.batches import Batch as Demonstrations
+from lorasp_jax.models.flow_matching import Times
 from lorasp_jax.peft.auxiliary import AUXILIARY_WEIGHTS, auxiliary_losses
 from lorasp_jax.reinforce import noise
 from lorasp_jax.reinforce.config import ReinforceConfig
@@ -22,6 +23,7 @@ from lorasp_jax.training import compilation, step
 from lorasp_jax.training import guard as guards
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.guard import Guard
+from lorasp_jax.training.optim import flow_times
 from lorasp_jax.training.program import Frozen
 from lorasp_jax.training.step import Metrics, active_ranks
 
@@ -68,9 +70,12 @@ def make_loss(config: ReinforceConfig, graphdef: Any) -> Loss:
     """Return the loss of the method that the config names."""
     weights: dict[str, Any] = {x: getattr(config.auxiliary, x) for x in AUXILIARY_WEIGHTS}
     if config.learn.method == "imitate":
-        noise_std = config.optim.state_noise
         return functools.partial(
-            imitation_loss, graphdef=graphdef, weights=weights, state_noise=noise_std
+            imitation_loss,
+            graphdef=graphdef,
+            weights=weights,
+            state_noise=config.optim.state_noise,
+            times=flow_times(config.optim),
         )
     return functools.partial(
         surrogate_loss,
@@ -91,6 +96,7 @@ def imitation_loss(
     graphdef: Any,
     weights: dict[str, Any],
     state_noise: float,
+    times: Times,
 ) -> tuple[jax.Array, Metrics]:
     """Return the flow-matching loss of the valid actions, as in training from demonstrations."""
     chunks, processor = batch.chunks, frozen.processor
@@ -103,7 +109,8 @@ def imitation_loss(
     valid = jnp.pad(batch.valid, ((0, 0), (0, rest)))[..., None] & processor.flow_slots
     actions = jnp.pad(chunks.actions, ((0, 0), (0, rest), (0, 0)))
     own = Demonstrations(observation, actions, valid)
-    return step.loss_fn(adapters, frozen.parameters, graphdef, own, loss_key, weights)
+    inputs = adapters, frozen.parameters, graphdef, own, loss_key, weights
+    return step.loss_fn(*inputs, times=times)
 
 
 def surrogate_loss(

@@ -77,6 +77,7 @@ def parse(arguments: Sequence[str], program: str = "python train.py") -> Command
     _check_rules(config, ["--method"] * bool(known.method) + rest)
     options = (text.partition("=")[0] for text in rest if text.startswith("--"))
     given = frozenset(option.lstrip("-").replace("-", "_") for option in options)
+    given |= {"peft"} if known.method else set()
     return Command(config, known.resume, known.dry_run, known.wandb, known.fit, given)
 
 

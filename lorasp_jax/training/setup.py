@@ -105,7 +105,7 @@ def build(
     if source and not base.config.inputs.masks_missing:
         base = with_config(base, cameras=base.config.cameras[: len(source.cameras)])
     prompts, joints = _prompts_and_joints(source, environments, tokenizer, base.config)
-    _check_sizes(config, base.config.chunk)
+    check_sizes(config, base.config.chunk)
     if not source:
         robot_slots(joints, base.config.inputs)
     relative = config.model.relative_actions
@@ -235,7 +235,7 @@ def _prompts_and_joints(
     return prompts, joints
 
 
-def _check_sizes(config: Config, chunk: int) -> None:
+def check_sizes(config: Config, chunk: int) -> None:
     """Raise ValueError if chunk, batch, devices or training options cannot be combined."""
     meshes.make_mesh(config.fsdp)
     if config.evaluation.execute_steps > chunk:

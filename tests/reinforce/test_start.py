@@ -55,7 +55,8 @@ def _without(model):
 
 
 def resolve(*arguments) -> ReinforceConfig:
-    options = ["--config", FILE, "--scale", "smoke", *map(str, arguments)]
+    options = ["--config", FILE, "--scale", "smoke", "--evaluation.execute-steps", "2"]
+    options += map(str, arguments)
     config = _resolved(parse(options)).config
     assert isinstance(config, ReinforceConfig)
     return config
@@ -90,6 +91,8 @@ def test_a_run_is_recorded_and_read_again(few, tmp_path):
         (["--learn.worlds", 0], "learn.worlds must be at least 1, got 0"),
         (["--learn.discount", 1.5], "learn.discount must lie in \\(0, 1\\], got 1.5"),
         (["--learn.method", "grpo"], "method"),
+        (["--method", "lora"], "--peft is that of .*few: drop it"),
+        (["--optim.ema", 0.9], "optim.ema is not for reinforcement learning: drop it"),
         (["--dry-run"], "--dry-run is not for reinforcement learning: drop it"),
         (["--fit", "16GB"], "--fit is not for reinforcement learning: drop it"),
     ],
