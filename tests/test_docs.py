@@ -15,6 +15,7 @@ OTHERS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 OTHERS += [*sorted(ROOT.glob("studies/*/README.md")), *sorted(ROOT.glob("examples/*/README.md"))]
 """Pages whose links and files are checked, but not their examples."""
 WITHOUT_EXAMPLES = {"runs", "launch", "benchmarks", "architecture", "libero", "deployment"}
+WITHOUT_EXAMPLES |= {"reinforce"}
 """Reference pages, and some of commands alone."""
 SLOW = {"serving", "latency", "reinforcement_learning", "simulation"}
 SLOW |= {"adapt_your_model", "language_models", "published_checkpoints"}

@@ -22,6 +22,7 @@ PACKAGES = [
     "lorasp_jax.training",
     "lorasp_jax.evaluation",
     "lorasp_jax.report",
+    "lorasp_jax.reinforce",
     "lorasp_jax.cli",
     # The core, which is everything above, imports none of these.
     "lorasp_jax.extras.serving",

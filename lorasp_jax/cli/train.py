@@ -50,13 +50,31 @@ def main(arguments: Sequence[str], program: str = "python train.py") -> int:
                 versions = {x.__name__: x.__version__ for x in (jax, flax, lorasp_jax)}
                 processes.agree("versions", versions)
             with processes.together():
-                command = parse(arguments, program)
+                command = _resolved(parse(arguments, program))
             options = {"resume": command.resume, "dry_run": command.dry_run}
             processes.agree("settings", to_json(command.config) | options)
             _execute(command, console, started)
 
     remedy = ": free some memory or disk space and add --resume"
     return run_command(adapt, errors, f"stopped; to resume: {resume}", remedy)
+
+
+def _resolved(command: "Command") -> "Command":
+    """Complete the config of reinforcement learning by what its start run decides."""
+    from lorasp_jax.reinforce.config import ReinforceConfig
+
+    if not isinstance(command.config, ReinforceConfig):
+        return command
+    import jax
+
+    from lorasp_jax.reinforce import start
+
+    others = {"dry_run": command.dry_run, "fit": command.fit, "wandb": command.wandb}
+    others["distributed"] = jax.distributed.is_initialized()
+    for name in (name for name, value in others.items() if value):
+        raise ValueError(f"--{name.replace('_', '-')} is not for reinforcement learning: drop it")
+    config = start.resolve(command.config, command.given)
+    return dataclasses.replace(command, config=config)
 
 
 def _execute(command: "Command", console: Console, started: float) -> None:
@@ -104,6 +122,14 @@ def run(
     For `budget` see `setup.build`.
     """
     import jax
+
+    from lorasp_jax.reinforce.config import ReinforceConfig
+
+    if isinstance(command.config, ReinforceConfig):
+        from lorasp_jax.reinforce import command as reinforce
+
+        reinforce.run(command.config, folder, console, started, resume=bool(command.resume))
+        return
 
     from lorasp_jax.evaluation.callback import Evaluation, NoEvaluation
     from lorasp_jax.evaluation.validation import Validation

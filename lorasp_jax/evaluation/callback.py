@@ -98,14 +98,19 @@ class Evaluation(Callback):
         write_json(run.folder / "results.json", summarize(run, results))
 
     def _write_media(self, run: Run, results: dict[str, Result]) -> None:
-        """Write each task's video and the initial camera images of its first demonstration."""
+        """Write each task's video and initial images, those of its first demonstration if any."""
         if not self._media:
             return
         for task, result in results.items():
-            images = {name: np.asarray(i[0, 0]) for name, i in run.episodes[task].image.items()}
+            env = self._rollouts[task][0]
+            if episodes := run.episodes.get(task):
+                images = {name: np.asarray(i[0, 0]) for name, i in episodes.image.items()}
+            else:  # a run without demonstrations
+                first = jax.tree.map(lambda x: x[:1], result.poses)
+                frames = video.render_episode(env, first, result.draw, run.config.image_size)
+                images = {name: frame[0] for name, frame in frames.items()}
             Image.fromarray(side_by_side(images)).save(run.folder / f"cameras_{task}.png")
             with atomic_file(run.folder / f"rollout_{task}.mp4") as unfinished:
-                env = self._rollouts[task][0]
                 video.write_episode(env, result.poses, unfinished, result.draw)
 
     def _evaluate_tasks(self, run: Run, when: str, episodes: int = 0) -> dict[str, Result]:

@@ -146,6 +146,8 @@ class Worlds:
 
     Attributes:
         state: the current state of the worlds.
+        policy: the policy, prepared for programs that all policies share.
+        sample_key: key of the policy's noise.
     """
 
     def __init__(
@@ -158,19 +160,23 @@ class Worlds:
         """
         rows = policy.processor.prompts.rows(env.instructions)
         self._env = env
-        self._policy = _shareable(policy)
+        self.policy: Policy = _shareable(policy)
         # Programs are compiled again for arrays placed otherwise, so all follow the keys.
         self._place = _placement(policy)
-        reset_key, self._sample_key = jax.device_put(tuple(jax.random.split(key)), self._place)
+        reset_key, self.sample_key = jax.device_put(tuple(jax.random.split(key)), self._place)
         self.state: State = _reset(env, reset_key, ranges)
         prompts = rows[np.asarray(self.state.info["instruction"])]
         self._prompts = jax.device_put(prompts, self._place)
 
+    def observe(self) -> RawObservation:
+        """Render and measure what the policy observes."""
+        return _observe(self._env, self.state)
+
     def predict(self, call: int, *, denoise_steps: int, **previous: Any) -> tuple[jax.Array, Any]:
         """Observe the worlds and sample a chunk in each; see `predict`."""
         observation, done = self.observe(), self.state.done
-        inputs = (self._sample_key, np.int32(call), observation, self._prompts, done)
-        actions, ranks = _predict()(self._policy, *inputs, denoise_steps=denoise_steps, **previous)
+        inputs = (self.sample_key, np.int32(call), observation, self._prompts, done)
+        actions, ranks = _predict()(self.policy, *inputs, denoise_steps=denoise_steps, **previous)
         return jax.device_put(actions, self._place), ranks
 
     def observe(self) -> RawObservation:
@@ -205,7 +211,6 @@ def predict(
         key: key of the rollout.
         call: `[]` int32, index of the policy call.
         observation: from `env.observe`.
-        prompts: `[W]` int32, rows of the policy's prompt table.
         done: `[W]` bool.
         denoise_steps: Euler steps.
         previous: `previous`, `prefix_length` and `guidance` of `Policy.sample`, if any.

@@ -5,8 +5,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.figure import Figure
 
+from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.evaluation.figure_style import COLORS, STYLE
 
 _STYLE = STYLE | {"font.size": 10}
@@ -69,6 +71,37 @@ def losses(rows: Rows) -> Figure:
     if right.lines:
         right.set_yscale("log")
         right.legend(frameon=False)
+    return figure
+
+
+@mpl.rc_context(_STYLE)
+def reinforcement(rows: Rows, episodes: int) -> Figure:
+    """Plot success with noise, with 95 % intervals, and the divergence from the start policy.
+
+    `episodes` is the number of episodes per task and iteration.
+    """
+    figure = Figure(figsize=(9, 3), layout="constrained")
+    steps, minutes, right = figure.subplots(1, 3)
+    names = sorted(name for name in rows[0] if name.startswith("rollout/"))
+    for axes, x in ((steps, "environment_steps"), (minutes, "minutes")):
+        for i, name in enumerate(names):
+            values = [100 * row[name] for row in rows]
+            bounds = [wilson_interval(round(row[name] * episodes), episodes) for row in rows]
+            low, high = 100 * np.transpose(bounds)
+            at = [row[x] for row in rows]
+            axes.plot(at, values, color=f"C{i}", label=name.removeprefix("rollout/"), lw=1.5)
+            axes.fill_between(at, low, high, color=f"C{i}", alpha=0.2, lw=0)
+        axes.set_ylim(0, 103)
+        axes.set_xlabel(x.replace("_", " "))
+    steps.set_title("success with noise [%]", loc="left")
+    steps.legend(frameon=False, loc="lower right")
+    _line(right, rows, "start_kl", COLORS["vision"], "from the start")
+    _line(right, rows, "kl", COLORS["before"], "in an iteration")
+    if right.lines:
+        right.set_yscale("log")
+        right.legend(frameon=False)
+    right.set_title("KL divergence per action", loc="left")
+    right.set_xlabel("iteration")
     return figure
 
 

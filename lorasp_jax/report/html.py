@@ -74,7 +74,7 @@ def write_report(folder: Path) -> Path:
         *_success(results),
         "<h2>Training</h2>",
         *_datasets(folder),
-        *_training(rows),
+        *_training(rows, config),
         *_held_out(folder, rows),
         *_rules(results),
         *_active_rank(results, rows, folder, config),
@@ -135,9 +135,14 @@ def _datasets(folder: Path) -> Iterable[str]:
         yield _table(header, rows)
 
 
-def _training(rows: figures.Rows) -> Iterable[str]:
+def _training(rows: figures.Rows, config: dict[str, Any]) -> Iterable[str]:
     """Show losses, skipped steps and, if measured, success over the steps and speed."""
-    yield _image(figures.losses(rows)) if rows else "<p>No metrics logged yet.</p>"
+    if not rows:
+        yield "<p>No metrics logged yet.</p>"
+    elif online := config.get("online"):
+        yield _image(figures.reinforcement(rows, online["worlds"]))
+    else:
+        yield _image(figures.losses(rows))
     if skipped := [(row["step"], row["skipped"]) for row in rows if row.get("skipped")]:
         total = sum(count for _, count in skipped)
         yield (

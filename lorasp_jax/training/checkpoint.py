@@ -12,7 +12,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import orbax.checkpoint as ocp
@@ -23,7 +23,8 @@ from lorasp_jax.base.errors import DISK_FULL
 from lorasp_jax.base.writing import rename
 from lorasp_jax.models.checkpoints import orbax_folders
 from lorasp_jax.training.distributed import processes
-from lorasp_jax.training.step import TrainState
+
+State = TypeVar("State")
 
 COMMIT_MARKER = "commit_success.txt"
 """File that Orbax writes into a checkpoint's folder once the checkpoint is complete."""
@@ -46,8 +47,8 @@ class Checkpoints:
         """Whether there is a complete checkpoint; it may be corrupt."""
         return bool(self._manager.all_steps())
 
-    def save(self, state: TrainState) -> None:
-        """Save `state` asynchronously.
+    def save(self, state: Any) -> None:
+        """Save a state with a `step` `[]`, such as a `TrainState`, asynchronously.
 
         Raises:
             ValueError: this or the previous checkpoint could not be written.
@@ -64,7 +65,7 @@ class Checkpoints:
                 ),
             )
 
-    def restore(self, like: TrainState) -> TrainState | None:
+    def restore(self, like: State) -> State | None:
         """Restore the newest intact checkpoint; return None if there are no checkpoints.
 
         Newer corrupt checkpoints are renamed and incomplete ones removed, with a warning for each.

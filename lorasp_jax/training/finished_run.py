@@ -47,8 +47,9 @@ def recorded_config(run: Path) -> Config:
 
 
 def _from_json(recorded: Mapping[str, Any], tasks: tuple[str, ...]) -> Config:
-    """Undo `run_folder.to_json`."""
-    fields = {name: value for name, value in recorded.items() if name not in ("scene", "digest")}
+    """Undo `run_folder.to_json`, but for what only reinforcement learning has."""
+    left_out = ("scene", "digest", "online")
+    fields = {name: value for name, value in recorded.items() if name not in left_out}
     data = dict(fields["data"])
     augment, validation = ("none", "0") if data["source"] else ("auto", "auto")
     data["augment"] = AugmentConfig(**data.get("augment", {"preset": augment}))

@@ -77,6 +77,7 @@ def parse(arguments: Sequence[str], program: str = "python train.py") -> Command
     _check_rules(config, ["--method"] * bool(known.method) + rest)
     options = (text.partition("=")[0] for text in rest if text.startswith("--"))
     given = frozenset(option.lstrip("-").replace("-", "_") for option in options)
+    given |= {"peft"} if known.method else set()
     return Command(config, known.resume, known.dry_run, known.wandb, known.fit, given)
 
 
@@ -155,8 +156,8 @@ def override(config: Config, arguments: Sequence[str], program: str = "") -> Con
         prog=program,
         config=(tyro.conf.AvoidSubcommands,),
     )
-    names = (field.name for field in dataclasses.fields(Config))
-    return Config(**{name: getattr(parsed, name) for name in names})
+    names = (field.name for field in dataclasses.fields(config))
+    return type(config)(**{name: getattr(parsed, name) for name in names})
 
 
 def _check_rules(config: Config, arguments: Sequence[str]) -> None:
@@ -199,7 +200,7 @@ def _with_rank_of(current: peft.Method, name: str) -> peft.Method:
 
 
 def _concrete(config: Config) -> type[Config]:
-    """Return a `Config` class whose `peft` has the chosen method's type, to expose its fields.
+    """Return a config class whose `peft` has the chosen method's type, to expose its fields.
 
     `scale` is hidden, because it only selects defaults.
     """
@@ -209,7 +210,7 @@ def _concrete(config: Config) -> type[Config]:
             ("peft", type(config.peft), dataclasses.field()),
             ("scale", tyro.conf.Suppress[str], dataclasses.field()),
         ],
-        bases=(Config,),
+        bases=(type(config),),
         frozen=True,
         kw_only=True,
     )

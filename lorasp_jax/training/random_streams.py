@@ -18,6 +18,9 @@ class RandomStream(enum.IntEnum):
     BASE = 4
     STATISTICS = 5
     # 6 is retired: a new purpose gets a number that no run has used.
+    CRITIC = 7
+    ROLLOUTS = 8
+    """Episodes of online reinforcement learning."""
     EVALUATION = 10
     """Evaluations before and during training."""
     FINAL_EVALUATION = 11

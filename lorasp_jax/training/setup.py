@@ -110,7 +110,7 @@ def build(
         short = isinstance(tokenizer, Offline)
         endings = prompts.ADVANTAGE_SHORT if short else prompts.ADVANTAGE
     table, joints = _prompts_and_joints(source, environments, tokenizer, base.config, endings)
-    _check_sizes(config, base.config.chunk)
+    check_sizes(config, base.config.chunk)
     if not source:
         robot_slots(joints, base.config.inputs)
     relative = config.model.relative_actions
@@ -246,7 +246,7 @@ def _prompts_and_joints(
     return table, joints
 
 
-def _check_sizes(config: Config, chunk: int) -> None:
+def check_sizes(config: Config, chunk: int) -> None:
     """Raise ValueError if chunk, batch, devices or training options cannot be combined."""
     meshes.make_mesh(config.fsdp)
     if config.evaluation.execute_steps > chunk:

@@ -191,7 +191,7 @@ def test_one_rank_budget_and_no_average_of_it():
     optim = dataclasses.replace(CONFIG.optim, ema=0.9)
     config = with_rules("q_proj=ada_lora:4", "v_proj=lora:2", optim=optim)
     with pytest.raises(ValueError, match="ema cannot be combined with ada_lora"):
-        setup._check_sizes(config, 10)
+        setup.check_sizes(config, 10)
     assert AdaLoRA(rank=4) in rules.methods(config)
 
 

@@ -1,0 +1,35 @@
+"""Improve a finished run by trial in simulation, from success alone.
+
+    python train.py --config configs/single_task.py --data.episodes 8 --name few
+    python train.py --config configs/reinforce.py --from runs/few
+
+Base, robot, tasks and adapters are the start run's. See docs/reinforce.md.
+"""
+
+from lorasp_jax.config import EvaluationConfig, OptimConfig
+from lorasp_jax.peft import LoRASP
+from lorasp_jax.reinforce.config import Learning, ReinforceConfig
+
+
+def get_config(scale: str) -> ReinforceConfig:
+    """Return the config at `scale`: smoke, cpu or accelerator."""
+    worlds = {"smoke": 16, "cpu": 128, "accelerator": 256}[scale]
+    episodes = {"smoke": 16, "cpu": 64, "accelerator": 256}[scale]
+    rate = 1e-3
+    return ReinforceConfig(
+        name="reinforce",
+        scale=scale,
+        peft=LoRASP(),
+        tasks=("press",),
+        optim=OptimConfig(
+            steps={"smoke": 2, "cpu": 12, "accelerator": 100}[scale],
+            batch_size={"smoke": 16, "cpu": 64, "accelerator": 256}[scale],
+            learning_rate=rate,
+            final_learning_rate=rate,
+            warmup_steps=10,
+        ),
+        evaluation=EvaluationConfig(episodes=episodes, num_envs=episodes, every=2),
+        online=Learning(worlds=worlds),
+        log_every=1,
+        checkpoint_every={"smoke": 1, "cpu": 1, "accelerator": 10}[scale],
+    )

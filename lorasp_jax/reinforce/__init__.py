@@ -1,0 +1,1 @@
+"""Online reinforcement learning of adapters: rollouts in simulation, proximal policy updates."""

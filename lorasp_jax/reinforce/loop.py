@@ -1,0 +1,221 @@
+"""The loop of online learning: collect, update, log, save."""
+
+import contextlib
+import dataclasses
+import functools
+import time
+from collections.abc import Mapping, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lorasp_jax.base.bars import bars
+from lorasp_jax.reinforce import critic, noise, rollout, update
+from lorasp_jax.reinforce.config import ReinforceConfig
+from lorasp_jax.reinforce.rollout import Rollout
+from lorasp_jax.reinforce.setting import Setting, prepare
+from lorasp_jax.reinforce.update import Batch, Learner
+from lorasp_jax.training import best, records
+from lorasp_jax.training.checkpoint import Checkpoints
+from lorasp_jax.training.guard import summarize
+from lorasp_jax.training.interrupt import deferred
+from lorasp_jax.training.loop import RunError
+from lorasp_jax.training.random_streams import RandomStream
+from lorasp_jax.training.run import Callback, Run
+from lorasp_jax.training.run_folder import MetricsLog, read_json, read_metrics
+
+
+def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False) -> None:
+    """Improve `run.policy` by trial, then set it to the best policy that was evaluated.
+
+    With `resume`, it continues from the newest checkpoint, if there is one.
+
+    Raises:
+        RunError: too many consecutive updates were skipped.
+        KeyboardInterrupt: a signal stopped the run; the state is saved first.
+    """
+    fixed, initial, shapes = prepare(run)
+    checkpoints = Checkpoints(run.folder, run.base_hash, run.console)
+    restored = checkpoints.restore(shapes) if resume else None
+    if restored is None:
+        for callback in callbacks:
+            callback.on_start(run)
+        before = read_json(run.folder / "before.json", records.BEFORE)
+        _keep_best(run, 0, {f"success/{task}": x["success"] for task, x in before.items()})
+    try:
+        with run.timed("train"):
+            state = _loop(run, fixed, restored or initial, checkpoints, callbacks)
+    except RunError as error:
+        for callback in callbacks:
+            callback.on_stop(run, str(error))
+        raise
+    finally:
+        checkpoints.close()
+    run.policy = fixed.policy(state.adapters)
+    if best.error(run.folder) < float("inf"):
+        step, run.policy = best.load(run.folder, run.policy)
+        run.console.print(f"kept the adapters of iteration {step}, the best that were evaluated")
+    for callback in callbacks:
+        callback.on_end(run)
+
+
+def _loop(
+    run: Run,
+    setting: Setting,
+    state: Learner,
+    checkpoints: Checkpoints,
+    callbacks: Sequence[Callback],
+) -> Learner:
+    """Run iterations until the last one, a collapse, or a signal to stop."""
+    config, saved = setting.config, int(state.step)
+    total, clock = config.optim.steps, _Clock(run, saved)
+    with (
+        contextlib.closing(MetricsLog(run.folder, saved)) as log,
+        deferred() as stop,
+        bars(run.console, "iterations") as progress,
+    ):
+        bar = progress.add_task("compiling ...", total=total, completed=saved)
+        reason = ""
+        while (done := int(state.step)) < total and not reason and not stop.requested:
+            state, values = iterate(setting, state)
+            done += 1
+            if values.pop("in_a_row") >= config.optim.max_skipped:
+                raise RunError(_SKIPPED.format(config.optim.max_skipped, saved))
+            values = clock.count(values)
+            run.policy = setting.policy(state.adapters)
+            for callback in callbacks:
+                values = values | (callback.on_log(run, done, values) or {})
+            _keep_best(run, done, values)
+            log.write(done, values)
+            progress.update(bar, completed=done, description=_text(values))
+            reason = clock.collapse(config, values)
+            if done // config.checkpoint_every > saved // config.checkpoint_every:
+                checkpoints.save(state)
+                saved = done
+        checkpoints.save(state)
+    if reason:
+        run.console.print(f"stopped after iteration {done}: {reason}")
+    elif stop.requested:
+        raise KeyboardInterrupt
+    return state
+
+
+_SKIPPED = (
+    "{} consecutive updates were skipped because loss or gradient was non-finite; nothing after "
+    "iteration {} was saved: try a lower --optim.learning-rate"
+)
+
+
+class _Clock:
+    """Environment steps and minutes of a run, and the success that it began with."""
+
+    def __init__(self, run: Run, saved: int) -> None:
+        rows = [row for row in read_metrics(run.folder) if row["step"] <= saved]
+        last = rows[-1] if rows else {"environment_steps": 0, "minutes": 0}
+        self._steps, self._first = last["environment_steps"], rows[0] if rows else {}
+        self._began = time.perf_counter() - 60 * last["minutes"]
+
+    def count(self, values: dict[str, float]) -> dict[str, float]:
+        """Replace the steps of an iteration by those of the run, and add the minutes."""
+        self._steps += values.pop("steps")
+        minutes = (time.perf_counter() - self._began) / 60
+        self._first = self._first or values
+        return values | {"environment_steps": self._steps, "minutes": minutes}
+
+    def collapse(self, config: ReinforceConfig, values: Mapping[str, float]) -> str:
+        """Say in a sentence why going on is useless; "" if it is not."""
+        if not values["updates"]:
+            return "no episode succeeded: start from a run that succeeds more often"
+        if (kl := values.get("start_kl", 0)) > config.online.max_start_kl:
+            return (
+                f"the KL divergence from the start policy is {kl:.1f}, above "
+                f"{config.online.max_start_kl:g}: try a lower --optim.learning-rate"
+            )
+        for task in config.tasks:
+            now, first = values[f"rollout/{task}"], self._first[f"rollout/{task}"]
+            if now < first / 2:
+                return (
+                    f"success with noise in {task} fell from {100 * first:.0f} % to "
+                    f"{100 * now:.0f} %: try a lower --optim.learning-rate"
+                )
+        return ""
+
+
+def _text(values: Mapping[str, float]) -> str:
+    """Return the text of the bar."""
+    rates = [f"{100 * x:.0f} %" for name, x in values.items() if name.startswith("rollout/")]
+    return f"success with noise {', '.join(rates)}"
+
+
+def _keep_best(run: Run, step: int, values: Mapping[str, float]) -> None:
+    """Save the adapters if they were evaluated, and more episodes failed with all before."""
+    rates = [x for name, x in values.items() if name.startswith("success/")]
+    if rates and (error := 1 - float(np.mean(rates))) < best.error(run.folder):
+        best.save(run.folder, run.policy, step, error)
+
+
+def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]]:
+    """Collect and learn once; return the state and the metrics, with the environment `steps`."""
+    config, step = setting.config, int(state.step)
+    execute = config.evaluation.execute_steps
+    policy = setting.policy(state.adapters).with_sampler()
+    batches, critics, values = [], {}, {"steps": 0.0}
+    for task, env in setting.environments.items():
+        key = jax.random.fold_in(RandomStream.ROLLOUTS.key(config.seed, task), step)
+        found = rollout.collect(
+            env,
+            policy,
+            key,
+            config.online.std,
+            execute_steps=execute,
+            denoise_steps=config.evaluation.denoise_steps,
+            ranges=config.ranges,
+        )
+        advantages, valid = jnp.ones(found.steps.done.shape), rollout.of_successes(found.steps)
+        if old := state.critics.get(task):
+            valid = ~found.steps.done
+            learned = _learn(old, found.steps, found.last, key, config.online)
+            advantages, critics[task], metrics = learned
+            values |= {f"{name}/{task}": float(x) for name, x in metrics.items()}
+        batches.append(_batch(found, advantages, valid, execute))
+        values[f"rollout/{task}"] = float(jnp.mean(found.success))
+        values["steps"] += float(jnp.sum(~found.steps.done))
+    batch = jax.tree.map(lambda *x: jnp.concatenate(x), *batches)
+    key = jax.random.fold_in(RandomStream.TRAINING.key(config.seed), step)
+    state, rows = update.improve(setting.programs, state, setting.frozen, batch, key)
+    values |= _summary(setting, state, batch, rows)
+    state = dataclasses.replace(state, step=state.step + 1, critics=critics)
+    return jax.device_put(state, setting.shardings), values
+
+
+def _batch(found: Rollout, advantages: jax.Array, valid: jax.Array, execute_steps: int) -> Batch:
+    """Arrange steps `[calls x S, W]` as chunks `[calls x W, S]`."""
+    worlds = advantages.shape[1]
+
+    def arrange(x: jax.Array) -> jax.Array:
+        return jnp.moveaxis(x.reshape(-1, execute_steps, worlds), 1, 2).reshape(-1, execute_steps)
+
+    means = jnp.zeros_like(found.chunks.actions)
+    return Batch(found.chunks, arrange(advantages), arrange(valid), means)
+
+
+def _summary(
+    setting: Setting, state: Learner, batch: Batch, rows: dict[str, np.ndarray]
+) -> dict[str, float]:
+    """Return the means of the metrics of the gradient steps, and the divergence from the start."""
+    if not rows:
+        return {"updates": 0, "in_a_row": 0}
+    values = {n: float(x.mean()) for n, x in summarize(rows).items() if x.ndim == 0}
+    index = np.arange(setting.config.optim.batch_size) % len(batch.valid)
+    now, start = (
+        setting.programs.means(x, setting.frozen, batch.chunks, index)
+        for x in (state.adapters, setting.start)
+    )
+    slots = noise.action_slots(setting.frozen.processor)
+    kl = noise.divergence(now, start, setting.config.online.std, slots)
+    extra = {"start_kl": float(jnp.mean(kl)), "in_a_row": float(rows["in_a_row"][-1])}
+    return values | extra | {"updates": len(rows["loss"])}
+
+
+_learn = functools.partial(jax.jit, static_argnums=4)(critic.learn)

@@ -1,0 +1,188 @@
+"""Episodes of the policy that explores, as chunks to learn from."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs import traced
+from envs.env import Env
+from envs.scene.ranges import Randomization
+from envs.state import State
+from lorasp_jax.base import fast_cpu
+from lorasp_jax.evaluation.programs import Worlds
+from lorasp_jax.policies.policy import Policy
+from lorasp_jax.policies.processor import RawObservation
+from lorasp_jax.reinforce import noise
+from lorasp_jax.training.distributed import mesh as meshes
+
+
+class Chunks(NamedTuple):
+    """What the policy saw and did in N policy calls.
+
+    Attributes:
+        observation: from `env.observe`, images in uint8.
+        prompts: `[N]` int32, rows of the policy's prompt table.
+        noise: `[N, C, A]` initial noise of the flow.
+        actions: `[N, S, A]` normalized actions that were executed.
+    """
+
+    observation: RawObservation
+    prompts: jax.Array
+    noise: jax.Array
+    actions: jax.Array
+
+
+class Steps(NamedTuple):
+    """T control steps in W worlds.
+
+    Attributes:
+        state: `[T, W, D]` full state of the simulator before the step, and the elapsed share of the
+            time limit.
+        done: `[T, W]` bool, whether the episode was over before the step.
+        ended: `[T, W]` bool, whether it was over after it.
+        success: `[T, W]` bool, whether it had succeeded.
+        reward: `[T, W]`.
+    """
+
+    state: jax.Array
+    done: jax.Array
+    ended: jax.Array
+    success: jax.Array
+    reward: jax.Array
+
+
+class Rollout(NamedTuple):
+    """W worlds until the time limit of their first episodes; finished ones restart meanwhile.
+
+    Attributes:
+        chunks: N = calls x W, in this order.
+        steps: T = calls x S. A world idles until the next call when its episode is over.
+        last: `[W, D]` the last full state, as in `Steps`.
+        success: `[W]` bool, of the first episodes.
+    """
+
+    chunks: Chunks
+    steps: Steps
+    last: jax.Array
+    success: jax.Array
+
+
+def collect(
+    env: Env,
+    policy: Policy,
+    key: jax.Array,
+    std: float,
+    *,
+    execute_steps: int,
+    denoise_steps: int,
+    ranges: Randomization | None = None,
+) -> Rollout:
+    """Act in every world until the time limit.
+
+    Args:
+        env: W worlds.
+        policy: on one device, or sharded over a mesh, which then shares the worlds, too.
+        key: determines layouts, start poses, instructions and noise.
+        std: standard deviation of exploration [normalized action units].
+        execute_steps: S, actions executed from each chunk.
+        denoise_steps: Euler steps.
+        ranges: as in `env.reset`.
+    """
+    worlds = Worlds(env, policy, key, ranges)
+    rows = jnp.asarray(policy.processor.prompts.rows(env.instructions))
+    worlds.state = _spread(worlds.state, policy)
+    chunks, steps = [], []
+    for call in range(-(-env.max_steps // execute_steps)):
+        now = jax.random.fold_in(worlds.sample_key, call)
+        if call:
+            worlds.state = _restart(env, worlds.state, now, ranges)
+        prompts = rows[worlds.state.info["instruction"]]
+        inputs = now, worlds.observe(), prompts, np.float32(std), denoise_steps, execute_steps
+        actions, chunk = _explore()(worlds.policy, *inputs)
+        worlds.state, step = _act(env, worlds.state, actions)
+        chunks.append(chunk)
+        steps.append(Steps(**step))
+    join = lambda *parts: jnp.concatenate(parts)  # noqa: E731
+    joined = jax.tree.map(join, *steps)
+    end = jnp.argmax(joined.ended, axis=0)
+    success = jnp.take_along_axis(joined.success, end[None], axis=0)[0]
+    return Rollout(jax.tree.map(join, *chunks), joined, _full_state(env, worlds.state), success)
+
+
+def of_successes(steps: Steps) -> jax.Array:
+    """Return which steps belong to episodes that end in success, `[T, W]` bool."""
+
+    def body(later: jax.Array, step: Steps) -> tuple[jax.Array, jax.Array]:
+        succeeds = jnp.where(step.ended & ~step.done, step.success, later)
+        return succeeds, succeeds & ~step.done
+
+    return jax.lax.scan(body, jnp.zeros_like(steps.done[0]), steps, reverse=True)[1]
+
+
+def _spread(tree: Any, policy: Policy) -> Any:
+    """Spread worlds over the devices of the policy, if there are several."""
+    sharding = jax.tree.leaves(policy.model)[0].sharding
+    if len(sharding.device_set) == 1:
+        return tree
+    return jax.device_put(tree, meshes.batch_sharding(sharding.mesh))
+
+
+@functools.cache
+def _explore() -> Callable[..., Any]:
+    """Return the jitted `explore`; not a constant, because its options start JAX's backend."""
+    options = fast_cpu.without_simulation()
+    return jax.jit(explore, static_argnums=(5, 6), compiler_options=options)
+
+
+def explore(
+    policy: Policy,
+    key: jax.Array,
+    observation: RawObservation,
+    prompts: jax.Array,
+    std: jax.Array,
+    denoise_steps: int,
+    execute_steps: int,
+) -> tuple[jax.Array, Chunks]:
+    """Return noisy actions `[W, S, J+1]` [rad, m] of the next chunks, and the chunks."""
+    flow_key, action_key = jax.random.split(key)
+    processor, config = policy.processor, policy.model.config
+    initial = jax.random.normal(flow_key, (len(prompts), config.chunk, config.action_dim))
+    mean = policy.model.sample_actions(
+        None,
+        processor.encode(observation, prompts),
+        num_steps=denoise_steps,
+        noise=initial,
+        slots=processor.flow_slots,
+    )
+    slots = noise.action_slots(processor)
+    actions = noise.explore(action_key, mean[:, :execute_steps], std, slots)
+    chunks = Chunks(observation, prompts, initial, actions)
+    return processor.decode(actions, observation["state"]), chunks
+
+
+@functools.partial(traced.cached, files=(__file__,))
+def _restart(env: Env, state: State, key: jax.Array, ranges: Randomization | None) -> State:
+    # With the key itself, worlds would start as the noise of the flow says.
+    return env.reset_done(state, jax.random.fold_in(key, 1), ranges)
+
+
+@functools.partial(traced.cached, files=(__file__,))
+def _act(env: Env, state: State, actions: jax.Array) -> tuple[State, dict[str, jax.Array]]:
+    """Execute `[W, S, J+1]`; return the worlds and the fields of `Steps`."""
+
+    def step(state: State, action: jax.Array) -> tuple[State, dict[str, jax.Array]]:
+        before = {"state": _full_state(env, state), "done": state.done}
+        state = env.step(state, action)
+        after = {"ended": state.done, "success": state.info["success"], "reward": state.reward}
+        return state, before | after
+
+    return jax.lax.scan(step, state, jnp.moveaxis(actions, 1, 0))
+
+
+def _full_state(env: Env, state: State) -> jax.Array:
+    elapsed = state.info["steps"] / env.max_steps
+    return jnp.concatenate([env.full_state(state), elapsed[:, None]], axis=1)

@@ -1,0 +1,99 @@
+"""Where a run starts: the policy of a finished run, or a base with new adapters."""
+
+import dataclasses
+from collections.abc import Collection
+from pathlib import Path
+
+from flax import nnx
+from rich.console import Console
+
+from lorasp_jax import models
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.io import native
+from lorasp_jax.base import hub
+from lorasp_jax.policies.policy import Policy
+from lorasp_jax.reinforce.config import ReinforceConfig
+from lorasp_jax.training import export, rules, setup
+from lorasp_jax.training.export import BASE, QUANTIZED, describe, load_policy
+from lorasp_jax.training.finished_run import recorded_config
+from lorasp_jax.training.random_streams import RandomStream
+from lorasp_jax.training.run import Callback, Run
+
+_KEPT = ("model", "robot", "image_size", "scene", "control_dt", "data")
+"""Fields of the config that a start run decides."""
+_ADAPTERS = ("peft", "targets", "adapt")
+MERGED = "merged"
+"""Folder of a base with the adapters of the start run merged into it."""
+
+
+def resolve(config: ReinforceConfig, given: Collection[str]) -> ReinforceConfig:
+    """Return the config with what the start run decides.
+
+    Args:
+        config: as parsed.
+        given: names of the fields that the user set.
+
+    Raises:
+        ValueError: the start run is not finished, its tasks cannot be simulated, or a field that
+            it decides was given.
+    """
+    if not config.online.start:
+        return config
+    start = Path(config.online.start)
+    recorded = recorded_config(start)
+    kept = (*_KEPT, *(_ADAPTERS if config.online.adapters == "continue" else ()))
+    for name in kept:
+        values = getattr(config, name), getattr(recorded, name)
+        if name in {field.partition(".")[0] for field in given} and values[0] != values[1]:
+            what = f" ({values[1]})" if isinstance(values[1], str) else ""
+            raise ValueError(f"--{name.replace('_', '-')} is that of {start}{what}: drop it")
+    taken = {name: getattr(recorded, name) for name in kept}
+    tasks = config.tasks if "tasks" in given else recorded.tasks
+    known = describe(start)["tasks"]
+    if unknown := [task for task in tasks if task not in known]:
+        raise ValueError(f"{start} has learned {', '.join(known)}, not {unknown[0]}")
+    return dataclasses.replace(config, tasks=tasks, **taken)
+
+
+def load(config: ReinforceConfig, folder: Path, console: Console, started: float) -> Run:
+    """Return a run with the policy that it starts with.
+
+    Raises:
+        ValueError: see `load_policy`, `setup.build` and `setup.check_sizes`; or the start run
+            trained its base, or has adapters that cannot be merged.
+    """
+    if not config.online.start:
+        return setup.prepare(config, folder, console, started)
+    start = Path(config.online.start)
+    if (start / BASE).is_dir():
+        raise ValueError(f"{start} has no adapters, it trained its base: start from another run")
+    policy = load_policy(start)
+    base_hash = native.read_description(start)["base"]
+    if config.online.adapters == "merge":
+        models.save(folder / MERGED, adaptation.merge(policy.model))
+        merged = models.load(folder / MERGED, policy.model.config)  # rounded, as it is saved
+        base_hash = models.weights_hash(merged)
+        rngs = nnx.Rngs(RandomStream.ADAPTERS.key(config.seed))
+        policy = Policy(adaptation.adapt(merged, rules.rules(config), rngs=rngs), policy.processor)
+    setup.check_sizes(config, policy.model.config.chunk)
+    run = Run(config, folder, console, base_hash, started)
+    run.policy = policy
+    console.print(setup.headline(config, policy.model))
+    return run
+
+
+class Export(Callback):
+    """Exports the policy, as `train.py` does: `load_policy` loads it."""
+
+    def on_end(self, run: Run) -> None:
+        """Write adapter.safetensors and adapter.json."""
+        config = run.config
+        assert isinstance(config, ReinforceConfig)
+        if not config.online.start:
+            export.write(run)
+            return
+        metadata = describe(config.online.start)
+        if config.online.adapters == "merge":
+            metadata |= {"base": hub.portable_path(str(run.folder / MERGED)), QUANTIZED: None}
+        base = run.base_hash
+        native.save_adapters(run.folder, run.policy.model, base=base, metadata=metadata)

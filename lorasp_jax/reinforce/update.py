@@ -1,0 +1,244 @@
+"""The update of the adapters on the chunks of one iteration, by one of two losses."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import nnx
+
+from lorasp_jax.data.batches import Batch as Demonstrations
+from lorasp_jax.models.flow_matching import Times
+from lorasp_jax.peft.auxiliary import AUXILIARY_WEIGHTS, auxiliary_losses
+from lorasp_jax.reinforce import noise
+from lorasp_jax.reinforce.config import ReinforceConfig
+from lorasp_jax.reinforce.critic import Critic
+from lorasp_jax.reinforce.rollout import Chunks
+from lorasp_jax.training import compilation, step
+from lorasp_jax.training import guard as guards
+from lorasp_jax.training.distributed import mesh as meshes
+from lorasp_jax.training.guard import Guard
+from lorasp_jax.training.optim import flow_times
+from lorasp_jax.training.program import Frozen
+from lorasp_jax.training.step import Metrics, active_ranks
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Learner:
+    """What a run saves and resumes from.
+
+    Attributes:
+        step: `[]` int32, number of iterations.
+        adapters: trainable parameters, an `nnx.State`.
+        guard: statistics that decide which updates to skip.
+        critics: by task; empty unless the method is ppo.
+    """
+
+    step: jax.Array
+    adapters: Any
+    opt_state: Any
+    guard: Guard
+    critics: dict[str, Critic]
+
+
+class Batch(NamedTuple):
+    """N chunks, of which S actions each were executed.
+
+    Attributes:
+        advantages: `[N, S]`, of mean 0 and variance 1; or ones.
+        valid: `[N, S]` bool, the actions to learn from.
+        means: `[N, S, A]` means of the policy that acted, for ppo.
+    """
+
+    chunks: Chunks
+    advantages: jax.Array
+    valid: jax.Array
+    means: jax.Array
+
+
+Loss = Callable[[Any, Frozen, Batch, jax.Array], tuple[jax.Array, Metrics]]
+"""(adapters, frozen, batch, key) -> loss and metrics."""
+
+
+def make_loss(config: ReinforceConfig, graphdef: Any) -> Loss:
+    """Return the loss of the method that the config names."""
+    weights: dict[str, Any] = {x: getattr(config.auxiliary, x) for x in AUXILIARY_WEIGHTS}
+    if config.online.method == "imitate":
+        return functools.partial(
+            imitation_loss,
+            graphdef=graphdef,
+            weights=weights,
+            state_noise=config.optim.state_noise,
+            times=flow_times(config.optim),
+        )
+    return functools.partial(
+        surrogate_loss,
+        graphdef=graphdef,
+        weights=weights,
+        std=config.online.std,
+        clip=config.online.clip,
+        denoise_steps=config.evaluation.denoise_steps,
+    )
+
+
+def imitation_loss(
+    adapters: Any,
+    frozen: Frozen,
+    batch: Batch,
+    key: jax.Array,
+    *,
+    graphdef: Any,
+    weights: dict[str, Any],
+    state_noise: float,
+    times: Times,
+) -> tuple[jax.Array, Metrics]:
+    """Return the flow-matching loss of the valid actions, as in training from demonstrations."""
+    chunks, processor = batch.chunks, frozen.processor
+    state_key, loss_key = jax.random.split(key)
+    jitter = jax.random.normal(state_key, (len(chunks.prompts), processor.statistics.dim))
+    observation = processor.encode(
+        chunks.observation, chunks.prompts, state_noise=state_noise * jitter
+    )
+    rest = chunks.noise.shape[1] - chunks.actions.shape[1]  # never executed
+    valid = jnp.pad(batch.valid, ((0, 0), (0, rest)))[..., None] & processor.flow_slots
+    actions = jnp.pad(chunks.actions, ((0, 0), (0, rest), (0, 0)))
+    own = Demonstrations(observation, actions, valid)
+    inputs = adapters, frozen.parameters, graphdef, own, loss_key, weights
+    return step.loss_fn(*inputs, times=times)
+
+
+def surrogate_loss(
+    adapters: Any,
+    frozen: Frozen,
+    batch: Batch,
+    key: jax.Array,  # noqa: ARG001
+    *,
+    graphdef: Any,
+    weights: dict[str, Any],
+    std: float,
+    clip: float,
+    denoise_steps: int,
+) -> tuple[jax.Array, Metrics]:
+    """Return PPO's loss (arXiv 1707.06347, eq. 7), with one probability ratio per action."""
+    mean, aux = means(adapters, frozen, batch.chunks, graphdef, denoise_steps)
+    slots = noise.action_slots(frozen.processor)
+    new, old = (noise.log_prob(x, batch.chunks.actions, std, slots) for x in (mean, batch.means))
+    ratio, advantages = jnp.exp(new - old), batch.advantages
+    average = lambda x: jnp.sum(x * batch.valid) / jnp.maximum(jnp.sum(batch.valid), 1)  # noqa: E731
+    clipped = jnp.clip(ratio, 1 - clip, 1 + clip)
+    losses = auxiliary_losses(aux)
+    total = -average(jnp.minimum(ratio * advantages, clipped * advantages))
+    total += sum(weights[name] * value for name, value in losses.items())
+    metrics = {
+        "loss": total,
+        "kl": average(noise.divergence(mean, batch.means, std, slots)),
+        "clipped": average(clipped != ratio),
+        "ratio": average(ratio),
+        **losses,
+        **active_ranks(aux),
+    }
+    return total, metrics
+
+
+def means(
+    adapters: Any, frozen: Frozen, chunks: Chunks, graphdef: Any, denoise_steps: int
+) -> tuple[jax.Array, Any]:
+    """Return the means of the executed actions `[N, S, A]`, and the adapters' aux."""
+    model = nnx.merge(graphdef, adapters, frozen.parameters)
+    inputs = chunks.observation, chunks.prompts, chunks.noise
+    mean, aux = noise.means(model, frozen.processor, *inputs, denoise_steps)
+    return mean[:, : chunks.actions.shape[1]], aux
+
+
+class Programs:
+    """The jitted programs of an update. They take indices of chunks, `[n]`.
+
+    The means of the policy that acted are computed as the update computes them, and not where it
+    acted: probability ratios are then exactly 1 before the first update.
+    """
+
+    def __init__(
+        self,
+        config: ReinforceConfig,
+        graphdef: Any,
+        optimizer: optax.GradientTransformation,
+        shardings: Learner,
+    ) -> None:
+        """`shardings` are those of the state."""
+        mesh, loss = shardings.step.mesh, make_loss(config, graphdef)
+        self.config: ReinforceConfig = config
+
+        def take(tree: Any, index: jax.Array) -> Any:
+            rows = jax.tree.map(lambda x: x[index], tree)
+            return jax.lax.with_sharding_constraint(rows, meshes.batch_sharding(mesh))
+
+        def old(adapters: Any, frozen: Frozen, chunks: Chunks, index: jax.Array) -> jax.Array:
+            steps = config.evaluation.denoise_steps
+            return means(adapters, frozen, take(chunks, index), graphdef, steps)[0]
+
+        def update(
+            state: Learner, frozen: Frozen, batch: Batch, index: jax.Array, key: jax.Array
+        ) -> tuple[Learner, Metrics]:
+            inputs = state.adapters, frozen, take(batch, index), key
+            gradient, metrics = jax.grad(loss, has_aux=True)(*inputs)
+            norm, spike = optax.tree.norm(gradient), config.optim.spike
+            accept, guard = guards.check_step(state.guard, metrics["loss"], norm, spike)
+            updates, opt_state = optimizer.update(gradient, state.opt_state, state.adapters)
+            adapters = optax.apply_updates(state.adapters, updates)
+            after = dataclasses.replace(state, adapters=adapters, opt_state=opt_state, guard=guard)
+            before = dataclasses.replace(state, guard=guard)
+            within = metrics.get("kl", 0.0) <= jnp.asarray(config.online.max_kl)
+            metrics |= {"grad_norm": norm, "in_a_row": guard.in_a_row, "within": within}
+            return guards.select(accept & within, after, before), metrics
+
+        options = compilation.step_options(mesh.size)
+        self.means: Callable[..., Any] = jax.jit(old, compiler_options=options)
+        self.update: Callable[..., Any] = jax.jit(
+            update,
+            donate_argnames="state",
+            out_shardings=(shardings, meshes.replicated(mesh)),
+            compiler_options=options,
+        )
+
+
+def improve(
+    programs: Programs, state: Learner, frozen: Frozen, batch: Batch, key: jax.Array
+) -> tuple[Learner, dict[str, np.ndarray]]:
+    """Take gradient steps on minibatches of chunks, for ppo until the policy has changed enough.
+
+    Args:
+        batch: chunks with any means.
+        key: orders the chunks; for their noise.
+
+    Returns:
+        The state, and the metrics of all steps; none if no action is valid.
+    """
+    config = programs.config
+    size, rows = config.optim.batch_size, []
+    useful = np.flatnonzero(np.any(batch.valid & (batch.advantages != 0), axis=1))
+    if not len(useful):
+        return state, {}
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    length = -(-len(useful) // size) * size
+    if config.online.method == "ppo":
+        for index in np.resize(useful, length).reshape(-1, size):
+            found = programs.means(state.adapters, frozen, batch.chunks, index)
+            batch = batch._replace(means=batch.means.at[index].set(found))
+    for _ in range(config.online.epochs):
+        for index in np.resize(rng.permutation(useful), length).reshape(-1, size):
+            step_key = jax.random.fold_in(key, len(rows))
+            state, metrics = programs.update(state, frozen, batch, index, step_key)
+            rows.append(jax.device_get(metrics))
+            if not rows[-1]["within"]:
+                return state, _stack(rows)
+    return state, _stack(rows)
+
+
+def _stack(rows: list[Metrics]) -> dict[str, np.ndarray]:
+    return jax.tree.map(lambda *x: np.stack(x), *rows)

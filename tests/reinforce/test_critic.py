@@ -1,0 +1,44 @@
+"""Advantages, against sums written out."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lorasp_jax.reinforce import critic
+from lorasp_jax.reinforce.config import Learning
+from lorasp_jax.reinforce.critic import Critic
+from lorasp_jax.reinforce.rollout import Steps
+
+DISCOUNT, TRACE = 0.9, 0.8
+
+
+def test_generalized_advantages_are_sums_of_errors():
+    rng = np.random.default_rng(0)
+    values, reward = rng.normal(size=(2, 6, 1))
+    last, ended = np.array([0.7]), np.array([[0], [0], [1], [0], [0], [0]], bool)
+    found = critic.generalized_advantages(
+        jnp.array(values), jnp.array(last), jnp.array(reward), jnp.array(ended), DISCOUNT, TRACE
+    )[:, 0]
+    v, r = [*values[:, 0], last[0]], reward[:, 0]
+    error = [r[t] + DISCOUNT * (0 if ended[t, 0] else v[t + 1]) - v[t] for t in range(6)]
+    decay = DISCOUNT * TRACE
+    first = error[0] + decay * error[1] + decay**2 * error[2]  # the episode ends here
+    fourth = error[3] + decay * error[4] + decay**2 * error[5]  # this one goes on
+    np.testing.assert_allclose(found[jnp.array([0, 2, 3])], [first, error[2], fourth], rtol=1e-5)
+
+
+def test_a_critic_learns_the_returns():
+    """Reward 1 after one step if the state is positive."""
+    state = jax.random.normal(jax.random.key(0), (4, 128, 3))
+    ended, done = jnp.ones((4, 128), bool), jnp.zeros((4, 128), bool)
+    reward = (state[..., 0] > 0).astype(jnp.float32)
+    steps, model = Steps(state, done, ended, done, reward), Critic.init(jax.random.key(1), 3, 1e-2)
+    learning = Learning(discount=DISCOUNT, trace=TRACE, critic_learning_rate=1e-2)
+    learn = jax.jit(critic.learn, static_argnums=4)
+    keys = jax.random.split(jax.random.key(2), 4)
+    for number in range(4):
+        advantages, model, metrics = learn(model, steps, state[0], keys[number], learning)
+    assert metrics["explained_variance"] > 0.8
+    assert jnp.abs(model(jnp.array([[2.0, 0, 0], [-2.0, 0, 0]])) - jnp.array([1, 0])).max() < 0.1
+    np.testing.assert_allclose([advantages.mean(), advantages.std()], [0, 1], atol=1e-3)
+    np.testing.assert_allclose(model.mean, state.mean((0, 1)), atol=1e-5)

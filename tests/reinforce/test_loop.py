@@ -1,0 +1,123 @@
+"""The loop: resuming, several devices, the best adapters, collapse."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.reinforce import loop, setting
+from lorasp_jax.reinforce.config import Learning
+from lorasp_jax.training import best
+from lorasp_jax.training.run import Callback
+from lorasp_jax.training.run_folder import read_metrics
+from tests.reinforce import rooms
+from tests.runs import Terminate, leaves
+
+
+@pytest.fixture(autouse=True)
+def room(monkeypatch):
+    monkeypatch.setattr(setting, "environment", lambda *_: rooms.Room())
+
+
+def train(folder, callbacks=(), *, resume=False, devices=1, **changes):
+    run = rooms.start(folder, rooms.config(**changes), devices)
+    loop.train(run, callbacks, resume=resume)
+    return run
+
+
+def adapters(run):
+    return leaves(adaptation.split(run.policy.model)[1])
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """An uninterrupted run."""
+    patch = pytest.MonkeyPatch()
+    patch.setattr(setting, "environment", lambda *_: rooms.Room())
+    yield train(tmp_path_factory.mktemp("whole"))
+    patch.undo()
+
+
+def test_a_run_logs_what_the_report_shows(whole):
+    rows = read_metrics(whole.folder)
+    assert [row["step"] for row in rows] == [1, 2, 3, 4]
+    assert np.all(np.diff([row["environment_steps"] for row in rows]) > 0)
+    assert np.all(np.diff([row["minutes"] for row in rows]) > 0)
+    names = {"rollout/press", "kl", "start_kl", "clipped", "explained_variance/press"}
+    assert names <= rows[0].keys()
+    assert rows[0]["start_kl"] < rows[-1]["start_kl"]
+
+
+def test_a_stopped_run_resumes_to_the_bit(whole, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path, [Terminate()])
+    assert len(read_metrics(tmp_path)) == 2
+    resumed = train(tmp_path, resume=True)
+    expected = adapters(whole)
+    for name, leaf in adapters(resumed).items():
+        np.testing.assert_array_equal(leaf, expected[name])
+    timed = ("minutes",)
+    first, second = (
+        [{k: v for k, v in row.items() if k not in timed} for row in read_metrics(run.folder)]
+        for run in (whole, resumed)
+    )
+    assert first == second
+
+
+def test_several_devices_learn_the_same(whole, tmp_path):
+    several = train(tmp_path, devices=4)
+    expected = adapters(whole)
+    for name, leaf in adapters(several).items():
+        np.testing.assert_allclose(leaf, expected[name], atol=2e-4, err_msg=name)
+
+
+class Judge(Callback):
+    """Evaluates as told."""
+
+    def __init__(self, *rates):
+        self.rates = rates
+        self.seen = {}
+
+    def on_log(self, run, step, metrics):
+        self.seen[step] = adapters(run)
+        return {"success/press": self.rates[step - 1]}
+
+
+def test_the_best_adapters_are_kept(tmp_path):
+    judge = Judge(0.2, 0.6, 0.4, 0.6)
+    run = train(tmp_path, [judge])
+    assert best.error(tmp_path) == pytest.approx(0.4)
+    for name, leaf in adapters(run).items():
+        np.testing.assert_array_equal(leaf, judge.seen[2][name])
+    assert "kept the adapters of iteration 2" in run.console.file.getvalue()
+
+
+def test_a_policy_far_from_the_start_stops_the_run(tmp_path):
+    learn = dataclasses.replace(rooms.config().online, max_start_kl=1e-6)
+    run = train(tmp_path, online=learn)
+    assert len(read_metrics(tmp_path)) == 1
+    said = run.console.file.getvalue().replace("\n", " ")
+    assert "stopped after iteration 1: the KL divergence from the start policy is" in said
+
+
+def test_lost_success_stops_the_run():
+    config = rooms.config()
+    values = {"rollout/press": 0.5, "steps": 3.0, "updates": 1}
+    clock = loop._Clock.__new__(loop._Clock)
+    clock._steps, clock._first, clock._began = 0, {}, 0.0
+    assert not clock.collapse(config, clock.count(values))
+    assert "fell from 50 % to 20 %" in clock.collapse(config, {"rollout/press": 0.2, "updates": 1})
+
+
+def test_imitation_of_successes_needs_no_critic(tmp_path):
+    train(tmp_path, online=Learning(worlds=8, std=5.0, max_start_kl=1e9))
+    rows = read_metrics(tmp_path)
+    assert not any("explained_variance/press" in row for row in rows)
+    assert any("task" in row for row in rows)
+
+
+def test_a_run_without_any_success_stops(tmp_path):
+    run = train(tmp_path, online=Learning(worlds=8, std=1e-3))
+    assert len(read_metrics(tmp_path)) == 1
+    assert "no episode succeeded" in run.console.file.getvalue()

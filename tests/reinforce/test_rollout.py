@@ -1,0 +1,65 @@
+"""Rollouts: what is recorded, layouts of groups, restarts."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lorasp_jax.reinforce import noise, rollout
+from tests.reinforce import rooms
+
+OPTIONS = {"execute_steps": 2, "denoise_steps": 2}
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory):
+    return rooms.start(tmp_path_factory.mktemp("run"), rooms.config()).policy
+
+
+def collect(policy, room, std=0.2):
+    return rollout.collect(room, policy, jax.random.key(4), std, **OPTIONS)
+
+
+def test_the_recorded_noise_gives_the_mean_of_the_actions(policy):
+    found = collect(policy, rooms.Room())
+    chunks, processor = found.chunks, policy.processor.shared()
+    inputs = chunks.observation, chunks.prompts, chunks.noise
+    means, _ = noise.means(policy.model, processor, *inputs, 2)
+    slots = noise.action_slots(processor)
+    z = ((chunks.actions - means[:, :2]) / 0.2)[..., slots]
+    assert z.shape == (16, 2, 7)
+    assert np.abs(z.mean()) < 0.2
+    assert 0.8 < z.std() < 1.2
+    assert chunks.observation["image"]["side"].dtype == np.uint8
+
+
+def test_steps_follow_the_worlds(policy):
+    found = collect(policy, rooms.Room())
+    steps = found.steps
+    actions = policy.processor.decode(found.chunks.actions, found.chunks.observation["state"])
+    actions = actions.reshape(2, 8, 2, 7).swapaxes(1, 2).reshape(4, 8, 7)
+    change = jnp.diff(steps.state[:2, :, :7], axis=0)[0]
+    running = ~np.asarray(steps.done[1])
+    np.testing.assert_allclose(change[running], 0.3 * actions[0][running], atol=1e-5)
+    np.testing.assert_allclose(
+        steps.state[:, running, 7][:2], [[0] * running.sum(), [0.25] * running.sum()]
+    )
+    assert found.last.shape == (8, 8)
+    np.testing.assert_array_equal(steps.reward * ~steps.done, steps.success & ~steps.done)
+
+
+def test_finished_worlds_restart(policy):
+    found = collect(policy, rooms.Room(max_steps=8), std=5.0)
+    ended = np.asarray(found.steps.ended & ~found.steps.done)
+    assert (ended.sum(0) >= 1).all()  # the first episode of every world is complete
+    assert ended.sum() > 8
+
+
+def test_steps_of_successes():
+    """World 0 succeeds, restarts and fails; world 1 fails; world 2 is cut off."""
+    ended = jnp.array([[0, 1, 1, 0, 1], [0, 0, 0, 1, 1], [0, 0, 0, 0, 0]], bool).T
+    done = jnp.array([[0, 0, 1, 0, 0], [0, 0, 0, 0, 1], [0, 0, 0, 0, 0]], bool).T
+    success = jnp.array([[0, 1, 1, 0, 0], [0, 0, 0, 0, 0], [0, 0, 0, 0, 0]], bool).T
+    steps = rollout.Steps(jnp.zeros((5, 3, 1)), done, ended, success, jnp.zeros((5, 3)))
+    expected = [[1, 1, 0, 0, 0], [0] * 5, [0] * 5]
+    np.testing.assert_array_equal(rollout.of_successes(steps).T, np.array(expected, bool))

@@ -1,0 +1,157 @@
+"""What a start run decides, and what is refused in one sentence."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from flax import nnx
+from rich.console import Console
+
+from lorasp_jax import models
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.cli.train import _resolved
+from lorasp_jax.config import ModelConfig
+from lorasp_jax.peft import LoRA
+from lorasp_jax.reinforce import setting, start
+from lorasp_jax.reinforce.config import Learning, ReinforceConfig
+from lorasp_jax.training import export
+from lorasp_jax.training.export import load_policy
+from lorasp_jax.training.finished_run import recorded_config
+from lorasp_jax.training.overrides import parse
+from lorasp_jax.training.run_folder import to_json, write_json
+from tests import ROOT
+from tests.reinforce import rooms
+from tests.runs import CONFIG, RESULTS, leaves, make_run
+
+FILE = str(ROOT / "configs/reinforce.py")
+
+
+@pytest.fixture(scope="module")
+def few(tmp_path_factory):
+    """A finished run with plain LoRA, whose base is saved beside it."""
+    folder = tmp_path_factory.mktemp("runs")
+    base = folder / "base"
+    model = ModelConfig(size="dummy", checkpoint=str(base))
+    config = dataclasses.replace(CONFIG, peft=LoRA(rank=4), model=model, tasks=("press",))
+    run = make_run(folder / "few", config)
+    graphdef, adapters, frozen = adaptation.split(run.policy.model)
+    rng = np.random.default_rng(0)
+    adapters = jax.tree.map(lambda x: x + 0.03 * rng.normal(size=x.shape).astype("f"), adapters)
+    run.policy = dataclasses.replace(run.policy, model=nnx.merge(graphdef, adapters, frozen))
+    models.save(base, adaptation.merge(_without(run.policy.model)))
+    write_json(run.folder / "config.json", to_json(config))
+    write_json(run.folder / "results.json", RESULTS)
+    export.write(run)
+    return run.folder
+
+
+def _without(model):
+    """Return the base of an adapted model: adapters that add nothing merge to it."""
+    graphdef, adapters, frozen = adaptation.split(model)
+    return nnx.merge(graphdef, jax.tree.map(lambda x: 0 * x, adapters), frozen)
+
+
+def resolve(*arguments) -> ReinforceConfig:
+    options = ["--config", FILE, "--scale", "smoke", "--evaluation.execute-steps", "2"]
+    options += map(str, arguments)
+    config = _resolved(parse(options)).config
+    assert isinstance(config, ReinforceConfig)
+    return config
+
+
+def test_the_start_run_decides(few):
+    config = resolve("--from", few, "--online.std", 0.2)
+    recorded = recorded_config(few)
+    for name in ("model", "robot", "tasks", "peft", "targets", "image_size"):
+        assert getattr(config, name) == getattr(recorded, name), name
+    assert (config.online.std, config.name) == (0.2, "reinforce")
+
+
+def test_a_run_is_recorded_and_read_again(few, tmp_path):
+    config = resolve("--from", few)
+    write_json(tmp_path / "config.json", to_json(config))
+    write_json(tmp_path / "results.json", RESULTS)
+    fields = [f.name for f in dataclasses.fields(CONFIG)]
+    recorded = recorded_config(tmp_path)
+    for name in fields:
+        assert getattr(recorded, name) == getattr(config, name), name
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--robot", "panda"], "--robot is that of .*few \\(piper\\): drop it"),
+        (["--model.size", "small"], "--model is that of .*few: drop it"),
+        (["--peft.rank", 2], "--peft is that of .*few: drop it"),
+        (["--tasks", "pour"], "few has learned press, not pour"),
+        (["--online.std", 0], "online.std must be above 0, got 0.0"),
+        (["--online.worlds", 0], "online.worlds must be at least 1, got 0"),
+        (["--online.discount", 1.5], "online.discount must lie in \\(0, 1\\], got 1.5"),
+        (["--online.method", "grpo"], "method"),
+        (["--method", "lora"], "--peft is that of .*few: drop it"),
+        (["--optim.ema", 0.9], "optim.ema is not for reinforcement learning: drop it"),
+        (["--dry-run"], "--dry-run is not for reinforcement learning: drop it"),
+        (["--fit", "16GB"], "--fit is not for reinforcement learning: drop it"),
+    ],
+)
+def test_bad_input_is_refused_in_a_sentence(few, arguments, message, capsys):
+    with pytest.raises((ValueError, SystemExit)) as caught:
+        resolve("--from", few, *arguments)
+    said = str(caught.value) + re.sub(r"[│\s]+", " ", capsys.readouterr().err)
+    assert re.search(message, said), said
+
+
+def test_runs_without_success_or_end_are_refused(few, tmp_path):
+    config = recorded_config(few)
+    write_json(tmp_path / "config.json", to_json(config))
+    with pytest.raises(ValueError, match="is not a finished run"):
+        resolve("--from", tmp_path)
+    write_json(tmp_path / "results.json", RESULTS | {"tasks": {}})
+    with pytest.raises(ValueError, match=r"the tasks of .* cannot be simulated"):
+        resolve("--from", tmp_path)
+
+
+def load(config, folder):
+    folder.mkdir()
+    return start.load(config, folder, Console(quiet=True), 0.0)
+
+
+def outputs(policy):
+    rng = np.random.default_rng(0)
+    image = {n: rng.integers(0, 255, (2, 32, 32, 3), np.uint8) for n in ("side", "wrist")}
+    raw = {"image": image, "state": rng.normal(size=(2, 7)).astype("f")}
+    return policy.sample(jax.random.key(0), raw, np.zeros(2, np.int32), num_steps=2)
+
+
+def test_adapters_go_on_and_are_exported(few, tmp_path):
+    run = load(resolve("--from", few), tmp_path / "run")
+    np.testing.assert_allclose(outputs(run.policy), outputs(load_policy(few)), atol=1e-5)
+    start.Export().on_end(run)
+    again = load_policy(run.folder)
+    np.testing.assert_array_equal(outputs(again), outputs(run.policy))
+
+
+def test_adapters_are_merged_under_new_ones(few, tmp_path):
+    config = resolve("--from", few, "--online.adapters", "merge", "--peft.rank", 2)
+    run = load(config, tmp_path / "run")
+    assert config.peft.rank == 2
+    np.testing.assert_allclose(outputs(run.policy), outputs(load_policy(few)), atol=0.05)
+    adapters = leaves(adaptation.split(run.policy.model)[1])
+    assert any(not leaf.any() for leaf in adapters.values())  # new ones add nothing
+    start.Export().on_end(run)
+    np.testing.assert_array_equal(outputs(load_policy(run.folder)), outputs(run.policy))
+
+
+def test_worlds_that_do_not_fit_are_refused():
+    learn = Learning(worlds=2**22)
+    with pytest.raises(ValueError, match=r"4194304 worlds .* choose fewer"):
+        setting.check_memory(rooms.config(online=learn), {"press": rooms.Room(num_envs=2**22)})
+
+
+def test_configs_files_load(tmp_path):
+    assert Path(FILE).exists()
+    for scale in ("smoke", "cpu", "accelerator"):
+        assert parse(["--config", FILE, "--scale", scale]).config.online.worlds
