@@ -179,10 +179,6 @@ class Worlds:
         actions, ranks = _predict()(self.policy, *inputs, denoise_steps=denoise_steps, **previous)
         return jax.device_put(actions, self._place), ranks
 
-    def observe(self) -> RawObservation:
-        """Return what the policy observes, see `Env.observe`."""
-        return _observe(self._env, self.state)
-
     def act(self, actions: jax.Array, execute_steps: int) -> Poses:
         """Execute the first actions of chunks `[W, C, J+1]`; return poses, see `_act`."""
         self.state, poses = _act(self._env, self.state, actions[:, :execute_steps])
