@@ -19,6 +19,14 @@ from lorasp_jax.training.run import Run
 from tests.runs import CONFIG, random_episodes
 
 
+@dataclasses.dataclass(frozen=True)
+class Inputs:
+    """A processor as far as evaluation looks into it, with rows of good, bad and plain prompts."""
+
+    prompts: Any
+    datasets: None = None
+
+
 @pytest.fixture
 def run(tmp_path, monkeypatch):
     monkeypatch.setattr(callback, "compiled_rollout", lambda _, task: (task, None))
@@ -28,7 +36,9 @@ def run(tmp_path, monkeypatch):
     run = Run(config, tmp_path, Console(file=io.StringIO()), "")
     run.episodes = {task: random_episodes(task, 0) for task in config.tasks}
     unused = cast(Any, None)
-    run.policy = Policy(Sampler([], unused, unused, ()), unused)
+    table = PromptTable(Ids(jnp.arange(3)[:, None], jnp.ones((3, 1), bool)), instructions=("go",))
+    inputs = cast(Any, Inputs(table))
+    run.policy = Policy(Sampler([], unused, unused, ()), inputs)
     return run
 
 
@@ -78,14 +88,6 @@ def test_rows_that_the_device_computes_wrongly_are_reported(run, monkeypatch):
     assert "warning: success depends on bit 0 of an episode's index" in run.console.file.getvalue()
 
 
-@dataclasses.dataclass(frozen=True)
-class Inputs:
-    """A processor as far as evaluation looks into it, of a prompt and one without its ending."""
-
-    prompts: Any
-    datasets: None = None
-
-
 def test_the_base_is_not_asked_for_good_actions(run, monkeypatch):
     """The trained policy is."""
     asked = []
@@ -95,8 +97,6 @@ def test_the_base_is_not_asked_for_good_actions(run, monkeypatch):
         return Result(0.5, episodes, (0.4, 0.6), (), 30.0, {}, {}, poses=(), draw=None)
 
     monkeypatch.setattr(callback, "evaluate", evaluate)
-    table = PromptTable(Ids(jnp.arange(3)[:, None], jnp.ones((3, 1), bool)), instructions=("go",))
-    run.policy = dataclasses.replace(run.policy, processor=cast(Any, Inputs(table)))
     evaluation = Evaluation(media=False)
     evaluation.on_start(run)
     evaluation.on_log(run, 120, {})
