@@ -74,14 +74,15 @@ class Episodes:
     corrected: Array | None = None
 
     def __repr__(self) -> str:
-        arrays = {name: getattr(self, name) for name in _ARRAYS} | self._labels
+        arrays = {name: getattr(self, name) for name in _ARRAYS} | self.labels
         arrays |= {_IMAGE + name: images for name, images in self.image.items()}
         fields = [f"{name}={_dtype_and_shape(array)}" for name, array in arrays.items()]
         fields += [f"{name}={getattr(self, name)!r}" for name in _METADATA]
         return f"Episodes({', '.join(fields)})"
 
     @property
-    def _labels(self) -> dict[str, Array]:
+    def labels(self) -> dict[str, Array]:
+        """`success` and `corrected`, those that are not None."""
         labels = {name: getattr(self, name) for name in _LABELS}
         return {name: array for name, array in labels.items() if array is not None}
 
@@ -108,7 +109,7 @@ class Episodes:
         self.validate()
         path = Path(path)
         header = json.dumps({name: getattr(self, name) for name in _METADATA}).encode()
-        named = {name: getattr(self, name) for name in _ARRAYS} | self._labels
+        named = {name: getattr(self, name) for name in _ARRAYS} | self.labels
         arrays: dict[str, Any] = {name: np.asarray(array) for name, array in named.items()}
         arrays |= {_IMAGE + name: np.asarray(images) for name, images in self.image.items()}
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -200,7 +201,7 @@ class Episodes:
             integers = values.shape == (episodes,) and np.issubdtype(values.dtype, np.integer)
             in_range = integers and values.min() >= low and values.max() <= high
             yield in_range, f"{name} must be {episodes} integers from {low} to {high}, got {values}"
-        for name, array in self._labels.items():
+        for name, array in self.labels.items():
             values = np.asarray(array)
             kind, size = (
                 (np.bool_, (episodes, steps)) if name == "corrected" else (np.int32, (episodes,))
@@ -288,7 +289,7 @@ def concatenate(parts: Sequence[Episodes]) -> Episodes:
         return np.concatenate([_pad(x, steps) for x in arrays])
 
     attempted = sum(part.attempted for part in parts)
-    labels = {name for part in parts for name in part._labels}
+    labels = {name for part in parts for name in part.labels}
     whole = (dataclasses.replace(part, attempted=attempted) for part in parts)
     return jax.tree.map(join, *(labelled(part, labels) for part in whole))
 

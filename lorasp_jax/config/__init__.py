@@ -332,8 +332,7 @@ class Config:
         _require(self.control_dt > 0, "control_dt must be above 0", self.control_dt)
         _require(0 <= self.seed < 2**32, "seed must lie in [0, 2**32)", self.seed)
         self.scene.check(self.control_dt)
-        if self.learn != "imitation" and not self.data.source:
-            raise ValueError(f"learn {self.learn} needs recordings with outcomes: add data.source")
+        self.recap.check(self.learn, bool(self.data.source))
         every, rule = self.data.fresh_every, "data.fresh_every must be a multiple of log_every"
         _require(every % self.log_every == 0, rule, f"{every} and {self.log_every}")
         unique = 0 < len(self.tasks) == len(set(self.tasks))

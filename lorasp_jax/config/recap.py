@@ -17,6 +17,13 @@ class RecapConfig:
     dropout: float = 0.3
     """Share of the steps that the policy learns without being told which are good."""
 
+    def check(self, learn: str, recorded: bool) -> None:
+        """Raise ValueError unless `Config.learn` fits these settings and whether data is given."""
+        if learn != "imitation" and not recorded:
+            raise ValueError(f"learn {learn} needs recordings with outcomes: add data.source")
+        if learn != "recap" and self != RecapConfig():
+            raise ValueError(f"recap has settings, which learn {learn} ignores: add learn recap")
+
     def __post_init__(self) -> None:
         fields.check_fields(self)
         if self.steps < 1:

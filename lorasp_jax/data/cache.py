@@ -41,6 +41,8 @@ ROWS = ("state", "action", "length", "instruction", "task")
 """Columns other than images: state and action per step, and the others per episode."""
 LABELS = ("success", "corrected")
 """Columns of outcomes per episode and of corrections per step, which older caches lack."""
+UNLABELLED = -2
+"""Outcome of episodes that have no label, as -1 is that of those whose label says unknown."""
 _IMAGE = "image_"
 _DTYPES = {"state": np.float32, "action": np.float32, "image": np.uint8, "corrected": np.bool_}
 METADATA = tuple(name for name in SHARED if name not in ("task", "instructions"))
@@ -153,7 +155,7 @@ class _Writer:
             self._extend(name, np.asarray(array)[0, :length])
         row = {"length": length, "instruction": self._instructions.index(phrase)}
         row["task"] = self._tasks.index(episode.task)
-        row["success"] = -1 if episode.success is None else int(episode.success[0])
+        row["success"] = UNLABELLED if episode.success is None else int(episode.success[0])
         for name, value in row.items():
             self._extend(name, np.array([value], np.int32))
         self.num_steps += length
@@ -193,7 +195,7 @@ class Cache:
         left_out: camera -> why it is not among the cameras.
         names, grippers: as in `LeRobot`; empty if the cache does not say.
         parts: the datasets that were joined, or one for all.
-        success: outcomes `[E]`, see `Episodes`; None: none is known.
+        success: outcomes `[E]`, see `Episodes`, or `UNLABELLED`; None: all are.
         corrected: bool `[N]`, steps in which a person took over; None: none.
     """
 
@@ -236,7 +238,7 @@ class Cache:
         }
         labels = (name for name in LABELS if name in self.metadata["crc32"])
         self._columns = {name: self._map(name) for name in (*ROWS, *labels)}
-        self.success: np.ndarray | None = self._known("success", -1)
+        self.success: np.ndarray | None = self._known("success", UNLABELLED)
         self.corrected: np.ndarray | None = self._known("corrected", False)
         self._end = np.cumsum(self._columns["length"], dtype=np.int64)
         with as_value_error(header):
@@ -279,6 +281,7 @@ class Cache:
         rows = slice(self._end[number] - self._columns["length"][number], self._end[number])
         row = slice(number, number + 1)
         selected = self.cameras if cameras is None else cameras
+        success = None if self.success is None else self.success[row]
         return Episodes(
             image={name: self._images[name][rows][None] for name in selected},
             state=self._columns["state"][None, rows],
@@ -286,7 +289,7 @@ class Cache:
             length=self._columns["length"][row],
             instruction=self._columns["instruction"][row],
             instructions=self.instructions,
-            success=None if self.success is None else self.success[row],
+            success=None if success is None or success[0] == UNLABELLED else success,
             corrected=None if self.corrected is None else self.corrected[None, rows],
             task=self.metadata["tasks"][self._columns["task"][number]],
             attempted=1,

@@ -100,7 +100,6 @@ class LeRobot:
         images = [key for key in self.cameras.values() if not self._is_video(key)]
         needed = (self.keys.state, self.keys.action, *_COLUMNS, *images)
         self._marks: list[str] = lerobot_features.marks(self.index.features)
-        needed = (*needed, *self._marks)
         self._needed = list(dict.fromkeys(needed))  # state and action may be the same feature
         self._videos: dict[str, VideoReader] = {}
         self._table: tuple[Path | None, Any] = None, None
@@ -208,7 +207,7 @@ class LeRobot:
         path, number = entry.table, entry.number
         with as_value_error(path):
             if self._table[0] != path:
-                self._table = path, read_table(path, self.path, self._needed)
+                self._table = path, read_table(path, self.path, self._needed, optional=self._marks)
             table = self._table[1]
             of_episode = lerobot_features.rows(table["episode_index"], 1)[:, 0] == number
             table = table.filter(pa.array(of_episode))
@@ -239,24 +238,30 @@ class LeRobot:
         angle = np.deg2rad(1) if self.keys.angles == "degrees" else 1
         length = 1e-3 if self.keys.gripper == "millimetres" else 1
         values = values * np.where(is_gripper, length, angle)
-        every = self.keys.every
-        # Each selected state is paired with the last action before the next selected state.
-        first = 0 if kind == "state" else every - 1
-        steps = np.minimum(np.arange(0, len(values), every) + first, len(values) - 1)
+        steps = self._selected(len(values), kind)
         with np.errstate(over="ignore"):  # overflows to inf, which is rejected later
             return values[steps].astype(np.float32)
 
+    def _selected(self, length: int, kind: str) -> np.ndarray:
+        """Return the frames that states or actions are taken from, of an episode's `length`."""
+        every = self.keys.every
+        # Each selected state is paired with the last action before the next selected state.
+        first = 0 if kind == "state" else every - 1
+        return np.minimum(np.arange(0, length, every) + first, length - 1)
+
     def _labels(self, table: Any, entry: EpisodeEntry) -> dict[str, Any]:
         """Return `Episodes.success` and `corrected`, those that the dataset has."""
-        with as_value_error(entry.table):
-            marks = {name: lerobot_features.rows(table[name], 1)[:, 0] > 0 for name in self._marks}
+        present = [name for name in self._marks if name in table.column_names]
+        with as_value_error(entry.table):  # null is read as NaN
+            marks = {name: lerobot_features.rows(table[name], 1)[:, 0] for name in present}
+        done, success = marks.pop(DONE, np.ones(1)), marks.pop(SUCCESS, None)
         labels: dict[str, Any] = {}
-        if SUCCESS in marks:
-            failed = 0 if marks.pop(DONE, np.ones(1, bool))[-1] else -1  # cut off: unknown
-            success = 1 if marks.pop(SUCCESS).any() else failed
-            labels["success"] = np.array([success], np.int32)
-        if others := [flags for name, flags in marks.items() if name != DONE]:
-            labels["corrected"] = np.any(others, axis=0)[None, :: self.keys.every]
+        if success is not None:
+            failed = 0 if success[-1] >= 0 and done[-1] > 0 else -1  # cut off or not said: unknown
+            labels["success"] = np.array([1 if (success > 0).any() else failed], np.int32)
+        if marks:
+            steps = self._selected(entry.length, "action")
+            labels["corrected"] = np.any([x[steps] > 0 for x in marks.values()], axis=0)[None]
         return labels
 
     def _instruction(self, table: Any, entry: EpisodeEntry) -> int:

@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-from envs.datasets.episodes import Episodes, joint_names
+from envs.datasets.episodes import Episodes, joint_names, labelled
 from lorasp_jax.base.locks import locked
 from lorasp_jax.base.writing import atomic_folder, write_text
 from lorasp_jax.data.lerobot_features import DONE, INTERVENTION, SUCCESS
@@ -55,8 +55,10 @@ def to_lerobot(source: Source, path: str | os.PathLike[str], progress: Progress)
     """
     with locked(Path(path)), atomic_folder(path) as folder:
         writer = _Writer(folder, source.control_dt, dimension_names(source))
-        for number in range(len(source)):
-            writer.append(source.episode(number))
+        numbers = range(len(source))
+        labels = {name for number in numbers for name in source.episode(number, ()).labels}
+        for number in numbers:
+            writer.append(labelled(source.episode(number), labels))
             progress(writer.steps, source.num_steps)
         writer.complete()
 

@@ -41,10 +41,19 @@ def pictures(features: Features) -> tuple[dict[str, str], dict[str, str]]:
 
 
 def marks(features: Features) -> list[str]:
-    """Return the features that mark success, the end of an episode and a person's corrections."""
+    """Return the features that mark success, the end of an episode and a person's corrections.
+
+    These are one number or truth value per frame; others of such names mean something else.
+    """
     ends = (INTERVENTION, f"is_{INTERVENTION}")  # the second in HIL-SERL's recordings
     known = (SUCCESS, DONE)
-    return [name for name in features if name in known or name.rpartition(".")[2] in ends]
+    return [
+        name
+        for name, feature in features.items()
+        if (name in known or name.rpartition(".")[2] in ends)
+        and feature["dtype"].startswith(("bool", "int", "uint", "float"))
+        and feature.get("shape") in (None, [], [1])
+    ]
 
 
 def _why_not_color(feature: Mapping[str, Any]) -> str:

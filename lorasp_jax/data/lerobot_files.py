@@ -205,7 +205,11 @@ def _file(folder: Path, info: Mapping[str, Any], name: str, **values: Any) -> Pa
 
 
 def read_table(
-    path: Path, folder: Path, columns: Sequence[str] | None = None, without: str = "\0"
+    path: Path,
+    folder: Path,
+    columns: Sequence[str] | None = None,
+    without: str = "\0",
+    optional: Sequence[str] = (),
 ) -> pa.Table:
     """Read a parquet file of a dataset.
 
@@ -214,6 +218,7 @@ def read_table(
         folder: the dataset's folder.
         columns: columns to read, or None for all.
         without: prefix of columns to skip.
+        optional: columns to read, too, if the file has them.
 
     Raises:
         Exception: any error that `as_value_error` converts.
@@ -225,6 +230,7 @@ def read_table(
         if missing := [name for name in columns or () if name not in names]:
             raise KeyError(missing[0])
         selected = [name for name in columns or names if not name.startswith(without)]
+        selected += [name for name in optional if name in names and name not in selected]
         check_memory(_size(file.metadata, set(selected)), path)
         return file.read(columns=selected)
 

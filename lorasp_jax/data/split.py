@@ -47,10 +47,10 @@ def held_out(
         raise ValueError(f"data.validation must be one number or episodes' names, got {choice}")
     number = float(choice[0])
     count = round(number if number >= 1 else max(number * len(tasks), number > 0))
-    if number < 0 or (number % 1 and number > 1) or count >= len(tasks):
+    if number < 0 or (number % 1 and number > 1) or 0 < count >= len(tasks):
         raise ValueError(
             f"data.validation must be a share below 1 or a number of episodes below {len(tasks)}, "
-            f"which is how many there are, got {choice[0]}"
+            f"which is how many {'there are' if among is None else 'succeeded'}, got {choice[0]}"
         )
     chosen = _spread(count, tasks, phrases)
     if count and not chosen:

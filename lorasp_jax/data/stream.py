@@ -84,6 +84,8 @@ def _order(steps: Steps, seed: int) -> Any:
     if steps.mixture is None:
         return shuffled(0, steps.num_starts, seed)
     bounds, shares = (np.asarray(array).tolist() for array in steps.mixture)
-    datasets = [shuffled(*pair, seed + i) for i, pair in enumerate(itertools.pairwise(bounds))]
-    weights = [round(100 * share / min(shares)) for share in shares]
+    pairs = [*itertools.pairwise(bounds)]
+    used = [i for i, share in enumerate(shares) if share]
+    datasets = [shuffled(*pairs[i], seed + i) for i in used]
+    weights = [round(100 * shares[i] / min(shares[j] for j in used)) for i in used]
     return grain.MapDataset.mix(datasets, weights)

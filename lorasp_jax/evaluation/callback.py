@@ -121,6 +121,10 @@ class Evaluation(Callback):
         progress_bars = bars(run.console, "episodes", shown=not episodes)
         with run.timed("evaluate"), progress_bars as progress:
             policy = run.policy.with_sampler()  # once for all tasks
+            if when == "before":  # the base knows no good or bad actions
+                inputs = policy.processor
+                inputs = dataclasses.replace(inputs, prompts=inputs.prompts.plain())
+                policy = dataclasses.replace(policy, processor=inputs)
             evaluate_task = functools.partial(
                 self._evaluate_task, run, policy, when, episodes, progress
             )

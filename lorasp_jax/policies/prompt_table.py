@@ -113,6 +113,15 @@ class PromptTable:
         start = Ids(*(jnp.asarray(array)[rows] for array in self.start))
         return dataclasses.replace(self, start=start, instructions=())
 
+    def plain(self) -> "PromptTable":
+        """Return the table whose first rows are instructions with the last ending, which is empty.
+
+        Programs that take this table take that one, too.
+        """
+        count = len(self.instructions)
+        start = Ids(*(jnp.roll(jnp.asarray(array), count, axis=0) for array in self.start))
+        return dataclasses.replace(self, start=start)
+
     def with_instructions(self, tokenizer: Tokenizer, instructions: Sequence[str]) -> "PromptTable":
         """Return a table of other instructions, as long as these.
 

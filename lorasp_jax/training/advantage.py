@@ -16,7 +16,7 @@ import numpy as np
 from lorasp_jax.base.files import as_value_error, check_regular
 from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.config import Config
-from lorasp_jax.data.batches import RawBatch, encode
+from lorasp_jax.data.batches import RawBatch, encode, gather
 from lorasp_jax.data.cache import Cache
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.policies.processor import Processor
@@ -95,9 +95,10 @@ def advantages(cache: Cache, chosen: Chosen, config: Config, observed: np.ndarra
     advantage = np.where(ahead < end, later, returns) - value
     good, compared = np.array(chosen.demonstrated[episode]), _compared(cache, chosen)
     for index in range(len(longest)):
-        rows = compared & (task[episode] == index)
-        if rows.any():
-            good[rows] = advantage[rows] > np.quantile(advantage[rows], 1 - recap.share)
+        rows = np.flatnonzero(compared & (task[episode] == index))
+        lots = np.random.default_rng(0).permutation(len(rows))  # among equal advantages
+        best = np.lexsort((lots, -advantage[rows]))[: round(recap.share * len(rows))]
+        good[rows[best]] = True
     if cache.corrected is not None:
         good |= cache.corrected
     correlation = _rank_correlation(value[known], returns[known])
@@ -128,15 +129,7 @@ def features(cache: Cache, model: Backbone, processor: Processor) -> np.ndarray:
     steps, rows = cache.steps, []
     for first in range(0, cache.num_steps, _BATCH):
         index = np.minimum(np.arange(first, first + _BATCH), cache.num_steps - 1)
-        raw = RawBatch(
-            image={name: image[index] for name, image in steps.image.items()},
-            state=steps.state[index],
-            actions=steps.action[index][:, None],
-            inside=np.ones((_BATCH, 1), bool),
-            instruction=steps.instruction[index],
-            dataset=None if steps.dataset is None else steps.dataset[index],
-        )
-        rows.append(np.asarray(_features(model, processor, raw)))
+        rows.append(np.asarray(_features(model, processor, gather(steps, index, 1))))
     return np.concatenate(rows)[: cache.num_steps]
 
 
@@ -184,7 +177,9 @@ def _held_out_fits(
 
 
 def _rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Spearman's correlation; equal values share a rank."""
+    """Spearman's correlation; equal values share a rank, and 0 if all are equal."""
+    if not np.ptp(a) or not np.ptp(b):
+        return 0.0
 
     def ranks(values: np.ndarray) -> np.ndarray:
         level, counts = np.unique(values, return_inverse=True, return_counts=True)[1:]

@@ -137,10 +137,15 @@ def load(run: Run, source: Source, free_bytes: float) -> None:
     learn = run.config.learn
     chosen = offline.choose(cache, run.config)
     among = None if learn == "imitation" else [n for n in chosen.successes if n < len(tasks)]
-    offline.check(chosen, tasks, (), learn)
+    offline.check(chosen, cache, (), learn)
     options = {"recorded": not run.simulated, "among": among}
-    run.held_out = [] if among == [] else held_out(data.validation, tasks, phrases, **options)
-    offline.check(chosen, tasks, run.held_out, learn)
+    run.held_out = held_out(data.validation, tasks, phrases, **options)
+    if among is not None and (wrong := sorted({*run.held_out} - {*among})):
+        raise ValueError(
+            f"data.validation names episode_{wrong[0]}, which did not succeed, so --learn {learn} "
+            "cannot be measured on it: name one that did"
+        )
+    offline.check(chosen, cache, run.held_out, learn)
     unused = {*run.held_out, *chosen.left_out}
     steps = corrected_only(without(cache.steps, unused), cache, {*chosen.corrected} - unused)
     run.dataset, run.chosen = mixed(steps, data), chosen
@@ -280,7 +285,8 @@ def mixed(steps: Steps, data: DataConfig) -> Steps:
     counts = _windows(steps)
     shares = np.array(data.weights or counts[: len(counts) - bool(data.replay)], float)
     shares *= (1 - data.replay) / shares.sum()
-    shares = np.append(shares, [data.replay] * bool(data.replay)).astype(np.float32)
+    shares = np.append(shares, [data.replay] * bool(data.replay)) * (counts > 0)
+    shares = (shares / shares.sum()).astype(np.float32)
     bounds = np.append(0, np.cumsum(counts)).astype(np.int32)
     return dataclasses.replace(steps, mixture=Mixture(bounds, shares))
 
@@ -296,9 +302,10 @@ def shares(steps: Steps, parts: Sequence[Part]) -> list[dict[str, Any]]:
 
 
 def _windows(steps: Steps) -> np.ndarray:
-    """Return the number of windows of each dataset, `[D]`."""
+    """Return the number of windows of each dataset, `[D]`, of which some may have none."""
     assert steps.dataset is not None
-    return np.bincount(steps.dataset if steps.starts is None else steps.dataset[steps.starts])
+    started = steps.dataset if steps.starts is None else steps.dataset[steps.starts]
+    return np.bincount(started, minlength=steps.dataset[-1] + 1)
 
 
 def is_simulated(tasks: Collection[str], robot: str, physics_dt: float) -> bool:

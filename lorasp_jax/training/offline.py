@@ -1,7 +1,7 @@
 """Learn from recordings with outcomes: which of their episodes and steps count.
 
-A dataset without outcomes or without failures holds demonstrations. Of an episode that does not
-count, the steps that a person corrected still do.
+A dataset without failures or corrections holds demonstrations, also one without labels, but not one
+whose labels all say unknown. Of an episode that does not count, corrected steps still do.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 
 from lorasp_jax.config import Config
-from lorasp_jax.data.cache import Cache
+from lorasp_jax.data.cache import UNLABELLED, Cache
 
 
 @dataclass(frozen=True)
@@ -21,12 +21,14 @@ class Chosen:
     Attributes:
         outcome: int `[E]`, 1 success, 0 failure, -1 unknown; demonstrations succeeded.
         demonstrated: bool `[E]`, episodes of demonstrations.
+        helped: bool `[E]`, episodes with corrected steps.
         left_out: numbers of the episodes that do not count.
         corrected: numbers of those of which only corrected steps count.
     """
 
     outcome: np.ndarray
     demonstrated: np.ndarray
+    helped: np.ndarray
     left_out: tuple[int, ...] = ()
     corrected: tuple[int, ...] = ()
 
@@ -42,14 +44,18 @@ def choose(cache: Cache, config: Config) -> Chosen:
     Raises:
         ValueError: the recordings have no outcomes, or recap has no failure to learn from.
     """
-    outcome = np.full(len(cache), -1) if cache.success is None else np.array(cache.success)
-    demonstrated = np.zeros(len(cache), bool)
+    said = np.full(len(cache), UNLABELLED) if cache.success is None else np.array(cache.success)
+    demonstrated, helped = np.zeros((2, len(cache)), bool)
+    if cache.corrected is not None:
+        helped[cache.episodes[cache.corrected]] = True
     for index in range(len(cache.parts)):
         rows = cache.dataset == index
-        demonstrated[rows] = (outcome[rows] == -1).all() or (outcome[rows] == 1).all()
+        policy = (said[rows] == 0).any() or helped[rows].any()
+        demonstrated[rows] = not policy and said[rows] != -1
+    outcome = np.maximum(said, -1)
     if config.learn == "imitation":
-        return Chosen(outcome, demonstrated)
-    if (outcome == -1).all():
+        return Chosen(outcome, demonstrated, helped)
+    if (said < 0).all() and not (config.learn == "filtered" and helped.any()):
         raise ValueError(
             f"{' '.join(config.data.source)} does not say which episodes succeeded, as --learn "
             f"{config.learn} needs: see docs/datasets.md"
@@ -58,33 +64,37 @@ def choose(cache: Cache, config: Config) -> Chosen:
     if config.learn == "recap" and not (outcome == 0).any():
         raise ValueError("no recorded episode failed, so --learn recap has nothing to compare")
     unused = outcome < (0 if config.learn == "recap" else 1)
-    helped = np.zeros(len(cache), bool)
-    if cache.corrected is not None:
-        helped[np.unique(cache.episodes[cache.corrected])] = True
     numbers = (np.flatnonzero(rows).tolist() for rows in (unused & ~helped, unused & helped))
-    return Chosen(outcome, demonstrated, *map(tuple, numbers))
+    return Chosen(outcome, demonstrated, helped, *map(tuple, numbers))
 
 
-def check(chosen: Chosen, tasks: Sequence[str], held_out: Sequence[int], learn: str) -> None:
-    """Raise ValueError if nothing good is left to learn from for one of the tasks `[E]`."""
+def check(chosen: Chosen, cache: Cache, held_out: Sequence[int], learn: str) -> None:
+    """Raise ValueError if nothing good is left to learn from for a task, or for its instructions.
+
+    Different datasets may call the same task differently.
+    """
     if learn == "imitation":
         return
-    good = {*chosen.successes, *chosen.corrected} - {*held_out}
-    for task in dict.fromkeys(tasks):
-        if not good & {number for number, name in enumerate(tasks) if name == task}:
+    good = (chosen.outcome == 1) | chosen.helped
+    good[[*held_out]] = False
+    episodes = [cache.episode(number, ()) for number in range(len(cache))]
+    tasks = np.array([episode.task for episode in episodes])
+    phrases = np.array([episode.instruction[0] for episode in episodes])
+    for task in cache.metadata["tasks"]:
+        if not good[(tasks == task) | np.isin(phrases, phrases[tasks == task])].any():
             raise ValueError(f"no episode of {task} succeeded, so --learn {learn} cannot learn it")
 
 
 def describe(chosen: Chosen, cache: Cache, learn: str, console: Console) -> None:
     """Print how many episodes count as what."""
     wins, failures, unknown = ((chosen.outcome == value).sum() for value in (1, 0, -1))
-    if not failures:
+    if not (failures or chosen.left_out or chosen.corrected):
         return
     text = f"{wins} successes, {failures} failures, {unknown} episodes without an outcome"
     if cache.corrected is not None:
         text += f", {cache.corrected.sum()} corrected steps"
     console.print(text, highlight=False)
-    names = [part.name for i, part in enumerate(cache.parts) if _all(chosen, cache, i)]
+    names = [part.name for i, part in enumerate(cache.parts) if _any(chosen, cache, i)]
     if learn == "imitation":
         text = "failures are imitated, too: --learn filtered leaves them out"
         console.print(text, style="yellow", highlight=False)
@@ -92,8 +102,8 @@ def describe(chosen: Chosen, cache: Cache, learn: str, console: Console) -> None
         console.print(f"demonstrations: {', '.join(names)}", highlight=False, markup=False)
 
 
-def _all(chosen: Chosen, cache: Cache, index: int) -> bool:
-    return bool(chosen.demonstrated[cache.dataset == index].all())
+def _any(chosen: Chosen, cache: Cache, index: int) -> bool:
+    return bool(chosen.demonstrated[cache.dataset == index].any())
 
 
 def run_ends(corrected: np.ndarray, end: np.ndarray) -> np.ndarray:

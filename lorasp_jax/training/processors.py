@@ -70,7 +70,10 @@ def of_datasets(
     slots: dict[str, Any] = {"slots": inputs.state_slots, "action_slots": inputs.action_slots}
     slots["dim"] = model_config.action_dim
     chunk = model_config.chunk
-    each = [_measure(group, model_config.inputs, chunk, **slots) for group in groups]
+    each = [
+        _measure(group, model_config.inputs, chunk, **slots) if group else inputs.statistics
+        for group in groups
+    ]
     each = each or [inputs.statistics] * len(parts)
     present = {
         name: jnp.array([name in part.cameras for part in parts])

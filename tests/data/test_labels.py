@@ -5,16 +5,18 @@ import json
 import shutil
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from rich.console import Console
 
 from envs.datasets import rlds
 from envs.datasets.episodes import Episodes, concatenate
 from lorasp_jax.base.digest import verify_digest, with_digest
-from lorasp_jax.data import cache, inspection, lerobot_export
+from lorasp_jax.data import cache, inspection, lerobot_export, lerobot_features
 from lorasp_jax.data.keys import Keys
 from lorasp_jax.data.lerobot import LeRobot
 from lorasp_jax.data.opening import open_source, open_sources
+from tests.data.lerobots import edit_rows
 from tests.runs import random_episodes
 
 OUTCOMES = [1, 0, -1]
@@ -130,3 +132,66 @@ def test_a_dataset_marks_corrections_from_its_first_episode_on(tmp_path):
     other.append(dataclasses.replace(labelled(), corrected=None))
     other.complete()
     assert labels_of(open_source(tmp_path / "other")) == (2 * OUTCOMES, CORRECTED)
+
+
+def test_a_correction_belongs_to_the_action_of_its_step(formats):
+    every = LeRobot(formats / "lerobot", Keys(every=4))  # with actions of frames 3, 7 and 8
+    assert labels_of(every)[1] == [(1, 1), (1, 2)]
+
+
+def edited(formats, folder, **columns):
+    """Copy the LeRobot dataset; give every frame of its first episode these values, or none."""
+    shutil.copytree(formats / "lerobot", folder)
+
+    def change(table):
+        for name, value in columns.items():
+            dotted = name.replace("__", ".")
+            table = table.drop_columns([dotted]) if dotted in table.column_names else table
+            if value is not None:
+                table = table.append_column(dotted, pa.array(len(table) * value))
+        return table
+
+    edit_rows(folder, change)
+    return LeRobot(folder)
+
+
+@pytest.mark.parametrize(
+    ("success", "outcome"),
+    [([None], -1), ([float("nan")], -1), ([-1], -1), ([0], 0), ([False], 0), ([1], 1)],
+)
+@pytest.mark.parametrize("done", [[True], None])
+def test_an_outcome_that_nobody_gave_is_unknown(success, outcome, done, formats, tmp_path):
+    values = pa.array(success).cast(pa.float64()).to_pylist()
+    found = edited(formats, tmp_path / "data", next__success=values, next__done=done)
+    assert found.episode(0, ()).success.tolist() == [outcome]
+    assert found.episode(1, ()).success.tolist() == [0]
+
+
+def test_a_mark_is_one_number_of_a_frame(formats, tmp_path):
+    """Features with the names of marks that are something else, or missing, are ignored."""
+    others = {
+        "is_intervention": {"dtype": "bool", "shape": [2]},
+        "annotation.intervention": {"dtype": "string", "shape": [1]},
+        "observation.images.intervention": {"dtype": "video", "shape": [8, 8, 3]},
+        "next.success": {"dtype": "string", "shape": [1]},
+    }
+    assert lerobot_features.marks(others) == []
+    assert lerobot_features.marks({"is_intervention": {"dtype": "float32"}}) == ["is_intervention"]
+    found = edited(formats, tmp_path / "data", next__success=None, intervention=None)
+    assert found.episode(0, ()).labels == {}
+    assert found.episode(1, ()).labels.keys() == {"success", "corrected"}
+
+
+def test_unlabelled_episodes_are_exported_with_labelled_ones(formats, tmp_path):
+    plain = edited(formats, tmp_path / "plain", next__success=None, intervention=None)
+    lerobot_export.to_lerobot(plain, tmp_path / "out", quietly)
+    assert labels_of(LeRobot(tmp_path / "out")) == ([-1, 0, -1], CORRECTED)
+
+
+def test_a_cache_tells_unlabelled_from_unknown(formats, tmp_path):
+    plain = edited(formats, tmp_path / "plain", next__success=None, intervention=None)
+    cache.write([plain], tmp_path / "cache", quietly)
+    found = cache.Cache(tmp_path / "cache")
+    assert found.success.tolist() == [cache.UNLABELLED, 0, -1]
+    assert found.episode(0, ()).success is None
+    assert found.episode(2, ()).success.tolist() == [-1]

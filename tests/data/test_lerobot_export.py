@@ -86,7 +86,7 @@ def test_refusals_leave_nothing(tmp_path):
     with pytest.raises(ValueError, match=r"33\.3"):
         to_lerobot(source, tmp_path / "dataset", silent)
     source, first = LeRobot(golden("v3")), LeRobot(golden("v3")).episode(0)
-    source.episode = lambda number: dataclasses.replace(first, robot=f"arm_{number}")
+    source.episode = lambda number, *_: dataclasses.replace(first, robot=f"arm_{number}")
     with pytest.raises(ValueError, match="episode 1"):
         to_lerobot(source, tmp_path / "dataset", silent)
     assert not list(tmp_path.iterdir())

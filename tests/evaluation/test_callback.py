@@ -5,6 +5,7 @@ import io
 import threading
 from typing import Any, cast
 
+import jax.numpy as jnp
 import pytest
 from rich.console import Console
 
@@ -13,8 +14,17 @@ from lorasp_jax.evaluation import Result, callback
 from lorasp_jax.evaluation.callback import Evaluation
 from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.policies.policy import Policy
+from lorasp_jax.policies.prompt_table import Ids, PromptTable
 from lorasp_jax.training.run import Run
 from tests.runs import CONFIG, random_episodes
+
+
+@dataclasses.dataclass(frozen=True)
+class Inputs:
+    """A processor as far as evaluation looks into it, with rows of good, bad and plain prompts."""
+
+    prompts: Any
+    datasets: None = None
 
 
 @pytest.fixture
@@ -26,7 +36,9 @@ def run(tmp_path, monkeypatch):
     run = Run(config, tmp_path, Console(file=io.StringIO()), "")
     run.episodes = {task: random_episodes(task, 0) for task in config.tasks}
     unused = cast(Any, None)
-    run.policy = Policy(Sampler([], unused, unused, ()), unused)
+    table = PromptTable(Ids(jnp.arange(3)[:, None], jnp.ones((3, 1), bool)), instructions=("go",))
+    inputs = cast(Any, Inputs(table))
+    run.policy = Policy(Sampler([], unused, unused, ()), inputs)
     return run
 
 
@@ -74,6 +86,21 @@ def test_rows_that_the_device_computes_wrongly_are_reported(run, monkeypatch):
     monkeypatch.setattr(callback, "evaluate", lambda *_, **__: result)
     Evaluation(media=False).on_log(run, 120, {})
     assert "warning: success depends on bit 0 of an episode's index" in run.console.file.getvalue()
+
+
+def test_the_base_is_not_asked_for_good_actions(run, monkeypatch):
+    """The trained policy is."""
+    asked = []
+
+    def evaluate(policy, env, key, episodes, **_):
+        asked.append(policy.processor.prompts)
+        return Result(0.5, episodes, (0.4, 0.6), (), 30.0, {}, {}, poses=(), draw=None)
+
+    monkeypatch.setattr(callback, "evaluate", evaluate)
+    evaluation = Evaluation(media=False)
+    evaluation.on_start(run)
+    evaluation.on_log(run, 120, {})
+    assert [int(prompts.start.ids[0, 0]) for prompts in asked] == [2, 2, 0, 0]
 
 
 def test_evaluation_can_be_disabled(run, monkeypatch):

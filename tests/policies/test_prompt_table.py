@@ -112,6 +112,8 @@ def test_endings_follow_every_instruction_and_must_fit():
     said = ["".join(map(chr, row[row > 0])) for row in np.asarray(table.start.ids)]
     assert said == ["lift+", "go+", "lift-", "go-", "lift", "go"]
     assert table.rows(["go"]).tolist() == [1]
+    plain = np.asarray(table.plain().start.ids)[:2]
+    assert ["".join(map(chr, row[row > 0])) for row in plain] == ["lift", "go"]
     asked = table.with_instructions(Letters(), ["put"]).start.ids[0]
     assert "".join(map(chr, np.asarray(asked)[:4])) == "put+"
     with pytest.raises(ValueError, match=r"'release' leaves no room for '[+]' in 6 tokens"):

@@ -15,8 +15,9 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import DataConfig
 from lorasp_jax.config.recap import RecapConfig
 from lorasp_jax.data import cache, lerobot_export
-from lorasp_jax.data.batches import gather
+from lorasp_jax.data.batches import draw, gather
 from lorasp_jax.data.opening import open_source
+from lorasp_jax.data.stream import Stream
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
 from lorasp_jax.peft import LoRA
@@ -220,6 +221,9 @@ def test_settings_that_make_no_sense(tmp_path):
     for learn in ("filtered", "recap"):
         with pytest.raises(ValueError, match=f"learn {learn} needs recordings"):
             dataclasses.replace(CONFIG, learn=learn)
+    data = DataConfig(str(tmp_path))
+    with pytest.raises(ValueError, match="recap has settings, which learn filtered ignores"):
+        dataclasses.replace(CONFIG, learn="filtered", data=data, recap=RecapConfig(share=0.4))
     wrong = {"steps": 0, "share": 1.0, "dropout": 1.0}
     for name, value in wrong.items():
         with pytest.raises(ValueError, match=f"recap.{name} must"):
@@ -280,6 +284,95 @@ def test_advantages_of_known_values(tmp_path, monkeypatch):
     assert set(np.flatnonzero(policy)) == set(np.argsort(found.advantage[:11])[-3:])
     assert found.good[11:14].all()
     assert not found.good[14:].any()
+
+
+def joined(folder, learn, data=None, **sources):
+    """Prepare a run on datasets by name."""
+    for name, episodes in sources.items():
+        if episodes.success is None:
+            lerobot_export.to_lerobot(Unlabelled(episodes), folder / name, lambda *_: None)
+        else:
+            rlds.write(episodes, folder / name)
+    paths = tuple(str(folder / name) for name in sources)
+    return prepare(folder, learn, data=DataConfig(paths, **{"validation": ("0",), **(data or {})}))
+
+
+UNKNOWN = np.full(3, -1, np.int32)
+
+
+@pytest.mark.parametrize("success", [None, UNKNOWN])
+def test_of_corrected_recordings_without_outcomes_the_corrections_count(success, tmp_path):
+    """Alone, and joined with others."""
+    hil = dataclasses.replace(labelled(1), success=success)
+    run = joined(tmp_path, "filtered", tries=labelled(), hil=hil)
+    assert run.steps.starts.tolist() == [0, 1, 2, 3, 4, 11, 12, 13, 32, 33, 34]
+    (tmp_path / "alone").mkdir()
+    alone = joined(tmp_path / "alone", "filtered", hil=hil)
+    assert alone.steps.starts.tolist() == [11, 12, 13]
+    assert "0 successes, 0 failures, 3 episodes" in alone.console.file.getvalue()
+
+
+def test_what_nobody_judged_is_no_demonstration(tmp_path):
+    unjudged = dataclasses.replace(labelled(1), success=UNKNOWN, corrected=None)
+    run = joined(tmp_path, "filtered", tries=labelled(), unjudged=unjudged)
+    assert run.steps.starts.max() == 13
+    assert "demonstrations" not in run.console.file.getvalue()
+
+
+def test_demonstrations_of_which_one_was_not_judged(tmp_path):
+    shown = dataclasses.replace(labelled(1, [1, 1, -1]), corrected=None)
+    run = joined(tmp_path, "filtered", tries=labelled(), shown=shown)
+    assert run.chosen.demonstrated.tolist() == [*3 * [False], True, True, False]
+    assert run.steps.starts.tolist() == [0, 1, 2, 3, 4, 11, 12, 13, *range(21, 35)]
+    assert "demonstrations: shown" in run.console.file.getvalue()
+
+
+@pytest.mark.parametrize("stream", [False, True])
+def test_a_policy_that_never_succeeded_is_joined_with_demonstrations(stream, tmp_path):
+    """Nothing of it is drawn, and where each dataset has its statistics, it has those of all."""
+    tries = dataclasses.replace(labelled(0, [0, 0, -1]), corrected=None)
+    shown = dataclasses.replace(random_episodes("press", 1), physics_dt=0.0)
+    data = {"weights": (1.0, 3.0), "statistics": "each"}
+    run = joined(tmp_path, "filtered", data, tries=tries, shown=shown)
+    assert run.steps.mixture.shares.tolist() == [0, 1]
+    drawn = (
+        next(Stream(run.steps, batch_size=64, chunk=1, seed=0))
+        if stream
+        else draw(jax.random.key(0), jax.device_put(run.steps), batch_size=64, chunk=1)
+    )
+    assert set(np.asarray(drawn.dataset).tolist()) == {1}
+
+
+def test_recap_learns_from_failures_with_corrections(tmp_path):
+    rlds.write(labelled(0, [0, 0, -1]), tmp_path / "data")
+    cache.write([open_source(tmp_path / "data")], tmp_path / "cache", lambda *_: None)
+    recordings = cache.Cache(tmp_path / "cache")
+    data = DataConfig(str(tmp_path / "data"))
+    config = dataclasses.replace(CONFIG, learn="recap", data=data)
+    chosen = offline.choose(recordings, config)
+    offline.check(chosen, recordings, (), "recap")
+    assert chosen.left_out == (2,)
+
+
+@pytest.mark.parametrize(
+    ("validation", "sentence"),
+    [
+        (("episode_1",), "names episode_1, which did not succeed, so --learn filtered cannot"),
+        (("1",), "number of episodes below 0, which is how many succeeded, got 1"),
+    ],
+)
+def test_failures_are_not_held_out(validation, sentence, tmp_path):
+    outcomes = [1, 0, -1] if validation == ("episode_1",) else [0, 0, -1]
+    with pytest.raises(ValueError, match=sentence):
+        joined(tmp_path, "filtered", {"validation": validation}, tries=labelled(0, outcomes))
+
+
+def test_equal_values_have_a_share_of_good_ones_and_no_correlation(folder, monkeypatch):
+    run = prepare(folder, "imitation")
+    monkeypatch.setattr(advantage, "_values", lambda x, *_: np.zeros(len(x)))
+    found = advantage.advantages(run.recordings, run.chosen, run.config, np.zeros((240, 1)))
+    assert found.good.mean() == pytest.approx(0.3)
+    assert found.correlation == 0
 
 
 def test_demonstrations_are_good(tmp_path):
