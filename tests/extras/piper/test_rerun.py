@@ -183,7 +183,7 @@ def test_a_stuck_viewer_delays_nothing_and_costs_bounded_memory(monkeypatch, cap
             viewer.line(0.02 * step, **TICK)
             viewer.observation(0.02 * step, {"image": {"side": picture}})
             worst = max(worst, time.perf_counter() - start)
-        assert worst < 0.1  # the threads of this process share its time
+        assert worst < 0.5  # the threads of this process share its time, and other tests the cores
         assert viewer._queue.qsize() <= rerun_log.MOST
         assert viewer.dropped > 1000
         pages = int(Path(f"/proc/{viewer._process.pid}/statm").read_text().split()[1])
