@@ -24,6 +24,8 @@ from lorasp_jax.peft import LoRASP
 from lorasp_jax.policies import tokenizer
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.prompt_table import PromptTable
+from lorasp_jax.training.base import TRAINING
+from lorasp_jax.training.export import BASE
 from lorasp_jax.training.rules import rules
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import MetricsLog, read_metrics, to_json, write_json
@@ -61,6 +63,12 @@ RESULTS = {
     "total_parameters": 1000,
 }
 """Contents of results.json."""
+
+
+def write_description(folder: Path, robot: str = CONFIG.robot) -> None:
+    """Write what a run that trained its base says of its policy's robot, without weights."""
+    (folder / BASE).mkdir()
+    write_json(folder / BASE / TRAINING, {"robot": robot})
 
 
 PROGRAMS: dict[Any, Any] = {}

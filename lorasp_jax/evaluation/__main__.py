@@ -1,6 +1,7 @@
 """Measure a finished run on recorded episodes, or record its own: `lorasp-jax evaluate --help`."""
 
 import argparse
+import dataclasses
 import functools
 import sys
 from collections.abc import Mapping, Sequence
@@ -11,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from lorasp_jax.base.arguments import positive
+from lorasp_jax.base.arguments import positive, seed
 from lorasp_jax.base.errors import run_command
 from lorasp_jax.data.__main__ import add_keys, keys_of
 
@@ -21,7 +22,9 @@ if TYPE_CHECKING:
 
 def main(arguments: Sequence[str], program: str = "lorasp-jax evaluate") -> int:
     """Run the command and return its exit code: 0, or one of `lorasp_jax.base.errors`."""
-    options = parser(program).parse_args(arguments)
+    own = parser(program)
+    options = own.parse_args(arguments)
+    _refuse_unused(own, options)
     command = record if options.record else evaluate
     return run_command(lambda: command(options, Console()), Console(stderr=True))
 
@@ -43,17 +46,27 @@ def parser(program: str) -> argparse.ArgumentParser:
     text = "with --record: episodes per task (default: %(default)s)"
     parser.add_argument("--rollouts", type=positive, default=64, metavar="N", help=text)
     text = "with --record: other layouts for another number (default: %(default)s)"
-    parser.add_argument("--seed", type=int, default=0, help=text)
+    parser.add_argument("--seed", type=seed, default=0, help=text)
     text = "for which of the run's datasets the policy acts, if they differ (default: the first)"
     parser.add_argument("--dataset", default="", metavar="NAME", help=text)
     text = "numbers of the episodes (default: all, or those of --dataset in a cache of several)"
     parser.add_argument("--episodes", nargs="+", type=int, metavar="N", help=text)
-    text = "flow-matching steps per chunk (default: %(default)s)"
-    parser.add_argument("--denoise-steps", type=int, default=10, metavar="N", help=text)
+    text = "flow-matching steps per chunk (default: 10; with --record: as in the run's evaluation)"
+    parser.add_argument("--denoise-steps", type=positive, metavar="N", help=text)
     text = "folder for the pictures (default: a folder of the run, named after the dataset)"
     parser.add_argument("--out", type=Path, help=text)
     add_keys(parser)
     return parser
+
+
+def _refuse_unused(own: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Exit, with a sentence, if an option is of the other command."""
+    given = {name for name, value in vars(options).items() if value != own.get_default(name)}
+    both, recording = {"run", "data", "record", "dataset", "denoise_steps"}, {"rollouts", "seed"}
+    unused = given - both - recording if options.record else given & recording
+    for name in sorted(unused):
+        other = "--record" if options.record else "--data"
+        own.error(f"argument --{name.replace('_', '-')}: not allowed with argument {other}")
 
 
 def evaluate(options: argparse.Namespace, console: Console) -> None:
@@ -76,9 +89,8 @@ def evaluate(options: argparse.Namespace, console: Console) -> None:
     if wrong := [number for number in numbers if not 0 <= number < len(source)]:
         raise ValueError(f"--episodes must be 0 to {len(source) - 1}, got {wrong[0]}")
     policy = export.load_policy(options.run, dataset=options.dataset)
-    found = held_out.measure(
-        policy, held_out.windows(source, numbers, policy), num_steps=options.denoise_steps
-    )
+    steps = {"num_steps": options.denoise_steps or 10}
+    found = held_out.measure(policy, held_out.windows(source, numbers, policy), **steps)
     console.print(_table("mean error", held_out.COLUMNS, held_out.table(found), 2))
     if len(found.instructions) > 1:
         title = "mean error by instruction [standard deviations]"
@@ -93,7 +105,6 @@ def evaluate(options: argparse.Namespace, console: Console) -> None:
     name = Path(options.data).name.removesuffix(".toml")
     folder = options.out or options.run / f"evaluate_{name}"
     folder.mkdir(parents=True, exist_ok=True)
-    steps = {"num_steps": options.denoise_steps}
     for path in held_out_figure.write(folder, policy, source, numbers, **steps):
         console.print(f"picture: {path}", soft_wrap=True, highlight=False, markup=False)
 
@@ -111,9 +122,15 @@ def record(options: argparse.Namespace, console: Console) -> None:
 
     cache.enable()
     config = finished_run.recorded_config(options.run)
-    policy, settings = export.load_policy(options.run), {"seed": options.seed}
-    for task in config.tasks:
-        folder = options.record / task
+    folders = {task: options.record / task for task in config.tasks}
+    if exists := next(filter(Path.exists, folders.values()), None):  # before hours of simulation
+        raise ValueError(f"{exists} already exists: choose another path")
+    if steps := options.denoise_steps:
+        evaluation = dataclasses.replace(config.evaluation, denoise_steps=steps)
+        config = dataclasses.replace(config, evaluation=evaluation)
+    policy = export.load_policy(options.run, dataset=options.dataset)
+    settings = {"seed": options.seed}
+    for task, folder in folders.items():
         with bars(console, "episodes") as progress:
             bar = progress.add_task(f"recording {task}", total=options.rollouts)
             settings |= {"progress": functools.partial(progress.advance, bar)}

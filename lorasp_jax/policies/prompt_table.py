@@ -123,7 +123,7 @@ class PromptTable:
         return dataclasses.replace(self, start=start)
 
     def with_instructions(self, tokenizer: Tokenizer, instructions: Sequence[str]) -> "PromptTable":
-        """Return a table of other instructions, as long as these.
+        """Return a table of other instructions, as long as these, with the first ending alone.
 
         Args:
             tokenizer: the tokenizer that the table was made with.
@@ -140,7 +140,8 @@ class PromptTable:
             starts = [prompts.pi05_start(text) for text in texts]
             ids, mask = _encode_complete(tokenizer, starts, max_tokens)
             start = ids[:, :max_tokens], mask[:, :max_tokens]
-        return dataclasses.replace(self, start=_ids(*start), instructions=tuple(instructions))
+        given = {"instructions": tuple(instructions), "endings": self.endings[:1]}
+        return dataclasses.replace(self, start=_ids(*start), **given)
 
     def encode(self, instruction: jax.Array, state: jax.Array) -> Ids:
         """Return the prompts `[B, T]`.

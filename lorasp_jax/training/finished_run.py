@@ -1,5 +1,6 @@
 """Read the config of a finished run."""
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -28,12 +29,14 @@ _GROUPS: dict[str, Any] = {
 
 
 def recorded_config(run: Path) -> Config:
-    """Return the config of a finished run.
+    """Return the config of a finished run, with the robot of its policy.
 
     Raises:
         ValueError: the run is not finished, its tasks cannot be simulated, or its config has
             settings that this version lacks.
     """
+    from lorasp_jax.training import export  # heavy, and finished studies need no run
+
     recorded = read_json(run / CONFIG_FILE, records.CONFIG)
     finished = read_json(run / "results.json", records.RESULTS)
     if not recorded or not finished:
@@ -41,9 +44,11 @@ def recorded_config(run: Path) -> Config:
     if not finished["tasks"]:
         raise ValueError(f"the tasks of {run} cannot be simulated")
     try:
-        return _from_json(recorded, tuple(finished["tasks"]))
+        config = _from_json(recorded, tuple(finished["tasks"]))
     except TypeError as error:
         raise ValueError(f"{run / CONFIG_FILE} has settings of another version: {error}") from error
+    # config.json is older than the dataset, which decides the robot.
+    return dataclasses.replace(config, robot=export.describe(run)["robot"])
 
 
 def _from_json(recorded: Mapping[str, Any], tasks: tuple[str, ...]) -> Config:

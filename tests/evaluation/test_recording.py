@@ -1,8 +1,10 @@
 """A policy's own episodes become a labelled dataset."""
 
 import dataclasses
+import re
 from types import SimpleNamespace
 from typing import ClassVar
+from unittest.mock import Mock, patch
 
 import jax
 import numpy as np
@@ -75,13 +77,44 @@ def test_a_dataset_has_as_many_as_wanted(tmp_path, monkeypatch):
 def test_the_command_says_how_many_succeeded(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(recording, "environment", lambda *_: LAB)
     monkeypatch.setattr("lorasp_jax.training.finished_run.recorded_config", lambda _: config())
-    monkeypatch.setattr("lorasp_jax.training.export.load_policy", lambda _: policy())
+    load = Mock(return_value=policy())
+    monkeypatch.setattr("lorasp_jax.training.export.load_policy", load)
     words = [str(tmp_path / "run"), "--record", str(tmp_path / "tries"), "--rollouts", "5"]
-    assert command.main(words) == 0
+    with patch.object(recording, "record", wraps=recording.record) as record:
+        assert command.main([*words, "--dataset", "mugs", "--denoise-steps", "3"]) == 0
     assert f"{tmp_path}/tries/press:" in capsys.readouterr().out
+    load.assert_called_once_with(tmp_path / "run", dataset="mugs")
+    assert record.call_args.kwargs["denoise_steps"] == 3
+
+
+def test_no_task_is_recorded_if_one_of_the_folders_exists(tmp_path, monkeypatch, capsys):
+    tasks = dataclasses.replace(config(), tasks=("pour", "press"))
+    monkeypatch.setattr("lorasp_jax.training.finished_run.recorded_config", lambda _: tasks)
+    load = Mock()
+    monkeypatch.setattr("lorasp_jax.training.export.load_policy", load)
+    (tmp_path / "press").mkdir()
+    assert command.main(["run", "--record", str(tmp_path)]) == 2
+    assert "press already exists" in " ".join(capsys.readouterr().err.split())
+    assert not load.called
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--record", "tries", "--data", "both"],
+        ["--record", "tries", "--episodes", "1"],
+        ["--record", "tries", "--out", "pictures"],
+        ["--record", "tries", "--angles", "degrees"],
+        ["--record", "tries", "--image-size", "0"],
+        ["--data", "mugs", "--rollouts", "5"],
+        ["--data", "mugs", "--seed", "1"],
+        ["--record", "tries", "--seed", "-1"],
+    ],
+)
+def test_options_that_would_not_count_are_refused(words, capsys):
     with pytest.raises(SystemExit):
-        command.main([str(tmp_path / "run"), "--record", "tries", "--data", "both"])
-    assert "not allowed with" in capsys.readouterr().err
+        command.main(["run", *words])
+    assert re.search(f"{words[2]}: (not allowed with|must be)", capsys.readouterr().err)
 
 
 def test_other_seeds_give_other_episodes():

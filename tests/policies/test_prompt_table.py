@@ -114,7 +114,8 @@ def test_endings_follow_every_instruction_and_must_fit():
     assert table.rows(["go"]).tolist() == [1]
     plain = np.asarray(table.plain().start.ids)[:2]
     assert ["".join(map(chr, row[row > 0])) for row in plain] == ["lift", "go"]
-    asked = table.with_instructions(Letters(), ["put"]).start.ids[0]
-    assert "".join(map(chr, np.asarray(asked)[:4])) == "put+"
+    asked = table.with_instructions(Letters(), ["put"])
+    assert "".join(map(chr, np.asarray(asked.start.ids[0])[:4])) == "put+"
+    assert asked.endings == ("+",)  # a row for each
     with pytest.raises(ValueError, match=r"'release' leaves no room for '[+]' in 6 tokens"):
         PromptTable.of(Letters(), ["release"], config, num_joints=6, endings=("+", "-", ""))

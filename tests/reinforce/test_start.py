@@ -24,7 +24,7 @@ from lorasp_jax.training.overrides import parse
 from lorasp_jax.training.run_folder import to_json, write_json
 from tests import ROOT
 from tests.reinforce import rooms
-from tests.runs import CONFIG, RESULTS, leaves, make_run
+from tests.runs import CONFIG, RESULTS, leaves, make_run, write_description
 
 FILE = str(ROOT / "configs/reinforce.py")
 
@@ -74,6 +74,7 @@ def test_a_run_is_recorded_and_read_again(few, tmp_path):
     config = resolve("--from", few)
     write_json(tmp_path / "config.json", to_json(config))
     write_json(tmp_path / "results.json", RESULTS)
+    write_description(tmp_path)
     fields = [f.name for f in dataclasses.fields(CONFIG)]
     recorded = recorded_config(tmp_path)
     for name in fields:

@@ -10,7 +10,7 @@ from lorasp_jax.extras.study.study import Derived, Study
 from lorasp_jax.peft import AdaLoRA, FullFineTuning, LoRASP
 from lorasp_jax.training.finished_run import recorded_config
 from lorasp_jax.training.run_folder import to_json, write_json
-from tests.runs import CONFIG, RESULTS
+from tests.runs import CONFIG, RESULTS, write_description
 
 TASKS = {task: RESULTS["tasks"]["press"] for task in CONFIG.tasks}
 
@@ -36,7 +36,8 @@ def test_configs_are_read_as_written(tmp_path, changes):
     config = dataclasses.replace(CONFIG, **changes)
     write_json(tmp_path / "config.json", to_json(config))
     write_json(tmp_path / "results.json", RESULTS | {"tasks": TASKS})
-    assert recorded_config(tmp_path) == config
+    write_description(tmp_path, robot="so100")  # that of the dataset
+    assert recorded_config(tmp_path) == dataclasses.replace(config, robot="so100")
 
 
 def test_unfinished_runs_are_refused(tmp_path):
@@ -60,6 +61,7 @@ def test_cells_of_a_run(tmp_path):
     run.mkdir()
     write_json(run / "config.json", to_json(CONFIG))
     write_json(run / "results.json", RESULTS | {"tasks": TASKS})
+    write_description(run)
     assert progress.read(study, tmp_path)["a"].state == CellState.RUNNABLE
     assert progress.read(known, tmp_path)["a"].state == CellState.FINISHED
     other = dataclasses.replace(known, cells=(dataclasses.replace(cell, settings={"delay": 4}),))

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from lorasp_jax.base.arguments import not_negative, pair
+from lorasp_jax.base.arguments import not_negative, pair, positive
 from lorasp_jax.base.errors import report_error, run_command
 from lorasp_jax.extras.piper import options as shared
 from lorasp_jax.extras.piper import remote
@@ -57,7 +57,7 @@ def parser(program: str) -> argparse.ArgumentParser:
         "the scene back [s]; default: until you press a key")  # fmt: skip
     add("--teach", choices=("hand", "leader"), help="record what a person shows the arm, guided by "
         "hand or through a leader arm, in place of a policy")  # fmt: skip
-    add("--image-size", type=int, default=224, help="of recorded pictures [px] (default: 224)")
+    add("--image-size", type=positive, default=224, help="of recorded pictures [px] (default: 224)")
     add = parser.add_argument_group("robot").add_argument
     add("--can", nargs="+", default=[], metavar="INTERFACE", help="CAN interface (default: can0); "
         "left=can0 right=can1 for two arms")  # fmt: skip
@@ -222,8 +222,11 @@ def _run_episode(
 
     problem = _execute(work, seconds, done)
     if verdict == TAKE and not problem:
-        verdict, keys, work = "", KEYS, _take_over(options, rig)
+        before, verdict, keys, work = work, "", KEYS, _take_over(options, rig)
         shared.stop_on_signals(work)
+        if before.stopped:  # while the arm braked
+            return verdict, before, None
+        print(f"take over: guide the arm by hand, then press a key: {QUESTION}", flush=True)
         problem = _execute(work, seconds, done)
     return verdict, work, problem
 
@@ -257,7 +260,6 @@ def _prepare(options: argparse.Namespace, rig: Rig, prompt: str) -> Session | Le
 def _take_over(options: argparse.Namespace, rig: Rig) -> Lesson:
     """Return the rest of a policy's episode, in which a person guides the arm by hand."""
     assert rig.recorder
-    print(f"take over: guide the arm by hand, then press a key: {QUESTION}", flush=True)
     how = {"way": "hand", "control_dt": shared.period(options), "corrects": True}
     return Lesson(rig.arms, rig.look, rig.recorder, RealClock(), **how)
 

@@ -62,6 +62,8 @@ class Lesson:
             Unsafe: feedback stops or is implausible, the arm reports a fault, there is no leader,
                 or a picture is missing.
         """
+        if self.stopped:
+            return
         try:
             if self._way == "hand":
                 self._arms.teach(True)

@@ -195,9 +195,8 @@ def plausible_states(processor: Processor) -> np.ndarray:
 def without_prompts(policy: Policy) -> Policy:
     """Return the policy with prepared weights and a table of no instructions."""
     prompts = policy.processor.prompts
-    empty = dataclasses.replace(
-        prompts, start=Ids(*(a[:0] for a in prompts.start)), instructions=()
-    )
+    start = Ids(*(a[:0] for a in prompts.start))
+    empty = dataclasses.replace(prompts, start=start, instructions=(), endings=("",))
     processor = dataclasses.replace(policy.processor, prompts=empty)
     return dataclasses.replace(policy, processor=processor).with_sampler()
 

@@ -14,7 +14,7 @@ from lorasp_jax.extras.latency.execution import EXECUTIONS, Trace
 from lorasp_jax.extras.study import results, run_cell
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run_folder import read_json, to_json, write_json
-from tests.runs import CONFIG, RESULTS, finish
+from tests.runs import CONFIG, RESULTS, finish, write_description
 
 SETTINGS = dataclasses.replace(CONFIG.evaluation, episodes=4, num_envs=2, denoise_steps=3)
 TASK = RESULTS["tasks"]["press"]
@@ -44,6 +44,7 @@ def folder(tmp_path, monkeypatch):
     optim = dataclasses.replace(CONFIG.optim, rtc_max_delay=1)
     config = dataclasses.replace(CONFIG, evaluation=SETTINGS, optim=optim)
     write_json(folder / "config.json", to_json(config))
+    write_description(folder)
     policy = SimpleNamespace(with_sampler=lambda: None)
     monkeypatch.setattr(run_cell, "_source", lambda run: policy)
     monkeypatch.setattr(curve, "delayed_rollout", played)
@@ -93,6 +94,7 @@ def test_a_figure_of_several_runs(folder, tmp_path, monkeypatch):
     (tmp_path / "other").mkdir()
     other = finish(tmp_path / "other")
     write_json(other / "config.json", read_json(folder / "config.json"))
+    write_description(other)
     command.main([str(folder), "--executions", "naive", "--delays", "0", "1", "--tasks", "press"])
     path = tmp_path / "both.svg"
     options = ["--delays", "0", "1", "--tasks", "press", "--figure", str(path)]

@@ -14,6 +14,7 @@ from lorasp_jax.extras.piper import remote
 from lorasp_jax.extras.piper.__main__ import main as real
 from lorasp_jax.extras.piper.fake import __main__ as faking
 from lorasp_jax.extras.piper.fake.__main__ import main as fake
+from lorasp_jax.extras.piper.session import Session
 from lorasp_jax.extras.serving import jpeg
 from lorasp_jax.extras.serving.client import PolicyClient
 from tests.cases import mostly_slow
@@ -83,6 +84,19 @@ def test_a_served_policy_on_the_fake_arm(server, tmp_path, capsys, limit, more):
     assert "episode 0: failure\n" in capsys.readouterr().out
     assert server.policy.last_request.images["wrist"].shape == (16, 16, 3)
     assert server.policy.last_request.prompt
+
+
+@pytest.mark.usefixtures("patient")
+@pytest.mark.parametrize(("problem", "outcome"), [(None, 0), ("the server did not answer", -1)])
+def test_a_problem_is_no_failure_of_the_policy(
+    problem, outcome, server, tmp_path, limit, monkeypatch
+):
+    limit(0.5)
+    run = Session.run
+    monkeypatch.setattr(Session, "run", lambda *given: run(*given) or problem)
+    words = ["--server", server.address, "--log", str(tmp_path / "log")]
+    assert fake([*words, "--record", str(tmp_path / "data")]) == 0
+    assert open_source(tmp_path / "data").episode(0).success.tolist() == [outcome]
 
 
 @pytest.mark.usefixtures("patient")
@@ -242,6 +256,8 @@ def test_the_fake_arm_refuses_wrong_options(words, message, tmp_path, capsys):
         (fake, ["--noise", "-1"]),
         (fake, ["--seed", "-1"]),
         (fake, ["--execute", "0"]),
+        (fake, ["--image-size", "0"]),
+        (real, ["--image-size", "0"]),
         (real, ["--seconds", "inf"]),
         (real, ["--reset-time", "nan"]),
     ],

@@ -155,6 +155,26 @@ def test_a_person_takes_over_by_hand(server, linked, tmp_path, press_keys, monke
     assert flags[-flags.sum() :].all()  # the person acts until the end
 
 
+def test_a_signal_while_the_arm_brakes_ends_a_take_over(
+    server, linked, tmp_path, press_keys, monkeypatch, capsys
+):
+    settle, taught = Session._settle, Mock()
+
+    def interrupted(session):
+        signal.raise_signal(signal.SIGINT)
+        settle(session)
+
+    monkeypatch.setattr(Session, "_settle", interrupted)
+    monkeypatch.setattr(LinkedArm, "teach", taught)
+    keys = press_keys([*400 * [""], "t"], "q")
+    words = ["--server", server.address, *linked, "--seconds", "30", "--image-size", "16"]
+    words += ["--record", str(tmp_path / "data"), "--log", str(tmp_path / "log")]
+    assert real(words) == 0
+    assert not taught.called
+    assert "take over" not in capsys.readouterr().out
+    assert keys.questions == [command.QUESTION]
+
+
 def test_a_key_ends_an_episode(server, linked, tmp_path, press_keys, capsys):
     keys = press_keys(["f", "f", "", "", "x", "s"], "")
     words = ["--server", server.address, *linked, "--seconds", "60", "--episodes", "2"]

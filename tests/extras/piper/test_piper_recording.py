@@ -1,6 +1,7 @@
 """Recording episodes: of a policy, of a hand, of a leader; the dataset feeds training."""
 
 import json
+from unittest.mock import patch
 
 import can
 import numpy as np
@@ -105,6 +106,14 @@ def test_a_leaders_targets_are_the_actions(bench, tmp_path):
     action = only_episode(tmp_path / "data").action[0]
     np.testing.assert_allclose(np.diff(action[:, 0]), 0.02, atol=1e-4)
     leader.shutdown()
+
+
+def test_a_lesson_that_was_stopped_before_it_began_leaves_the_arm_alone(bench, tmp_path):
+    teacher = lesson(bench, recording(tmp_path / "data"), "hand")
+    teacher.stop()
+    with patch.object(bench.arms, "teach") as teach:
+        teacher.run(1.0)
+    assert not teach.called
 
 
 def test_a_lesson_without_a_leader_is_refused(bench, tmp_path):

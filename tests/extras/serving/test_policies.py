@@ -212,6 +212,17 @@ def test_a_prompt_table_for_other_instructions_is_the_same_as_a_new_one():
             np.testing.assert_array_equal(a, b)
 
 
+def test_policies_with_and_without_endings_make_one_program():
+    def structure(endings):
+        policy = make_policy()
+        prompts = dataclasses.replace(policy.processor.prompts, endings=endings)
+        processor = dataclasses.replace(policy.processor, prompts=prompts)
+        bare = policies.without_prompts(dataclasses.replace(policy, processor=processor))
+        return jax.tree.structure(bare.processor)
+
+    assert structure(("",)) == structure((" good", " bad", ""))
+
+
 def test_a_state_that_no_demonstration_had_is_logged_once(caplog):
     served = compiled({"a": make_policy()}, max_batch=1)
     spec = served.spec

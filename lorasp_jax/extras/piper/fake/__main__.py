@@ -14,7 +14,7 @@ from rich.console import Console
 
 from envs.rendering.video import side_by_side, write_video
 from lorasp_jax.base import compilation_cache as cache
-from lorasp_jax.base.arguments import not_negative, seed
+from lorasp_jax.base.arguments import not_negative, positive, seed
 from lorasp_jax.base.errors import run_command
 from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.extras.piper import options as shared
@@ -65,8 +65,8 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--noise", type=not_negative, default=2e-4, help="of measured angles [rad] "
         "(default: %(default)s)")  # fmt: skip
     add("--realtime", action="store_true", help="let time run while the policy thinks")
-    add("--image-size", type=int, default=64, help="of pictures [px], for policies that do not "
-        "say it (default: %(default)s)")  # fmt: skip
+    add("--image-size", type=positive, default=64, help="of pictures [px], for policies that do "
+        "not say it (default: %(default)s)")  # fmt: skip
     add("--video", type=Path, metavar="FILE", help="MP4 of what the cameras see")
     shared.add_shared(parser)
     return parser
@@ -122,7 +122,8 @@ def _episodes(
         stopped = world.success or session.stopped
         ended = "" if stopped or not server else server.ended
         if recorder:
-            _keep(recorder, world.success, failed=bool(server) and not (ended or session.stopped))
+            lost = not server or bool(ended) or session.stopped
+            _keep(recorder, world.success, lost=lost, problem=problem)
         if ended:
             before = f"before, {_result(wins, episode)}" if episode else "no episode was judged"
             raise ServerGone(f"stopped in episode {episode}, as {ended}; {before}")
@@ -133,10 +134,13 @@ def _episodes(
     console.print(_result(wins, options.episodes))
 
 
-def _keep(recorder: Recording, success: bool, *, failed: bool) -> None:
-    """Record a success, or a policy's failure; forget what was cut short, or the expert's."""
-    if recorder.steps and (success or failed):
-        recorder.keep(success)
+def _keep(recorder: Recording, success: bool, *, lost: bool, problem: str | None) -> None:
+    """Record a success, or a policy's failure; forget what was cut short, or the expert's.
+
+    A problem says nothing of the policy: the outcome is then unknown.
+    """
+    if recorder.steps and (success or not lost):
+        recorder.keep(success or (None if problem else False))
     else:
         recorder.discard()
 
