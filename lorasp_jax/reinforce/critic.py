@@ -4,6 +4,7 @@ It sees what the policy cannot see, since it is thrown away after training (asym
 arXiv 1710.06542), and uses no adapters.
 """
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -112,12 +113,8 @@ def learn(
     mean = moment(states)
     std = jnp.sqrt(moment(jnp.square(states - mean)))
     new = jnp.all(critic.std == 0)
-    critic = Critic(
-        critic.layers,
-        critic.opt_state,
-        jnp.where(new, mean, critic.mean),
-        jnp.where(new, std, critic.std),
-    )
+    mean, std = jnp.where(new, mean, critic.mean), jnp.where(new, std, critic.std)
+    critic = dataclasses.replace(critic, mean=mean, std=std)
     values = critic(states)
     outcome = steps.reward, steps.ended, learning.discount, learning.trace
     advantages = generalized_advantages(values, critic(last), *outcome)
