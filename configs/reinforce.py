@@ -15,7 +15,6 @@ def get_config(scale: str) -> ReinforceConfig:
     """Return the config at `scale`: smoke, cpu or accelerator."""
     worlds = {"smoke": 16, "cpu": 128, "accelerator": 256}[scale]
     episodes = {"smoke": 16, "cpu": 64, "accelerator": 256}[scale]
-    rate = 1e-3
     return ReinforceConfig(
         name="reinforce",
         scale=scale,
@@ -24,12 +23,9 @@ def get_config(scale: str) -> ReinforceConfig:
         optim=OptimConfig(
             steps={"smoke": 2, "cpu": 12, "accelerator": 100}[scale],
             batch_size={"smoke": 16, "cpu": 64, "accelerator": 256}[scale],
-            learning_rate=rate,
-            final_learning_rate=rate,
-            warmup_steps=10,
+            learning_rate=1e-3,
         ),
         evaluation=EvaluationConfig(episodes=episodes, num_envs=episodes, every=2),
         online=Learning(worlds=worlds),
-        log_every=1,
         checkpoint_every={"smoke": 1, "cpu": 1, "accelerator": 10}[scale],
     )

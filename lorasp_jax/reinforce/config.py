@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from lorasp_jax.config import Config, OptimConfig
+from lorasp_jax.config import Config
 from lorasp_jax.peft import fields
 
 
@@ -36,8 +36,8 @@ class Learning:
     epochs: int = 8
     """Passes over the chunks of an iteration."""
     max_kl: float = 0.02
-    """An iteration ends when an action's mean KL divergence from the policy that acted exceeds
-    this."""
+    """With ppo, a step whose mean KL divergence per action from the policy that acted exceeds this
+    is undone and ends the iteration."""
     max_start_kl: float = 300.0
     """The run stops when an action's mean KL divergence from the start policy exceeds this."""
     critic_learning_rate: float = 1e-3
@@ -56,21 +56,43 @@ class Learning:
                 raise ValueError(f"online.{name} must lie in (0, 1], got {getattr(self, name)}")
 
 
+_IGNORED = {
+    "reinforcement learning": (
+        *("optim.accumulate", "optim.ema", "optim.warmup_steps", "optim.final_learning_rate"),
+        *("recap.steps", "recap.share", "recap.dropout", "learn", "keep", "log_every"),
+        *("auxiliary.warmup", "evaluation.before"),  # the start is a candidate for the best policy
+    ),
+    "imitate": (
+        *("online.reward", "online.discount", "online.trace", "online.clip", "online.max_kl"),
+        "online.critic_learning_rate",
+    ),
+    "ppo": ("optim.spike", "optim.state_noise", "optim.time_shape", "optim.rtc_max_delay"),
+}
+"""Settings that must keep their defaults, in all runs or by method."""
+
+
 @dataclass(frozen=True)
 class ReinforceConfig(Config):
     """One run of online reinforcement learning; a step is an iteration of rollout and update.
 
-    `optim.batch_size` are the chunks of a gradient step.
+    `optim.batch_size` are the chunks of a gradient step. The learning rate is constant.
     """
 
     online: Learning = field(default_factory=Learning)
     """What is learned, and how."""
+    log_every: int = 1
+    """Iterations between log entries."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("accumulate", "ema"):
-            if getattr(self.optim, name) != getattr(OptimConfig, name):
-                raise ValueError(f"optim.{name} is not for reinforcement learning: drop it")
+        for what in ("reinforcement learning", self.online.method):
+            for name in _IGNORED[what]:
+                group, _, field_name = name.rpartition(".")
+                owner = getattr(self, group) if group else self
+                if getattr(owner, field_name) != getattr(type(owner), field_name):
+                    raise ValueError(f"{name} is not for {what}: drop it")
+        if self.data.source and not self.online.start:
+            raise ValueError("data.source is not for reinforcement learning: drop it")
 
     def evaluates(self, step: int) -> bool:
         """Whether to evaluate after an iteration: as the config says, and after the last one."""

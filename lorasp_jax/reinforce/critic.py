@@ -4,6 +4,7 @@ It sees what the policy cannot see, since it is thrown away after training (asym
 arXiv 1710.06542), and uses no adapters.
 """
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,8 @@ from lorasp_jax.reinforce.rollout import Steps
 _WIDTH, _BATCH, _STEPS = 64, 512, 100  # our choice, as in examples/ppo.py
 _LIMIT = 5.0
 """Normalized states are clipped to this magnitude."""
+_LEAST = 0.05
+"""Advantages are divided by their standard deviation, but not by less: this would scale noise."""
 
 
 @jax.tree_util.register_dataclass
@@ -102,35 +105,45 @@ def learn(
         learning: γ, λ and the critic's learning rate.
 
     Returns:
-        `[T, W]` advantages, of mean 0 and variance 1 where an episode runs, and 0 elsewhere.
+        `[T, W]` advantages, of mean 0 and variance at most 1 where an episode runs, else 0.
     """
     running = ~steps.done
-    count = jnp.sum(running)
-    moment = lambda x: jnp.sum(x * running[..., None], (0, 1)) / count  # noqa: E731
-    mean = moment(steps.state)
-    std = jnp.sqrt(moment(jnp.square(steps.state - mean)))
+    states, last = (jnp.nan_to_num(x, posinf=0.0, neginf=0.0) for x in (steps.state, last))
+    moment = lambda x: jnp.sum(x * running[..., None], (0, 1)) / jnp.sum(running)  # noqa: E731
+    mean = moment(states)
+    std = jnp.sqrt(moment(jnp.square(states - mean)))
     new = jnp.all(critic.std == 0)
-    critic = Critic(
-        critic.layers,
-        critic.opt_state,
-        jnp.where(new, mean, critic.mean),
-        jnp.where(new, std, critic.std),
-    )
-    values = critic(steps.state)
+    mean, std = jnp.where(new, mean, critic.mean), jnp.where(new, std, critic.std)
+    critic = dataclasses.replace(critic, mean=mean, std=std)
+    values = critic(states)
     outcome = steps.reward, steps.ended, learning.discount, learning.trace
     advantages = generalized_advantages(values, critic(last), *outcome)
     targets = advantages + values
-    optimizer = optax.adam(learning.critic_learning_rate)
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (steps.state, targets, running))
+    fitted, errors = _fit(critic, (states, targets, running), key, learning.critic_learning_rate)
+    variance = lambda x: jnp.var(x, where=running)  # noqa: E731
+    metrics = {
+        "critic_error": jnp.mean(errors),
+        "explained_variance": 1 - variance(targets - values) / (variance(targets) + 1e-8),
+    }
+    centered = advantages - jnp.mean(advantages, where=running)
+    scaled = centered / jnp.maximum(jnp.std(advantages, where=running), _LEAST)
+    return jnp.where(running, scaled, 0), fitted, metrics
+
+
+def _fit(
+    critic: Critic, data: tuple[jax.Array, ...], key: jax.Array, rate: float
+) -> tuple[Critic, jax.Array]:
+    """Fit states `[T, W, D]` to targets `[T, W]` where a mask is set; return the errors, too."""
+    optimizer = optax.adam(rate)
+    states, targets, running = (x.reshape(-1, *x.shape[2:]) for x in data)
 
     def step(carry: tuple[Any, Any], key: jax.Array) -> tuple[Any, jax.Array]:
         layers, opt_state = carry
-        rows = jax.random.choice(key, len(flat[0]), (_BATCH,), p=flat[2] / count)
-        states, wanted = flat[0][rows], flat[1][rows]
+        rows = jax.random.choice(key, len(states), (_BATCH,), p=running / jnp.sum(running))
 
         def loss(layers: Any) -> jax.Array:
-            predicted = Critic(layers, None, critic.mean, critic.std)(states)
-            return jnp.mean(jnp.square(predicted - wanted))
+            predicted = Critic(layers, None, critic.mean, critic.std)(states[rows])
+            return jnp.mean(jnp.square(predicted - targets[rows]))
 
         error, gradient = jax.value_and_grad(loss)(layers)
         updates, opt_state = optimizer.update(gradient, opt_state)
@@ -138,12 +151,4 @@ def learn(
 
     learned = (critic.layers, critic.opt_state)
     (layers, opt_state), errors = jax.lax.scan(step, learned, jax.random.split(key, _STEPS))
-    variance = lambda x: jnp.var(x, where=running)  # noqa: E731
-    metrics = {
-        "critic_error": jnp.mean(errors),
-        "explained_variance": 1 - variance(targets - values) / (variance(targets) + 1e-8),
-    }
-    centered = advantages - jnp.mean(advantages, where=running)
-    scaled = centered / (jnp.std(advantages, where=running) + 1e-8)
-    new = Critic(layers, opt_state, critic.mean, critic.std)
-    return jnp.where(running, scaled, 0), new, metrics
+    return Critic(layers, opt_state, critic.mean, critic.std), errors

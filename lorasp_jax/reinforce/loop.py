@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lorasp_jax.base.bars import bars
+from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.reinforce import critic, noise, rollout, update
 from lorasp_jax.reinforce.config import ReinforceConfig
 from lorasp_jax.reinforce.rollout import Rollout
@@ -76,7 +77,7 @@ def _loop(
         bars(run.console, "iterations") as progress,
     ):
         bar = progress.add_task("compiling ...", total=total, completed=saved)
-        reason = ""
+        reason = clock.collapse(config, clock.last) if clock.last else ""
         while (done := int(state.step)) < total and not reason and not stop.requested:
             state, values = iterate(setting, state)
             done += 1
@@ -112,9 +113,9 @@ class _Clock:
 
     def __init__(self, run: Run, saved: int) -> None:
         rows = [row for row in read_metrics(run.folder) if row["step"] <= saved]
-        last = rows[-1] if rows else {"environment_steps": 0, "minutes": 0}
-        self._steps, self._first = last["environment_steps"], rows[0] if rows else {}
-        self._began = time.perf_counter() - 60 * last["minutes"]
+        self.last: dict[str, float] = rows[-1] if rows else {}
+        self._steps, self._first = self.last.get("environment_steps", 0), rows[0] if rows else {}
+        self._began = time.perf_counter() - 60 * self.last.get("minutes", 0)
 
     def count(self, values: dict[str, float]) -> dict[str, float]:
         """Replace the steps of an iteration by those of the run, and add the minutes."""
@@ -125,20 +126,24 @@ class _Clock:
 
     def collapse(self, config: ReinforceConfig, values: Mapping[str, float]) -> str:
         """Say in a sentence why going on is useless; "" if it is not."""
-        if not values["updates"]:
+        now, first = (
+            round(sum(config.online.worlds * row[f"rollout/{task}"] for task in config.tasks))
+            for row in (values, self._first)
+        )
+        if config.online.reward == "sparse" and not now:
             return "no episode succeeded: start from a run that succeeds more often"
         if (kl := values.get("start_kl", 0)) > config.online.max_start_kl:
             return (
                 f"the KL divergence from the start policy is {kl:.1f}, above "
                 f"{config.online.max_start_kl:g}: try a lower --optim.learning-rate"
             )
-        for task in config.tasks:
-            now, first = values[f"rollout/{task}"], self._first[f"rollout/{task}"]
-            if now < first / 2:
-                return (
-                    f"success with noise in {task} fell from {100 * first:.0f} % to "
-                    f"{100 * now:.0f} %: try a lower --optim.learning-rate"
-                )
+        episodes = config.online.worlds * len(config.tasks)
+        low, high = wilson_interval(first, episodes)[0], wilson_interval(now, episodes)[1]
+        if now < first / 2 and high < low:  # not by chance
+            return (
+                f"success with noise fell from {first} to {now} of {episodes} episodes: try a "
+                "lower --optim.learning-rate"
+            )
         return ""
 
 
@@ -175,7 +180,8 @@ def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]
         advantages, valid = jnp.ones(found.steps.done.shape), rollout.of_successes(found.steps)
         if old := state.critics.get(task):
             valid = ~found.steps.done
-            learned = _learn(old, found.steps, found.last, key, config.online)
+            own = jax.random.fold_in(key, RandomStream.CRITIC)  # the rollout has split the key
+            learned = _learn(old, found.steps, found.last, own, config.online)
             advantages, critics[task], metrics = learned
             values |= {f"{name}/{task}": float(x) for name, x in metrics.items()}
         batches.append(_batch(found, advantages, valid, execute))
@@ -190,11 +196,12 @@ def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]
 
 
 def _batch(found: Rollout, advantages: jax.Array, valid: jax.Array, execute_steps: int) -> Batch:
-    """Arrange steps `[calls x S, W]` as chunks `[calls x W, S]`."""
-    worlds = advantages.shape[1]
+    """Arrange steps `[calls x S, W]` as chunks `[calls x W, C]`; the rest is invalid."""
+    worlds, rest = advantages.shape[1], found.chunks.actions.shape[1] - execute_steps
 
     def arrange(x: jax.Array) -> jax.Array:
-        return jnp.moveaxis(x.reshape(-1, execute_steps, worlds), 1, 2).reshape(-1, execute_steps)
+        rows = jnp.moveaxis(x.reshape(-1, execute_steps, worlds), 1, 2).reshape(-1, execute_steps)
+        return jnp.pad(rows, ((0, 0), (0, rest)))
 
     means = jnp.zeros_like(found.chunks.actions)
     return Batch(found.chunks, arrange(advantages), arrange(valid), means)
@@ -207,14 +214,16 @@ def _summary(
     if not rows:
         return {"updates": 0, "in_a_row": 0}
     values = {n: float(x.mean()) for n, x in summarize(rows).items() if x.ndim == 0}
-    index = np.arange(setting.config.optim.batch_size) % len(batch.valid)
+    useful = np.flatnonzero(np.any(batch.valid, axis=1))  # of all calls, in their order
+    index = useful[np.linspace(0, len(useful) - 1, setting.config.optim.batch_size).astype(int)]
     now, start = (
         setting.programs.means(x, setting.frozen, batch.chunks, index)
         for x in (state.adapters, setting.start)
     )
     slots = noise.action_slots(setting.frozen.processor)
     kl = noise.divergence(now, start, setting.config.online.std, slots)
-    extra = {"start_kl": float(jnp.mean(kl)), "in_a_row": float(rows["in_a_row"][-1])}
+    executed = kl[:, : setting.config.evaluation.execute_steps]
+    extra = {"start_kl": float(jnp.mean(executed)), "in_a_row": float(rows["in_a_row"][-1])}
     return values | extra | {"updates": len(rows["loss"])}
 
 

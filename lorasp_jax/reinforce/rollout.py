@@ -27,7 +27,8 @@ class Chunks(NamedTuple):
         observation: from `env.observe`, images in uint8.
         prompts: `[N]` int32, rows of the policy's prompt table.
         noise: `[N, C, A]` initial noise of the flow.
-        actions: `[N, S, A]` normalized actions that were executed.
+        actions: `[N, C, A]` normalized actions: S that were executed, with noise, and the rest of
+            the sampler's chunk.
     """
 
     observation: RawObservation
@@ -148,7 +149,7 @@ def explore(
     execute_steps: int,
 ) -> tuple[jax.Array, Chunks]:
     """Return noisy actions `[W, S, J+1]` [rad, m] of the next chunks, and the chunks."""
-    flow_key, action_key = jax.random.split(key)
+    flow_key, action_key, _ = jax.random.split(key, 3)
     processor, config = policy.processor, policy.model.config
     initial = jax.random.normal(flow_key, (len(prompts), config.chunk, config.action_dim))
     mean = policy.model.sample_actions(
@@ -160,14 +161,14 @@ def explore(
     )
     slots = noise.action_slots(processor)
     actions = noise.explore(action_key, mean[:, :execute_steps], std, slots)
-    chunks = Chunks(observation, prompts, initial, actions)
+    whole = jnp.concatenate([actions, mean[:, execute_steps:]], axis=1)
+    chunks = Chunks(observation, prompts, initial, whole)
     return processor.decode(actions, observation["state"]), chunks
 
 
 @functools.partial(traced.cached, files=(__file__,))
 def _restart(env: Env, state: State, key: jax.Array, ranges: Randomization | None) -> State:
-    # With the key itself, worlds would start as the noise of the flow says.
-    return env.reset_done(state, jax.random.fold_in(key, 1), ranges)
+    return env.reset_done(state, jax.random.split(key, 3)[2], ranges)  # `explore` has the others
 
 
 @functools.partial(traced.cached, files=(__file__,))

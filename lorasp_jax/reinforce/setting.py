@@ -11,6 +11,7 @@ from flax import nnx
 import envs
 from envs.env import Env
 from lorasp_jax.adapters import adaptation
+from lorasp_jax.peft import AdaLoRA
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.reinforce import update
 from lorasp_jax.reinforce.config import ReinforceConfig
@@ -48,18 +49,20 @@ def prepare(run: Run) -> tuple[Setting, Learner, Any]:
     """Return the setting, the initial state, and the state's shapes."""
     config = run.config
     assert isinstance(config, ReinforceConfig)
-    learning, evaluation = config.online, config.evaluation
+    learning = config.online
     environments = {task: environment(config, task) for task in config.tasks}
     check_memory(config, environments)
     mesh = meshes.make_mesh(config.fsdp, run.devices)
+    if learning.worlds % mesh.size:
+        devices = f"the number of devices ({mesh.size})"
+        raise ValueError(f"online.worlds must be a multiple of {devices}, got {learning.worlds}")
     graphdef, adapters, parameters = adaptation.split(run.policy.model)
     methods = adaptation.methods(run.policy.model).values()
-    chunks = sum(
-        env.num_envs * -(-env.max_steps // evaluation.execute_steps)
-        for env in environments.values()
-    )
-    most = config.optim.steps * learning.epochs * -(-chunks // config.optim.batch_size)
-    optimizer = make_optimizer(dataclasses.replace(config.optim, steps=most), methods)
+    if any(isinstance(method, AdaLoRA) for method in methods):
+        raise ValueError("ada_lora needs a number of steps, which reinforcement learning has not")
+    rate = config.optim.learning_rate
+    constant = dataclasses.replace(config.optim, final_learning_rate=rate, warmup_steps=0)
+    optimizer = make_optimizer(constant, methods)
     zero = jnp.zeros((), jnp.int32)
     critics = _critics(config, environments)
     adapters = jax.tree.map(jnp.copy, adapters)
@@ -98,7 +101,8 @@ def check_memory(config: ReinforceConfig, environments: Mapping[str, Env]) -> No
     """Raise ValueError if the pictures of an iteration exceed the memory of the devices."""
     calls = sum(-(-x.max_steps // config.evaluation.execute_steps) for x in environments.values())
     pictures = len(Env.cameras) * config.image_size**2 * 3
-    needed = calls * config.online.worlds * pictures / jax.local_device_count()
+    copies = 2  # those of the calls, and joined
+    needed = copies * calls * config.online.worlds * pictures / jax.local_device_count()
     if needed > (available := preflight.available_bytes()):
         raise ValueError(
             f"the pictures of {config.online.worlds} worlds (online.worlds) take "

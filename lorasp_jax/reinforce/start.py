@@ -11,10 +11,12 @@ from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io import native
 from lorasp_jax.base import hub
+from lorasp_jax.config import Config
+from lorasp_jax.peft import LoRAMoE, LoRASP, LoRASPRelease
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.reinforce.config import ReinforceConfig
 from lorasp_jax.training import export, rules, setup
-from lorasp_jax.training.export import BASE, QUANTIZED, describe, load_policy
+from lorasp_jax.training.export import BASE, describe, load_policy
 from lorasp_jax.training.finished_run import recorded_config
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Callback, Run
@@ -35,7 +37,8 @@ def resolve(config: ReinforceConfig, given: Collection[str]) -> ReinforceConfig:
 
     Raises:
         ValueError: the start run is not finished, its tasks cannot be simulated, or a field that
-            it decides was given.
+            it decides was given; several datasets have statistics or cameras of their own; or
+            its adapters cannot be merged into its base.
     """
     if not config.online.start:
         return config
@@ -49,10 +52,29 @@ def resolve(config: ReinforceConfig, given: Collection[str]) -> ReinforceConfig:
             raise ValueError(f"--{name.replace('_', '-')} is that of {start}{what}: drop it")
     taken = {name: getattr(recorded, name) for name in kept}
     tasks = config.tasks if "tasks" in given else recorded.tasks
-    known = describe(start)["tasks"]
+    described = describe(start)
+    if len(names := export.datasets(described)) > 1:
+        raise ValueError(
+            f"{start} has statistics or cameras for each of {', '.join(names)}: start from a run "
+            "with one dataset"
+        )
+    if config.online.adapters == "merge":
+        _check_mergeable(start, recorded)
+    known = described["tasks"]
     if unknown := [task for task in tasks if task not in known]:
         raise ValueError(f"{start} has learned {', '.join(known)}, not {unknown[0]}")
     return dataclasses.replace(config, tasks=tasks, **taken)
+
+
+def _check_mergeable(start: Path, recorded: Config) -> None:
+    by_input = (LoRASP, LoRASPRelease, LoRAMoE)
+    for method in rules.methods(recorded):
+        if isinstance(method, by_input):
+            raise ValueError(
+                f"the adapters of {start} ({method.name}) cannot be merged: drop --online.adapters"
+            )
+    if recorded.model.base_dtype:
+        raise ValueError(f"the base of {start} is quantized: drop --online.adapters")
 
 
 def load(config: ReinforceConfig, folder: Path, console: Console, started: float) -> Run:
@@ -60,7 +82,7 @@ def load(config: ReinforceConfig, folder: Path, console: Console, started: float
 
     Raises:
         ValueError: see `load_policy`, `setup.build` and `setup.check_sizes`; or the start run
-            trained its base, or has adapters that cannot be merged.
+            trained its base.
     """
     if not config.online.start:
         return setup.prepare(config, folder, console, started)
@@ -94,6 +116,6 @@ class Export(Callback):
             return
         metadata = describe(config.online.start)
         if config.online.adapters == "merge":
-            metadata |= {"base": hub.portable_path(str(run.folder / MERGED)), QUANTIZED: None}
+            metadata["base"] = hub.portable_path(str(run.folder / MERGED))
         base = run.base_hash
         native.save_adapters(run.folder, run.policy.model, base=base, metadata=metadata)

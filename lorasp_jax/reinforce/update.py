@@ -48,12 +48,12 @@ class Learner:
 
 
 class Batch(NamedTuple):
-    """N chunks, of which S actions each were executed.
+    """N chunks of C actions.
 
     Attributes:
-        advantages: `[N, S]`, of mean 0 and variance 1; or ones.
-        valid: `[N, S]` bool, the actions to learn from.
-        means: `[N, S, A]` means of the policy that acted, for ppo.
+        advantages: `[N, C]`, of mean 0 and variance 1; or ones.
+        valid: `[N, C]` bool, the actions to learn from.
+        means: `[N, C, A]` means of the policy that acted, for ppo.
     """
 
     chunks: Chunks
@@ -105,10 +105,7 @@ def imitation_loss(
     observation = processor.encode(
         chunks.observation, chunks.prompts, state_noise=state_noise * jitter
     )
-    rest = chunks.noise.shape[1] - chunks.actions.shape[1]  # never executed
-    valid = jnp.pad(batch.valid, ((0, 0), (0, rest)))[..., None] & processor.flow_slots
-    actions = jnp.pad(chunks.actions, ((0, 0), (0, rest), (0, 0)))
-    own = Demonstrations(observation, actions, valid)
+    own = Demonstrations(observation, chunks.actions, batch.valid[..., None] & processor.flow_slots)
     inputs = adapters, frozen.parameters, graphdef, own, loss_key, weights
     return step.loss_fn(*inputs, times=times)
 
@@ -149,7 +146,7 @@ def surrogate_loss(
 def means(
     adapters: Any, frozen: Frozen, chunks: Chunks, graphdef: Any, denoise_steps: int
 ) -> tuple[jax.Array, Any]:
-    """Return the means of the executed actions `[N, S, A]`, and the adapters' aux."""
+    """Return the means of the actions `[N, C, A]`, and the adapters' aux."""
     model = nnx.merge(graphdef, adapters, frozen.parameters)
     inputs = chunks.observation, chunks.prompts, chunks.noise
     mean, aux = noise.means(model, frozen.processor, *inputs, denoise_steps)

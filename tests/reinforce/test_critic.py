@@ -42,3 +42,25 @@ def test_a_critic_learns_the_returns():
     assert jnp.abs(model(jnp.array([[2.0, 0, 0], [-2.0, 0, 0]])) - jnp.array([1, 0])).max() < 0.1
     np.testing.assert_allclose([advantages.mean(), advantages.std()], [0, 1], atol=1e-3)
     np.testing.assert_allclose(model.mean, state.mean((0, 1)), atol=1e-5)
+
+
+def failures(state):
+    """Return steps of one-step episodes that all fail."""
+    done = jnp.zeros(state.shape[:2], bool)
+    return Steps(state, done, ~done, done, jnp.zeros(state.shape[:2]))
+
+
+def learn(state):
+    model = Critic.init(jax.random.key(1), 3, 1e-3)
+    return critic.learn(model, failures(state), state[0], jax.random.key(2), Learning())
+
+
+def test_noise_of_the_critic_is_not_scaled_to_advantages():
+    advantages, _, _ = learn(jax.random.normal(jax.random.key(0), (4, 128, 3)))
+    assert 0 < advantages.std() < 0.5
+
+
+def test_states_that_are_not_finite_teach_the_critic_nothing():
+    state = jax.random.normal(jax.random.key(0), (4, 128, 3))
+    state = state.at[1, 2, 0].set(jnp.nan).at[0, 3, 1].set(jnp.inf)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(learn(state)))

@@ -1,12 +1,14 @@
 """The loop: resuming, several devices, the best adapters, collapse."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from lorasp_jax.adapters import adaptation
-from lorasp_jax.reinforce import loop, setting
+from lorasp_jax.peft import AdaLoRA
+from lorasp_jax.reinforce import loop, setting, update
 from lorasp_jax.reinforce.config import Learning
 from lorasp_jax.training import best
 from lorasp_jax.training.run import Callback
@@ -97,17 +99,26 @@ def test_a_policy_far_from_the_start_stops_the_run(tmp_path):
     learn = dataclasses.replace(rooms.config().online, max_start_kl=1e-6)
     run = train(tmp_path, online=learn)
     assert len(read_metrics(tmp_path)) == 1
-    said = run.console.file.getvalue().replace("\n", " ")
-    assert "stopped after iteration 1: the KL divergence from the start policy is" in said
+    expected = "stopped after iteration 1: the KL divergence from the start policy is"
+    assert expected in run.console.file.getvalue().replace("\n", " ")
+    resumed = train(tmp_path, online=learn, resume=True)
+    assert len(read_metrics(tmp_path)) == 1
+    assert expected in resumed.console.file.getvalue().replace("\n", " ")
 
 
 def test_lost_success_stops_the_run():
-    config = rooms.config()
-    values = {"rollout/press": 0.5, "steps": 3.0, "updates": 1}
+    assert "fell from 32 to 10 of 64 episodes" in collapse(32, 10)
+    assert not collapse(6, 2)  # likely by chance
+    assert not collapse(60, 45)
+    assert "no episode succeeded" in collapse(1, 0)
+    assert not collapse(1, 0, reward="dense")
+
+
+def collapse(first, now, **changes):
+    config = rooms.config(online=Learning(method="ppo", worlds=64, **changes))
     clock = loop._Clock.__new__(loop._Clock)
-    clock._steps, clock._first, clock._began = 0, {}, 0.0
-    assert not clock.collapse(config, clock.count(values))
-    assert "fell from 50 % to 20 %" in clock.collapse(config, {"rollout/press": 0.2, "updates": 1})
+    clock._first = {"rollout/press": first / 64}
+    return clock.collapse(config, {"rollout/press": now / 64, "updates": 1})
 
 
 def test_imitation_of_successes_needs_no_critic(tmp_path):
@@ -117,7 +128,37 @@ def test_imitation_of_successes_needs_no_critic(tmp_path):
     assert any("task" in row for row in rows)
 
 
-def test_a_run_without_any_success_stops(tmp_path):
-    run = train(tmp_path, online=Learning(worlds=8, std=1e-3))
+@pytest.mark.parametrize("method", ["imitate", "ppo"])
+def test_a_run_without_any_success_stops(tmp_path, method):
+    run = train(tmp_path, online=Learning(method=method, worlds=8, std=1e-3))
     assert len(read_metrics(tmp_path)) == 1
     assert "no episode succeeded" in run.console.file.getvalue()
+
+
+def test_the_divergence_from_the_start_is_that_of_all_valid_chunks(tmp_path):
+    config, seen = rooms.config(), []
+    fixed, state, _ = setting.prepare(rooms.start(tmp_path, config))
+
+    def means(adapters, frozen, chunks, index):
+        seen.append(index)
+        return np.zeros((8, 4, 8))
+
+    valid = (np.arange(64) % 2 == 1)[:, None] & np.ones(4, bool)
+    batch = update.Batch(None, np.ones((64, 4)), valid, None)
+    fixed = fixed._replace(programs=SimpleNamespace(means=means))
+    loop._summary(fixed, state, batch, {"loss": np.ones(1), "in_a_row": np.zeros(1, int)})
+    assert seen[0].tolist() == [1, 9, 17, 27, 35, 45, 53, 63]
+
+
+def test_devices_must_divide_the_worlds(tmp_path):
+    learn = dataclasses.replace(rooms.config().online, worlds=6)
+    run = rooms.start(tmp_path, rooms.config(online=learn), 4)
+    expected = r"online.worlds must be a multiple of the number of devices \(4\), got 6"
+    with pytest.raises(ValueError, match=expected):
+        setting.prepare(run)
+
+
+def test_ada_lora_is_refused(tmp_path):
+    run = rooms.start(tmp_path, rooms.config(peft=AdaLoRA()))
+    with pytest.raises(ValueError, match="ada_lora needs a number of steps"):
+        setting.prepare(run)

@@ -1,4 +1,4 @@
-"""Rollouts: what is recorded, layouts of groups, restarts."""
+"""Rollouts: what is recorded, restarts."""
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,8 @@ def test_the_recorded_noise_gives_the_mean_of_the_actions(policy):
     inputs = chunks.observation, chunks.prompts, chunks.noise
     means, _ = noise.means(policy.model, processor, *inputs, 2)
     slots = noise.action_slots(processor)
-    z = ((chunks.actions - means[:, :2]) / 0.2)[..., slots]
+    z = ((chunks.actions - means)[:, :2] / 0.2)[..., slots]
+    np.testing.assert_allclose(chunks.actions[:, 2:], means[:, 2:], atol=1e-4)
     assert z.shape == (16, 2, 7)
     assert np.abs(z.mean()) < 0.2
     assert 0.8 < z.std() < 1.2
@@ -36,7 +37,8 @@ def test_the_recorded_noise_gives_the_mean_of_the_actions(policy):
 def test_steps_follow_the_worlds(policy):
     found = collect(policy, rooms.Room())
     steps = found.steps
-    actions = policy.processor.decode(found.chunks.actions, found.chunks.observation["state"])
+    executed = found.chunks.actions[:, :2]
+    actions = policy.processor.decode(executed, found.chunks.observation["state"])
     actions = actions.reshape(2, 8, 2, 7).swapaxes(1, 2).reshape(4, 8, 7)
     change = jnp.diff(steps.state[:2, :, :7], axis=0)[0]
     running = ~np.asarray(steps.done[1])
@@ -63,3 +65,17 @@ def test_steps_of_successes():
     steps = rollout.Steps(jnp.zeros((5, 3, 1)), done, ended, success, jnp.zeros((5, 3)))
     expected = [[1, 1, 0, 0, 0], [0] * 5, [0] * 5]
     np.testing.assert_array_equal(rollout.of_successes(steps).T, np.array(expected, bool))
+
+
+def test_restarts_and_noise_have_keys_of_their_own(policy, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(noise, "explore", lambda key, mean, *_: drawn.append(key) or mean)
+    monkeypatch.setattr(rooms.Room, "reset_done", lambda self, state, key, _: drawn.append(key))
+    room, key = rooms.Room(), jax.random.key(3)
+    image = np.zeros((8, 32, 32, 3), np.uint8)
+    raw = {"image": {"side": image, "wrist": image}, "state": np.zeros((8, 7), "f")}
+    sampled = type(policy)(policy.with_sampler().model, policy.processor.shared())
+    rollout.explore(sampled, key, raw, np.zeros(8, np.int32), 0.1, 1, 2)
+    rollout._restart.__wrapped__(room, None, key, None)
+    first, second = map(jax.random.key_data, drawn)
+    assert not np.array_equal(first, second)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import shutil
 from pathlib import Path
 
 import jax
@@ -14,14 +15,14 @@ from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.cli.train import _resolved
 from lorasp_jax.config import ModelConfig
-from lorasp_jax.peft import LoRA
+from lorasp_jax.peft import LoRA, LoRASP
 from lorasp_jax.reinforce import setting, start
 from lorasp_jax.reinforce.config import Learning, ReinforceConfig
 from lorasp_jax.training import export
 from lorasp_jax.training.export import load_policy
 from lorasp_jax.training.finished_run import recorded_config
 from lorasp_jax.training.overrides import parse
-from lorasp_jax.training.run_folder import to_json, write_json
+from lorasp_jax.training.run_folder import read_json, to_json, write_json
 from tests import ROOT
 from tests.reinforce import rooms
 from tests.runs import CONFIG, RESULTS, leaves, make_run, write_description
@@ -94,6 +95,15 @@ def test_a_run_is_recorded_and_read_again(few, tmp_path):
         (["--online.method", "grpo"], "method"),
         (["--method", "lora"], "--peft is that of .*few: drop it"),
         (["--optim.ema", 0.9], "optim.ema is not for reinforcement learning: drop it"),
+        (["--optim.warmup-steps", 5], "optim.warmup_steps is not for reinforcement learning"),
+        (["--evaluation.no-before"], "evaluation.before is not for reinforcement learning"),
+        (["--log-every", 2], "log_every is not for reinforcement learning: drop it"),
+        (["--recap.share", 0.5], "recap.share is not for reinforcement learning: drop it"),
+        (["--keep", "last"], "keep is not for reinforcement learning: drop it"),
+        (["--from", "", "--data.source", "x"], "data.source is not for reinforcement learning"),
+        (["--online.reward", "dense"], "online.reward is not for imitate: drop it"),
+        (["--online.method", "ppo", "--optim.spike", 9], "optim.spike is not for ppo: drop it"),
+        (["--online.method", "ppo", "--optim.state-noise", 1], "optim.state_noise is not for ppo"),
         (["--dry-run"], "--dry-run is not for reinforcement learning: drop it"),
         (["--fit", "16GB"], "--fit is not for reinforcement learning: drop it"),
     ],
@@ -113,6 +123,41 @@ def test_runs_without_success_or_end_are_refused(few, tmp_path):
     write_json(tmp_path / "results.json", RESULTS | {"tasks": {}})
     with pytest.raises(ValueError, match=r"the tasks of .* cannot be simulated"):
         resolve("--from", tmp_path)
+
+
+@pytest.fixture
+def changed(few, tmp_path):
+    """Copy the run and change what it recorded of its config or policy."""
+
+    def change(policy=(), **config):
+        folder = shutil.copytree(few, tmp_path / "changed")
+        changed = dataclasses.replace(recorded_config(few), **config)
+        write_json(folder / "config.json", to_json(changed))
+        found = read_json(folder / "adapter.json")
+        found["metadata"]["policy"] |= dict(policy)
+        write_json(folder / "adapter.json", {k: v for k, v in found.items() if k != "digest"})
+        return folder
+
+    return change
+
+
+def test_runs_with_several_statistics_are_refused(changed):
+    folder = changed(policy={"dataset": "near", "datasets": {"near": {}, "far": {}}})
+    with pytest.raises(ValueError, match="for each of near, far: start from a run with one"):
+        resolve("--from", folder)
+
+
+def test_adapters_that_cannot_be_merged_are_refused(changed):
+    folder = changed(peft=LoRASP())
+    assert resolve("--from", folder).online.adapters == "continue"
+    with pytest.raises(ValueError, match=r"\(lora_sp\) cannot be merged: drop --online.adapters"):
+        resolve("--from", folder, "--online.adapters", "merge")
+
+
+def test_adapters_are_not_merged_into_a_quantized_base(changed):
+    folder = changed(model=ModelConfig(size="dummy", base_dtype="int8"))
+    with pytest.raises(ValueError, match=r"is quantized: drop --online.adapters"):
+        resolve("--from", folder, "--online.adapters", "merge")
 
 
 def load(config, folder):
@@ -150,6 +195,13 @@ def test_worlds_that_do_not_fit_are_refused():
     learn = Learning(worlds=2**22)
     with pytest.raises(ValueError, match=r"4194304 worlds .* choose fewer"):
         setting.check_memory(rooms.config(online=learn), {"press": rooms.Room(num_envs=2**22)})
+
+
+def test_pictures_are_held_twice(monkeypatch):
+    once = 2 * 8 * 2 * 32 * 32 * 3 / jax.local_device_count()
+    monkeypatch.setattr(setting.preflight, "available_bytes", lambda: 1.5 * once)
+    with pytest.raises(ValueError, match="choose fewer worlds"):
+        setting.check_memory(rooms.config(), {"press": rooms.Room()})
 
 
 def test_configs_files_load(tmp_path):
