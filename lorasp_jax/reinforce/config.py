@@ -84,7 +84,6 @@ class ReinforceConfig(Config):
     """Iterations between log entries."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         for what in ("reinforcement learning", self.online.method):
             for name in _IGNORED[what]:
                 group, _, field_name = name.rpartition(".")
@@ -93,6 +92,7 @@ class ReinforceConfig(Config):
                     raise ValueError(f"{name} is not for {what}: drop it")
         if self.data.source and not self.online.start:
             raise ValueError("data.source is not for reinforcement learning: drop it")
+        super().__post_init__()
 
     def evaluates(self, step: int) -> bool:
         """Whether to evaluate after an iteration: as the config says, and after the last one."""

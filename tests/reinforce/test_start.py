@@ -99,6 +99,7 @@ def test_a_run_is_recorded_and_read_again(few, tmp_path):
         (["--evaluation.no-before"], "evaluation.before is not for reinforcement learning"),
         (["--log-every", 2], "log_every is not for reinforcement learning: drop it"),
         (["--recap.share", 0.5], "recap.share is not for reinforcement learning: drop it"),
+        (["--learn", "recap"], "learn is not for reinforcement learning: drop it"),
         (["--keep", "last"], "keep is not for reinforcement learning: drop it"),
         (["--from", "", "--data.source", "x"], "data.source is not for reinforcement learning"),
         (["--online.reward", "dense"], "online.reward is not for imitate: drop it"),
