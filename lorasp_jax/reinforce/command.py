@@ -15,6 +15,6 @@ def run(
 ) -> None:
     """Learn from a start run, evaluate before and after, export the policy, write the report."""
     learned = start.load(config, folder, console, started)
-    loop.train(learned, [start.Export(), Evaluation(), Report()], resume=resume)
+    loop.train(learned, [start.PolicyExport(), Evaluation(), Report()], resume=resume)
     report = folder / "report.html"
     console.print(f"finished in {learned.seconds['total']:.0f} s: {report}", markup=False)

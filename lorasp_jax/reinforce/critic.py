@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import optax
 
 from lorasp_jax.reinforce.config import Learning
-from lorasp_jax.reinforce.rollout import Steps
+from lorasp_jax.reinforce.rollout import Transitions
 
 _WIDTH, _BATCH, _STEPS = 64, 512, 100  # our choice, as in examples/ppo.py
 _LIMIT = 5.0
@@ -91,7 +91,7 @@ def generalized_advantages(
 
 
 def learn(
-    critic: Critic, steps: Steps, last: jax.Array, key: jax.Array, learning: Learning
+    critic: Critic, steps: Transitions, last: jax.Array, key: jax.Array, learning: Learning
 ) -> tuple[jax.Array, Critic, dict[str, jax.Array]]:
     """Return advantages of steps, the critic after learning from the steps, and metrics.
 

@@ -14,14 +14,14 @@ from lorasp_jax.base.bars import bars
 from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.reinforce import critic, noise, rollout, update
 from lorasp_jax.reinforce.config import ReinforceConfig
-from lorasp_jax.reinforce.rollout import Rollout
+from lorasp_jax.reinforce.rollout import Experience
 from lorasp_jax.reinforce.setting import Setting, prepare
-from lorasp_jax.reinforce.update import Batch, Learner
+from lorasp_jax.reinforce.update import Learner, WeightedChunks
 from lorasp_jax.training import best, records
 from lorasp_jax.training.checkpoint import Checkpoints
 from lorasp_jax.training.guard import summarize
 from lorasp_jax.training.interrupt import deferred
-from lorasp_jax.training.loop import RunError
+from lorasp_jax.training.loop import RunError, training
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import MetricsLog, read_json, read_metrics
@@ -44,15 +44,8 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
             callback.on_start(run)
         before = read_json(run.folder / "before.json", records.BEFORE)
         _keep_best(run, 0, {f"success/{task}": x["success"] for task, x in before.items()})
-    try:
-        with run.timed("train"):
-            state = _loop(run, fixed, restored or initial, checkpoints, callbacks)
-    except RunError as error:
-        for callback in callbacks:
-            callback.on_stop(run, str(error))
-        raise
-    finally:
-        checkpoints.close()
+    with training(run, checkpoints, callbacks):
+        state = _loop(run, fixed, restored or initial, checkpoints, callbacks)
     run.policy = fixed.policy(state.adapters)
     if best.error(run.folder) < float("inf"):
         step, run.policy = best.load(run.folder, run.policy)
@@ -195,7 +188,9 @@ def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]
     return jax.device_put(state, setting.shardings), values
 
 
-def _batch(found: Rollout, advantages: jax.Array, valid: jax.Array, execute_steps: int) -> Batch:
+def _batch(
+    found: Experience, advantages: jax.Array, valid: jax.Array, execute_steps: int
+) -> WeightedChunks:
     """Arrange steps `[calls x S, W]` as chunks `[calls x W, C]`; the rest is invalid."""
     worlds, rest = advantages.shape[1], found.chunks.actions.shape[1] - execute_steps
 
@@ -204,11 +199,11 @@ def _batch(found: Rollout, advantages: jax.Array, valid: jax.Array, execute_step
         return jnp.pad(rows, ((0, 0), (0, rest)))
 
     means = jnp.zeros_like(found.chunks.actions)
-    return Batch(found.chunks, arrange(advantages), arrange(valid), means)
+    return WeightedChunks(found.chunks, arrange(advantages), arrange(valid), means)
 
 
 def _summary(
-    setting: Setting, state: Learner, batch: Batch, rows: dict[str, np.ndarray]
+    setting: Setting, state: Learner, batch: WeightedChunks, rows: dict[str, np.ndarray]
 ) -> dict[str, float]:
     """Return the means of the metrics of the gradient steps, and the divergence from the start."""
     if not rows:

@@ -37,7 +37,7 @@ class Chunks(NamedTuple):
     actions: jax.Array
 
 
-class Steps(NamedTuple):
+class Transitions(NamedTuple):
     """T control steps in W worlds.
 
     Attributes:
@@ -56,18 +56,18 @@ class Steps(NamedTuple):
     reward: jax.Array
 
 
-class Rollout(NamedTuple):
+class Experience(NamedTuple):
     """W worlds until the time limit of their first episodes; finished ones restart meanwhile.
 
     Attributes:
         chunks: N = calls x W, in this order.
         steps: T = calls x S. A world idles until the next call when its episode is over.
-        last: `[W, D]` the last full state, as in `Steps`.
+        last: `[W, D]` the last full state, as in `Transitions`.
         success: `[W]` bool, of the first episodes.
     """
 
     chunks: Chunks
-    steps: Steps
+    steps: Transitions
     last: jax.Array
     success: jax.Array
 
@@ -81,7 +81,7 @@ def collect(
     execute_steps: int,
     denoise_steps: int,
     ranges: Randomization | None = None,
-) -> Rollout:
+) -> Experience:
     """Act in every world until the time limit.
 
     Args:
@@ -106,18 +106,18 @@ def collect(
         actions, chunk = _explore()(worlds.policy, *inputs)
         worlds.state, step = _act(env, worlds.state, actions)
         chunks.append(chunk)
-        steps.append(Steps(**step))
+        steps.append(Transitions(**step))
     join = lambda *parts: jnp.concatenate(parts)  # noqa: E731
     joined = jax.tree.map(join, *steps)
     end = jnp.argmax(joined.ended, axis=0)
     success = jnp.take_along_axis(joined.success, end[None], axis=0)[0]
-    return Rollout(jax.tree.map(join, *chunks), joined, _full_state(env, worlds.state), success)
+    return Experience(jax.tree.map(join, *chunks), joined, _full_state(env, worlds.state), success)
 
 
-def of_successes(steps: Steps) -> jax.Array:
+def of_successes(steps: Transitions) -> jax.Array:
     """Return which steps belong to episodes that end in success, `[T, W]` bool."""
 
-    def body(later: jax.Array, step: Steps) -> tuple[jax.Array, jax.Array]:
+    def body(later: jax.Array, step: Transitions) -> tuple[jax.Array, jax.Array]:
         succeeds = jnp.where(step.ended & ~step.done, step.success, later)
         return succeeds, succeeds & ~step.done
 
@@ -173,7 +173,7 @@ def _restart(env: Env, state: State, key: jax.Array, ranges: Randomization | Non
 
 @functools.partial(traced.cached, files=(__file__,))
 def _act(env: Env, state: State, actions: jax.Array) -> tuple[State, dict[str, jax.Array]]:
-    """Execute `[W, S, J+1]`; return the worlds and the fields of `Steps`."""
+    """Execute `[W, S, J+1]`; return the worlds and the fields of `Transitions`."""
 
     def step(state: State, action: jax.Array) -> tuple[State, dict[str, jax.Array]]:
         before = {"state": _full_state(env, state), "done": state.done}

@@ -104,7 +104,7 @@ def load(config: ReinforceConfig, folder: Path, console: Console, started: float
     return run
 
 
-class Export(Callback):
+class PolicyExport(Callback):
     """Exports the policy, as `train.py` does: `load_policy` loads it."""
 
     def on_end(self, run: Run) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import optax
 from flax import nnx
 
-from lorasp_jax.data.batches import Batch as Demonstrations
+from lorasp_jax.data.batches import Batch
 from lorasp_jax.models.flow_matching import Times
 from lorasp_jax.peft.auxiliary import AUXILIARY_WEIGHTS, auxiliary_losses
 from lorasp_jax.reinforce import noise
@@ -47,7 +47,7 @@ class Learner:
     critics: dict[str, Critic]
 
 
-class Batch(NamedTuple):
+class WeightedChunks(NamedTuple):
     """N chunks of C actions.
 
     Attributes:
@@ -62,7 +62,7 @@ class Batch(NamedTuple):
     means: jax.Array
 
 
-Loss = Callable[[Any, Frozen, Batch, jax.Array], tuple[jax.Array, Metrics]]
+Loss = Callable[[Any, Frozen, WeightedChunks, jax.Array], tuple[jax.Array, Metrics]]
 """(adapters, frozen, batch, key) -> loss and metrics."""
 
 
@@ -90,7 +90,7 @@ def make_loss(config: ReinforceConfig, graphdef: Any) -> Loss:
 def imitation_loss(
     adapters: Any,
     frozen: Frozen,
-    batch: Batch,
+    batch: WeightedChunks,
     key: jax.Array,
     *,
     graphdef: Any,
@@ -105,7 +105,7 @@ def imitation_loss(
     observation = processor.encode(
         chunks.observation, chunks.prompts, state_noise=state_noise * jitter
     )
-    own = Demonstrations(observation, chunks.actions, batch.valid[..., None] & processor.flow_slots)
+    own = Batch(observation, chunks.actions, batch.valid[..., None] & processor.flow_slots)
     inputs = adapters, frozen.parameters, graphdef, own, loss_key, weights
     return step.loss_fn(*inputs, times=times)
 
@@ -113,7 +113,7 @@ def imitation_loss(
 def surrogate_loss(
     adapters: Any,
     frozen: Frozen,
-    batch: Batch,
+    batch: WeightedChunks,
     key: jax.Array,  # noqa: ARG001
     *,
     graphdef: Any,
@@ -180,7 +180,7 @@ class Programs:
             return means(adapters, frozen, take(chunks, index), graphdef, steps)[0]
 
         def update(
-            state: Learner, frozen: Frozen, batch: Batch, index: jax.Array, key: jax.Array
+            state: Learner, frozen: Frozen, batch: WeightedChunks, index: jax.Array, key: jax.Array
         ) -> tuple[Learner, Metrics]:
             inputs = state.adapters, frozen, take(batch, index), key
             gradient, metrics = jax.grad(loss, has_aux=True)(*inputs)
@@ -205,7 +205,7 @@ class Programs:
 
 
 def improve(
-    programs: Programs, state: Learner, frozen: Frozen, batch: Batch, key: jax.Array
+    programs: Programs, state: Learner, frozen: Frozen, batch: WeightedChunks, key: jax.Array
 ) -> tuple[Learner, dict[str, np.ndarray]]:
     """Take gradient steps on minibatches of chunks, for ppo until the policy has changed enough.
 

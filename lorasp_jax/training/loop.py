@@ -60,17 +60,24 @@ def train(
     if restored is None:
         program.compile(state, _log_interval(run.config, int(state.step)))  # in the background
         _call(callbacks, run, "on_start")
+    with training(run, checkpoints, callbacks):
+        state = _loop(run, state, program, checkpoints, callbacks, policy)
+    run.policy = policy(state)
+    _call(callbacks, run, "on_end")
+
+
+@contextlib.contextmanager
+def training(run: Run, checkpoints: Checkpoints, callbacks: Sequence[Callback]) -> Iterator[None]:
+    """Time the training in this block, tell callbacks why it cannot go on, close checkpoints."""
     try:
         with run.timed("train"):
-            state = _loop(run, state, program, checkpoints, callbacks, policy)
+            yield
     except RunError as error:
         for callback in callbacks:
             callback.on_stop(run, str(error))
         raise
     finally:
         checkpoints.close()
-    run.policy = policy(state)
-    _call(callbacks, run, "on_end")
 
 
 def _split(

@@ -7,7 +7,7 @@ import numpy as np
 from lorasp_jax.reinforce import critic
 from lorasp_jax.reinforce.config import Learning
 from lorasp_jax.reinforce.critic import Critic
-from lorasp_jax.reinforce.rollout import Steps
+from lorasp_jax.reinforce.rollout import Transitions
 
 DISCOUNT, TRACE = 0.9, 0.8
 
@@ -32,7 +32,10 @@ def test_a_critic_learns_the_returns():
     state = jax.random.normal(jax.random.key(0), (4, 128, 3))
     ended, done = jnp.ones((4, 128), bool), jnp.zeros((4, 128), bool)
     reward = (state[..., 0] > 0).astype(jnp.float32)
-    steps, model = Steps(state, done, ended, done, reward), Critic.init(jax.random.key(1), 3, 1e-2)
+    steps, model = (
+        Transitions(state, done, ended, done, reward),
+        Critic.init(jax.random.key(1), 3, 1e-2),
+    )
     learning = Learning(discount=DISCOUNT, trace=TRACE, critic_learning_rate=1e-2)
     learn = jax.jit(critic.learn, static_argnums=4)
     keys = jax.random.split(jax.random.key(2), 4)
@@ -47,7 +50,7 @@ def test_a_critic_learns_the_returns():
 def failures(state):
     """Return steps of one-step episodes that all fail."""
     done = jnp.zeros(state.shape[:2], bool)
-    return Steps(state, done, ~done, done, jnp.zeros(state.shape[:2]))
+    return Transitions(state, done, ~done, done, jnp.zeros(state.shape[:2]))
 
 
 def learn(state):

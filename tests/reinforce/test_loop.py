@@ -144,7 +144,7 @@ def test_the_divergence_from_the_start_is_that_of_all_valid_chunks(tmp_path):
         return np.zeros((8, 4, 8))
 
     valid = (np.arange(64) % 2 == 1)[:, None] & np.ones(4, bool)
-    batch = update.Batch(None, np.ones((64, 4)), valid, None)
+    batch = update.WeightedChunks(None, np.ones((64, 4)), valid, None)
     fixed = fixed._replace(programs=SimpleNamespace(means=means))
     loop._summary(fixed, state, batch, {"loss": np.ones(1), "in_a_row": np.zeros(1, int)})
     assert seen[0].tolist() == [1, 9, 17, 27, 35, 45, 53, 63]

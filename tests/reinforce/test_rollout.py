@@ -62,7 +62,7 @@ def test_steps_of_successes():
     ended = jnp.array([[0, 1, 1, 0, 1], [0, 0, 0, 1, 1], [0, 0, 0, 0, 0]], bool).T
     done = jnp.array([[0, 0, 1, 0, 0], [0, 0, 0, 0, 1], [0, 0, 0, 0, 0]], bool).T
     success = jnp.array([[0, 1, 1, 0, 0], [0, 0, 0, 0, 0], [0, 0, 0, 0, 0]], bool).T
-    steps = rollout.Steps(jnp.zeros((5, 3, 1)), done, ended, success, jnp.zeros((5, 3)))
+    steps = rollout.Transitions(jnp.zeros((5, 3, 1)), done, ended, success, jnp.zeros((5, 3)))
     expected = [[1, 1, 0, 0, 0], [0] * 5, [0] * 5]
     np.testing.assert_array_equal(rollout.of_successes(steps).T, np.array(expected, bool))
 

@@ -176,7 +176,7 @@ def outputs(policy):
 def test_adapters_go_on_and_are_exported(few, tmp_path):
     run = load(resolve("--from", few), tmp_path / "run")
     np.testing.assert_allclose(outputs(run.policy), outputs(load_policy(few)), atol=1e-5)
-    start.Export().on_end(run)
+    start.PolicyExport().on_end(run)
     again = load_policy(run.folder)
     np.testing.assert_array_equal(outputs(again), outputs(run.policy))
 
@@ -188,7 +188,7 @@ def test_adapters_are_merged_under_new_ones(few, tmp_path):
     np.testing.assert_allclose(outputs(run.policy), outputs(load_policy(few)), atol=0.05)
     adapters = leaves(adaptation.split(run.policy.model)[1])
     assert any(not leaf.any() for leaf in adapters.values())  # new ones add nothing
-    start.Export().on_end(run)
+    start.PolicyExport().on_end(run)
     np.testing.assert_array_equal(outputs(load_policy(run.folder)), outputs(run.policy))
 
 

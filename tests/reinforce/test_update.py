@@ -17,7 +17,7 @@ from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.reinforce import noise, update
 from lorasp_jax.reinforce.config import Learning
 from lorasp_jax.reinforce.rollout import Chunks
-from lorasp_jax.reinforce.update import Batch, Learner
+from lorasp_jax.reinforce.update import Learner, WeightedChunks
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.guard import Guard
 from lorasp_jax.training.program import Frozen
@@ -92,7 +92,7 @@ def chunks(processor, means, key, std=STD, count=CHUNKS):
 
 def batch(chunks, advantages, valid=None):
     valid = jnp.ones(advantages.shape, bool) if valid is None else valid
-    return Batch(chunks, advantages, valid, jnp.zeros_like(chunks.actions))
+    return WeightedChunks(chunks, advantages, valid, jnp.zeros_like(chunks.actions))
 
 
 def test_a_bandit_finds_its_optimum(processor):
