@@ -24,6 +24,7 @@ from benchmarks.measuring import best, machine, print_table
 from lorasp_jax import adapt, peft
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.extras.serving.adapters import OnDevice
+from lorasp_jax.extras.serving.exported import sampling_options
 from lorasp_jax.models import backbone, presets
 from lorasp_jax.models.observation import Observation, abstract_observation
 from lorasp_jax.models.shared_base import SharedBase, SharedSampler, by_row
@@ -80,13 +81,13 @@ def observations(config: Any, batch: int) -> Observation:
     return jax.tree.map(draw, abstract_observation(config, batch))
 
 
-@functools.partial(jax.jit, static_argnames="steps")
+@functools.partial(jax.jit, static_argnames="steps", compiler_options=sampling_options())
 def sample(sampler: Any, obs: Observation, noise: jax.Array, *, steps: int) -> jax.Array:
     """Sample with one adapter."""
     return sampler.sample_actions(None, obs, noise=noise, num_steps=steps)
 
 
-@functools.partial(jax.jit, static_argnames="steps")
+@functools.partial(jax.jit, static_argnames="steps", compiler_options=sampling_options())
 def sample_mixed(
     sampler: SharedSampler,
     adapters: list[list[jax.Array]],

@@ -25,7 +25,8 @@ open(arguments["--result"], "w").write(json.dumps(result))
 
 
 def job(table, variant="none", **options):
-    return Job(table, variant, options.pop("size", "tiny"), 1, options.pop("steps", 2), False)
+    size, steps = options.pop("size", "tiny"), options.pop("steps", 2)
+    return Job(table, variant, size, 1, steps, compile=False, denoise_steps=[3, 10])
 
 
 def interpreter(folder, name, body="", seconds=1.0):
@@ -58,9 +59,9 @@ def test_ratios_refer_to_the_first_program(tmp_path, capsys, fakes):
     status, content, printed = run(tmp_path, capsys, *command)
     lines = content["tables"]["pi0-sample"]
     assert status == 0
-    assert [line["program"] for line in lines] == ["ours", "openpi", "ours"]
-    assert [line["ratio"] for line in lines] == [1, 4, 1]
-    assert [line["samples/s"] for line in lines] == [4, 1, 4]
+    assert [line["program"] for line in lines] == ["ours", "ours", "openpi", "ours"]
+    assert [line["ratio"] for line in lines] == [1, 1, 4, 1]
+    assert [line["samples/s"] for line in lines] == [4, 4, 1, 4]
     assert content["versions"]["openpi"] == {"openpi": "1.2"}
     assert "openpi: openpi 1.2" in printed
 
@@ -72,7 +73,7 @@ def test_missing_programs_are_named_and_do_not_stop_others(body, tmp_path, capsy
         (tmp_path / "openpi").unlink()
     status, content, printed = run(tmp_path, capsys, *command)
     assert status == 0
-    assert [line["program"] for line in content["tables"]["pi0-sample"]] == ["ours", "ours"]
+    assert [line["program"] for line in content["tables"]["pi0-sample"]] == ["ours"] * 3
     assert "to install: pip install --no-deps git+https://github.com/Phys" in printed
 
 
@@ -80,7 +81,7 @@ def test_failures_are_reported_and_give_an_exit_status(tmp_path, capsys, fakes):
     command = fakes(ours={}, openpi={"body": "raise ValueError('out of memory')"})
     status, content, printed = run(tmp_path, capsys, *command)
     assert status == 1
-    assert content["results"][1]["error"] == "ValueError: out of memory"
+    assert content["results"][2]["error"] == "ValueError: out of memory"
     assert "to install" not in printed
 
 
@@ -95,11 +96,13 @@ def test_a_failed_reference_leaves_no_ratio(tmp_path, capsys, fakes):
 @pytest.mark.slow
 def test_ours_runs_as_a_process(tmp_path, capsys, fakes):
     """The real worker, beside a stand-in."""
-    command = ["--warmup", "1", "--steps", "2", "--once", *fakes(openpi={})]
+    command = ["--warmup", "1", "--steps", "2", "--once", "--denoise-steps", "2", "10"]
+    command += fakes(openpi={})
     status, content, _ = run(tmp_path, capsys, *command)
     assert status == 0
     result = content["results"][0]
-    assert [row["item"] for row in result["rows"]] == ["batch 1", "batch 2"]
+    items = [f"batch {b}, {n} denoising steps" for b in (1, 2) for n in (2, 10)]
+    assert [row["item"] for row in result["rows"]] == items
     assert result["versions"]["jax"] == jax.__version__
 
 

@@ -26,6 +26,7 @@ from benchmarks.peers import report
 from benchmarks.peers.cases import INSTALL, TABLES, Case, cases
 
 ROOT = Path(__file__).resolve().parents[2]
+_SETTINGS = "size", "warmup", "steps", "compile", "denoise_steps"
 
 
 def named(text: str) -> tuple[str, str]:
@@ -64,6 +65,7 @@ def run(case: Case, options: argparse.Namespace, folder: Path) -> dict[str, Any]
     command += ["--table", case.table, "--variant", case.variant, "--size", options.size]
     command += ["--warmup", str(options.warmup), "--steps", str(options.steps)]
     command += [*(["--compile"] if options.compile else []), "--result", str(file)]
+    command += ["--denoise-steps", *map(str, options.denoise_steps)]
     env = environment(case, options, str(folder / "cache"))
     names = {"table": case.table, "program": case.program, "variant": case.variant}
     try:
@@ -111,7 +113,7 @@ def measure(options: argparse.Namespace, console: Console) -> list[dict[str, Any
 def write(options: argparse.Namespace, results: list[dict[str, Any]]) -> None:
     """Write settings, versions, tables and all results to `options.out`."""
     tables = {table: report.rows(results, table) for table in options.tables}
-    settings = {name: getattr(options, name) for name in ("size", "warmup", "steps", "compile")}
+    settings = {name: getattr(options, name) for name in _SETTINGS}
     content = {**settings, "versions": report.versions(results), "tables": tables}
     options.out.write_text(json.dumps({**content, "results": results}, indent=1))
 
@@ -127,6 +129,8 @@ def parser() -> argparse.ArgumentParser:
         parser.add_argument(f"--{name}", help=f"{what} of a program", **option)
     parser.add_argument("--warmup", type=int, default=5, help="calls before the first timed one")
     parser.add_argument("--steps", type=int, default=30, help="timed calls")
+    steps = "numbers of denoising steps to sample with"
+    parser.add_argument("--denoise-steps", type=int, nargs="+", default=[10], help=steps)
     parser.add_argument("--once", action="store_true", help="do not repeat the references")
     parser.add_argument("--compile", action="store_true", help="torch.compile in LeRobot and PEFT")
     return parser

@@ -30,7 +30,7 @@ TABLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("openpi", "LoRA"),
         ("openpi", "LoRA without augmentation"),
     ),
-    "pi0-sample": ((OURS, "none"), ("openpi", "none")),
+    "pi0-sample": ((OURS, "none"), (OURS, "LoRA-SP"), ("openpi", "none")),
     "smolvla-train": (
         (OURS, "LoRA-SP"),
         (OURS, "LoRA"),
@@ -42,7 +42,7 @@ TABLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("lerobot", "expert only"),
         ("lerobot", "expert only, autocast"),
     ),
-    "smolvla-sample": ((OURS, "none"), ("lerobot", "none")),
+    "smolvla-sample": ((OURS, "none"), (OURS, "LoRA-SP"), ("lerobot", "none")),
     "layer-lora": ((OURS, "LoRA"), (OURS, "LoRA-SP"), ("peft", "LoRA")),
     "layer-dora": ((OURS, "DoRA"), ("peft", "DoRA")),
     "stack": ((OURS, "LoRA"), (OURS, "LoRA-SP"), ("qwix", "LoRA")),

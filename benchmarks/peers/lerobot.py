@@ -69,7 +69,6 @@ def policy_config(job: Job, folder: str) -> Any:
         max_action_dim=shape.dim,
         resize_imgs_with_padding=(shape.image, shape.image),
         tokenizer_max_length=shape.tokens,
-        num_steps=workloads.FLOW_STEPS,
         compile_model=job.compile,
         device=torch_device.device(),
     )
@@ -172,8 +171,10 @@ def sample(job: Job) -> Iterator[Row]:
         def call(batch: dict[str, torch.Tensor] = batch) -> torch.Tensor:
             return policy.predict_action_chunk(dict(batch))
 
-        row = worker.timed(f"batch {size}", call, torch_device.wait, job)
-        yield row | {"samples": size}
+        for steps in job.denoise_steps:
+            policy.config.num_steps = steps  # read in every call
+            item = worker.sampled(size, steps)
+            yield worker.timed(item, call, torch_device.wait, job) | {"samples": size}
 
 
 def measure(job: Job) -> Iterator[Row]:

@@ -5,6 +5,7 @@ here. An empty module takes its place.
 """
 
 import dataclasses
+import functools
 import sys
 import types
 from collections.abc import Iterator
@@ -145,12 +146,10 @@ def sample(job: Job) -> Iterator[Row]:
     run = openpi.nnx_utils.module_jit(model.sample_actions)
     for size in workloads.PI0[job.size].sampled:
         observation = inputs(openpi, job, size)[0]
-
-        def call(observation: Any = observation) -> jax.Array:
-            return run(jax.random.key(1), observation, num_steps=workloads.FLOW_STEPS)
-
-        row = worker.timed(f"batch {size}", call, jax.block_until_ready, job)
-        yield row | {"samples": size}
+        for steps in job.denoise_steps:
+            call = functools.partial(run, jax.random.key(1), observation, num_steps=steps)
+            item = worker.sampled(size, steps)
+            yield worker.timed(item, call, jax.block_until_ready, job) | {"samples": size}
 
 
 def measure(job: Job) -> Iterator[Row]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -17,11 +18,13 @@ from benchmarks.peers.worker import Job, Row
 from lorasp_jax import peft
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.data.batches import Batch
+from lorasp_jax.extras.serving.exported import sampling_options
 from lorasp_jax.models import presets
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig, VisionConfig
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.models.smolvla import SmolVLAConfig
 
 PACKAGES = ("lorasp_jax", "jax", "flax", "optax")
@@ -127,15 +130,17 @@ def train(job: Job) -> Iterator[Row]:
 def sample(job: Job) -> Iterator[Row]:
     """Time sampling with a prepared sampler, from images to actions."""
     config = model_config(job)
-    sampler = nnx.merge(*backbones.drawn(lambda key: config.create(nnx.Rngs(key)))).sampler()
-    run = jax.jit(
-        lambda sampler, observation: sampler.sample_actions(
-            jax.random.key(1), observation, num_steps=workloads.FLOW_STEPS
-        )
-    )
-    for size in workload(job)[1].sampled:
-        call = functools.partial(run, sampler, batch(job, size).observation)
-        yield worker.timed(f"batch {size}", call, jax.block_until_ready, job) | {"samples": size}
+    run = None if job.variant == "none" else backbones.run_config(rules(job)[1], ("all-linear",), 1)
+    sampler = nnx.merge(*backbones.arrays(config, run)).sampler()
+
+    @functools.partial(jax.jit, static_argnums=2, compiler_options=sampling_options())
+    def draw(sampler: Sampler, observation: Observation, steps: int) -> jax.Array:
+        return sampler.sample_actions(jax.random.key(1), observation, num_steps=steps)
+
+    for size, steps in itertools.product(workload(job)[1].sampled, job.denoise_steps):
+        call = functools.partial(draw, sampler, batch(job, size).observation, steps)
+        item = worker.sampled(size, steps)
+        yield worker.timed(item, call, jax.block_until_ready, job) | {"samples": size}
 
 
 def single_layers(job: Job) -> Iterator[Row]:

@@ -35,6 +35,8 @@ class Job:
     """Timed calls."""
     compile: bool
     """Whether programs in PyTorch use `torch.compile`."""
+    denoise_steps: list[int]
+    """Numbers of denoising steps to sample with."""
 
 
 Row = dict[str, Any]
@@ -60,6 +62,11 @@ def timed(item: str, call: Callable[[], Any], wait: Callable[[Any], Any], job: J
     seconds = seconds[job.warmup :]
     middle = statistics.median(seconds)
     return {"item": item, "median_s": middle, "min_s": min(seconds), "max_s": max(seconds)}
+
+
+def sampled(batch: int, denoise_steps: int) -> str:
+    """Name the item of a sampled batch."""
+    return f"batch {batch}, {denoise_steps} denoising steps"
 
 
 def version(name: str) -> str:
@@ -90,6 +97,7 @@ def main(
     parser.add_argument("--warmup", type=int, default=5)
     parser.add_argument("--steps", type=int, default=30)
     parser.add_argument("--compile", action="store_true")
+    parser.add_argument("--denoise-steps", type=int, nargs="+", default=[10])
     parser.add_argument("--result", type=Path, required=True)
     options = vars(parser.parse_args())
     result: Path = options.pop("result")

@@ -107,8 +107,6 @@ LAYERS: dict[Size, Layers] = {
     "tiny": Layers(((64, 128),), 32, 4),
 }
 STACK: dict[Size, Stack] = {"base": Stack(12, 2048, 8192, 128), "tiny": Stack(2, 64, 32, 4)}
-FLOW_STEPS = 10
-"""Denoising steps of one sampled chunk."""
 
 
 def policy_batch(policy: Policy, size: int) -> dict[str, Any]:
