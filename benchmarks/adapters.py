@@ -67,11 +67,19 @@ def make_samplers(config: Any, rules: Any, adapters: int) -> tuple[list[SharedSa
     model = config.create(nnx.Rngs(0))
     base, first = SharedBase(model), adapt(model, rules, rngs=nnx.Rngs(1))
     sampler = base.attach_model(first, model)
-    rng, samplers = np.random.default_rng(0), []
-    for _ in range(adapters):
-        own = [a + rng.normal(0, 0.01, a.shape).astype(a.dtype) for a in sampler.own]
+    keys = jax.random.split(jax.random.key(0), adapters)
+    samplers = []
+    for key in keys:  # in host memory
+        each = jax.random.split(key, len(sampler.own))
+        own = [np.asarray(_near(k, a)) for k, a in zip(each, sampler.own, strict=True)]
         samplers.append(dataclasses.replace(sampler, own=own))
     return samplers, jax.jit(lambda model: model.sampler())(first)
+
+
+@jax.jit
+def _near(key: jax.Array, array: jax.Array) -> jax.Array:
+    """Add noise to one of an adapter's arrays."""
+    return array + (0.01 * jax.random.normal(key, array.shape)).astype(array.dtype)
 
 
 def observations(config: Any, batch: int) -> Observation:
