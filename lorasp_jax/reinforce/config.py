@@ -83,7 +83,8 @@ _IGNORED = {
 class ReinforceConfig(Config):
     """One run of online reinforcement learning; a step is an iteration of rollout and update.
 
-    `optim.batch_size` are the chunks of a gradient step. The learning rate is constant.
+    `optim.batch_size` are the chunks of a gradient step. With ppo, the learning rate follows the KL
+    divergence of the iterations, else it is constant.
     """
 
     online: Learning = field(default_factory=Learning)
