@@ -25,15 +25,17 @@ class Learning:
     """Parallel worlds per task, one episode each in every iteration."""
     std: float = 0.05
     """Standard deviation of exploration [normalized action units]."""
+    correlation: float = 0.9
+    """Correlation of this noise in successive actions of a chunk; 0: new noise in each."""
     reward: Literal["sparse", "dense"] = "sparse"
     """1 on success, or that and the progress of the task's stages."""
-    discount: float = 0.98
+    discount: float = 0.997
     """Discount per control step."""
-    trace: float = 0.95
+    trace: float = 0.99
     """λ of generalized advantage estimation (arXiv 1506.02438)."""
     clip: float = 0.2
     """Largest deviation of the probability ratio of an action from 1 that is rewarded."""
-    epochs: int = 8
+    epochs: int = 4
     """Passes over the chunks of an iteration."""
     max_kl: float = 0.02
     """With ppo, a step whose mean KL divergence per action from the policy that acted exceeds this
@@ -42,6 +44,8 @@ class Learning:
     """The run stops when an action's mean KL divergence from the start policy exceeds this."""
     critic_learning_rate: float = 1e-3
     """Learning rate of the critic."""
+    minutes: float = 0.0
+    """Start no iteration after this time [min]; 0: no limit."""
 
     def __post_init__(self) -> None:
         fields.check_fields(self)
@@ -54,11 +58,15 @@ class Learning:
         for name in ("discount", "trace"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"online.{name} must lie in (0, 1], got {getattr(self, name)}")
+        if not 0 <= self.correlation < 1:
+            raise ValueError(f"online.correlation must lie in [0, 1), got {self.correlation}")
+        if self.minutes < 0:
+            raise ValueError(f"online.minutes must be at least 0, got {self.minutes}")
 
 
 _IGNORED = {
     "reinforcement learning": (
-        *("optim.accumulate", "optim.ema", "optim.warmup_steps", "optim.final_learning_rate"),
+        *("optim.ema", "optim.warmup_steps", "optim.final_learning_rate"),
         *("recap.steps", "recap.share", "recap.dropout", "learn", "keep", "log_every"),
         *("auxiliary.warmup", "evaluation.before"),  # the start is a candidate for the best policy
     ),
@@ -75,7 +83,8 @@ _IGNORED = {
 class ReinforceConfig(Config):
     """One run of online reinforcement learning; a step is an iteration of rollout and update.
 
-    `optim.batch_size` are the chunks of a gradient step. The learning rate is constant.
+    `optim.batch_size` are the chunks of a gradient step. With ppo, the learning rate follows the KL
+    divergence of the iterations, else it is constant.
     """
 
     online: Learning = field(default_factory=Learning)

@@ -15,7 +15,7 @@ import optax
 from lorasp_jax.reinforce.config import Learning
 from lorasp_jax.reinforce.rollout import Transitions
 
-_WIDTH, _BATCH, _STEPS = 64, 512, 100  # our choice, as in examples/ppo.py
+_WIDTH, _BATCH, _EPOCHS = 128, 512, 4  # our choice
 _LIMIT = 5.0
 """Normalized states are clipped to this magnitude."""
 _LEAST = 0.05
@@ -149,6 +149,6 @@ def _fit(
         updates, opt_state = optimizer.update(gradient, opt_state)
         return (optax.apply_updates(layers, updates), opt_state), error
 
-    learned = (critic.layers, critic.opt_state)
-    (layers, opt_state), errors = jax.lax.scan(step, learned, jax.random.split(key, _STEPS))
+    learned, count = (critic.layers, critic.opt_state), -(-_EPOCHS * len(states) // _BATCH)
+    (layers, opt_state), errors = jax.lax.scan(step, learned, jax.random.split(key, count))
     return Critic(layers, opt_state, critic.mean, critic.std), errors

@@ -119,6 +119,8 @@ class _Clock:
 
     def collapse(self, config: ReinforceConfig, values: Mapping[str, float]) -> str:
         """Say in a sentence why going on is useless; "" if it is not."""
+        if 0 < config.online.minutes <= values.get("minutes", 0):
+            return f"it has learned for {values['minutes']:.1f} minutes"
         now, first = (
             round(sum(config.online.worlds * row[f"rollout/{task}"] for task in config.tasks))
             for row in (values, self._first)
@@ -165,7 +167,7 @@ def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]
             env,
             policy,
             key,
-            config.online.std,
+            noise.Spread.of(config.online),
             execute_steps=execute,
             denoise_steps=config.evaluation.denoise_steps,
             ranges=config.ranges,
@@ -182,7 +184,9 @@ def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]
         values["steps"] += float(jnp.sum(~found.steps.done))
     batch = jax.tree.map(lambda *x: jnp.concatenate(x), *batches)
     key = jax.random.fold_in(RandomStream.TRAINING.key(config.seed), step)
-    state, rows = update.improve(setting.programs, state, setting.frozen, batch, key)
+    rows = {}
+    if step or not critics:  # a critic that has learned nothing only adds noise
+        state, rows = update.improve(setting.programs, state, setting.frozen, batch, key)
     values |= _summary(setting, state, batch, rows)
     state = dataclasses.replace(state, step=state.step + 1, critics=critics)
     return jax.device_put(state, setting.shardings), values
@@ -216,10 +220,11 @@ def _summary(
         for x in (state.adapters, setting.start)
     )
     slots = noise.action_slots(setting.frozen.processor)
-    kl = noise.divergence(now, start, setting.config.online.std, slots)
+    kl = noise.divergence(now, start, noise.Spread.of(setting.config.online), slots)
     executed = kl[:, : setting.config.evaluation.execute_steps]
     extra = {"start_kl": float(jnp.mean(executed)), "in_a_row": float(rows["in_a_row"][-1])}
-    return values | extra | {"updates": len(rows["loss"])}
+    rate = setting.config.optim.learning_rate * float(state.rate)
+    return values | extra | {"updates": len(rows["loss"]), "learning_rate": rate}
 
 
 _learn = functools.partial(jax.jit, static_argnums=4)(critic.learn)

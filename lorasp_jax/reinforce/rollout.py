@@ -17,6 +17,7 @@ from lorasp_jax.evaluation.programs import Worlds
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import RawObservation
 from lorasp_jax.reinforce import noise
+from lorasp_jax.reinforce.noise import Spread
 from lorasp_jax.training.distributed import mesh as meshes
 
 
@@ -76,7 +77,7 @@ def collect(
     env: Env,
     policy: Policy,
     key: jax.Array,
-    std: float,
+    spread: Spread,
     *,
     execute_steps: int,
     denoise_steps: int,
@@ -88,21 +89,21 @@ def collect(
         env: W worlds.
         policy: on one device, or sharded over a mesh, which then shares the worlds, too.
         key: determines layouts, start poses, instructions and noise.
-        std: standard deviation of exploration [normalized action units].
+        spread: distribution of the noise.
         execute_steps: S, actions executed from each chunk.
         denoise_steps: Euler steps.
         ranges: as in `env.reset`.
     """
     worlds = Worlds(env, policy, key, ranges)
     rows = jnp.asarray(policy.processor.prompts.rows(env.instructions))
-    worlds.state = _spread(worlds.state, policy)
-    chunks, steps = [], []
+    worlds.state = _over_devices(worlds.state, policy)
+    spread, chunks, steps = Spread(*map(np.float32, spread)), [], []
     for call in range(-(-env.max_steps // execute_steps)):
         now = jax.random.fold_in(worlds.sample_key, call)
         if call:
             worlds.state = _restart(env, worlds.state, now, ranges)
         prompts = rows[worlds.state.info["instruction"]]
-        inputs = now, worlds.observe(), prompts, np.float32(std), denoise_steps, execute_steps
+        inputs = now, worlds.observe(), prompts, spread, denoise_steps, execute_steps
         actions, chunk = _explore()(worlds.policy, *inputs)
         worlds.state, step = _act(env, worlds.state, actions)
         chunks.append(chunk)
@@ -124,7 +125,7 @@ def of_successes(steps: Transitions) -> jax.Array:
     return jax.lax.scan(body, jnp.zeros_like(steps.done[0]), steps, reverse=True)[1]
 
 
-def _spread(tree: Any, policy: Policy) -> Any:
+def _over_devices(tree: Any, policy: Policy) -> Any:
     """Spread worlds over the devices of the policy, if there are several."""
     sharding = jax.tree.leaves(policy.model)[0].sharding
     if len(sharding.device_set) == 1:
@@ -144,7 +145,7 @@ def explore(
     key: jax.Array,
     observation: RawObservation,
     prompts: jax.Array,
-    std: jax.Array,
+    spread: Spread,
     denoise_steps: int,
     execute_steps: int,
 ) -> tuple[jax.Array, Chunks]:
@@ -160,7 +161,7 @@ def explore(
         slots=processor.flow_slots,
     )
     slots = noise.action_slots(processor)
-    actions = noise.explore(action_key, mean[:, :execute_steps], std, slots)
+    actions = noise.explore(action_key, mean[:, :execute_steps], spread, slots)
     whole = jnp.concatenate([actions, mean[:, execute_steps:]], axis=1)
     chunks = Chunks(observation, prompts, initial, whole)
     return processor.decode(actions, observation["state"]), chunks

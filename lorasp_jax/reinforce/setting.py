@@ -63,10 +63,10 @@ def prepare(run: Run) -> tuple[Setting, Learner, Any]:
     rate = config.optim.learning_rate
     constant = dataclasses.replace(config.optim, final_learning_rate=rate, warmup_steps=0)
     optimizer = make_optimizer(constant, methods)
-    zero = jnp.zeros((), jnp.int32)
+    zero, one = jnp.zeros((), jnp.int32), jnp.ones(())
     critics = _critics(config, environments)
     adapters = jax.tree.map(jnp.copy, adapters)
-    state = Learner(zero, adapters, optimizer.init(adapters), Guard.initial(), critics)
+    state = Learner(zero, adapters, optimizer.init(adapters), Guard.initial(), critics, one)
     shardings = meshes.shardings(state, mesh)
     state = jax.device_put(state, shardings)
     processor = run.policy.processor

@@ -38,6 +38,7 @@ class Learner:
         adapters: trainable parameters, an `nnx.State`.
         guard: statistics that decide which updates to skip.
         critics: by task; empty unless the method is ppo.
+        rate: `[]` factor of the learning rate, which follows the KL divergence of the iterations.
     """
 
     step: jax.Array
@@ -45,6 +46,7 @@ class Learner:
     opt_state: Any
     guard: Guard
     critics: dict[str, Critic]
+    rate: jax.Array
 
 
 class WeightedChunks(NamedTuple):
@@ -61,6 +63,9 @@ class WeightedChunks(NamedTuple):
     valid: jax.Array
     means: jax.Array
 
+
+_FACTOR = 1.5
+"""By how much an iteration changes the learning rate; our choice."""
 
 Loss = Callable[[Any, Frozen, WeightedChunks, jax.Array], tuple[jax.Array, Metrics]]
 """(adapters, frozen, batch, key) -> loss and metrics."""
@@ -81,7 +86,7 @@ def make_loss(config: ReinforceConfig, graphdef: Any) -> Loss:
         surrogate_loss,
         graphdef=graphdef,
         weights=weights,
-        std=config.online.std,
+        spread=noise.Spread.of(config.online),
         clip=config.online.clip,
         denoise_steps=config.evaluation.denoise_steps,
     )
@@ -118,14 +123,14 @@ def surrogate_loss(
     *,
     graphdef: Any,
     weights: dict[str, Any],
-    std: float,
+    spread: noise.Spread,
     clip: float,
     denoise_steps: int,
 ) -> tuple[jax.Array, Metrics]:
     """Return PPO's loss (arXiv 1707.06347, eq. 7), with one probability ratio per action."""
     mean, aux = means(adapters, frozen, batch.chunks, graphdef, denoise_steps)
     slots = noise.action_slots(frozen.processor)
-    new, old = (noise.log_prob(x, batch.chunks.actions, std, slots) for x in (mean, batch.means))
+    new, old = (noise.log_prob(x, batch.chunks.actions, spread, slots) for x in (mean, batch.means))
     ratio, advantages = jnp.exp(new - old), batch.advantages
     average = lambda x: jnp.sum(x * batch.valid) / jnp.maximum(jnp.sum(batch.valid), 1)  # noqa: E731
     clipped = jnp.clip(ratio, 1 - clip, 1 + clip)
@@ -134,7 +139,7 @@ def surrogate_loss(
     total += sum(weights[name] * value for name, value in losses.items())
     metrics = {
         "loss": total,
-        "kl": average(noise.divergence(mean, batch.means, std, slots)),
+        "kl": average(noise.divergence(mean, batch.means, spread, slots)),
         "clipped": average(clipped != ratio),
         "ratio": average(ratio),
         **losses,
@@ -168,40 +173,68 @@ class Programs:
         shardings: Learner,
     ) -> None:
         """`shardings` are those of the state."""
-        mesh, loss = shardings.step.mesh, make_loss(config, graphdef)
+        mesh = shardings.step.mesh
         self.config: ReinforceConfig = config
-
-        def take(tree: Any, index: jax.Array) -> Any:
-            rows = jax.tree.map(lambda x: x[index], tree)
-            return jax.lax.with_sharding_constraint(rows, meshes.batch_sharding(mesh))
-
-        def old(adapters: Any, frozen: Frozen, chunks: Chunks, index: jax.Array) -> jax.Array:
-            steps = config.evaluation.denoise_steps
-            return means(adapters, frozen, take(chunks, index), graphdef, steps)[0]
-
-        def update(
-            state: Learner, frozen: Frozen, batch: WeightedChunks, index: jax.Array, key: jax.Array
-        ) -> tuple[Learner, Metrics]:
-            inputs = state.adapters, frozen, take(batch, index), key
-            gradient, metrics = jax.grad(loss, has_aux=True)(*inputs)
-            norm, spike = optax.tree.norm(gradient), config.optim.spike
-            accept, guard = guards.check_step(state.guard, metrics["loss"], norm, spike)
-            updates, opt_state = optimizer.update(gradient, state.opt_state, state.adapters)
-            adapters = optax.apply_updates(state.adapters, updates)
-            after = dataclasses.replace(state, adapters=adapters, opt_state=opt_state, guard=guard)
-            before = dataclasses.replace(state, guard=guard)
-            within = metrics.get("kl", 0.0) <= jnp.asarray(config.online.max_kl)
-            metrics |= {"grad_norm": norm, "in_a_row": guard.in_a_row, "within": within}
-            return guards.select(accept & within, after, before), metrics
-
+        self._graphdef, self._optimizer, self._mesh = graphdef, optimizer, mesh
+        self._gradient_of = jax.grad(make_loss(config, graphdef), has_aux=True)
         options = compilation.step_options(mesh.size)
-        self.means: Callable[..., Any] = jax.jit(old, compiler_options=options)
+        self.means: Callable[..., Any] = jax.jit(self._means, compiler_options=options)
         self.update: Callable[..., Any] = jax.jit(
-            update,
+            self._update,
             donate_argnames="state",
             out_shardings=(shardings, meshes.replicated(mesh)),
             compiler_options=options,
         )
+
+    def _parts(self, index: jax.Array) -> jax.Array:
+        """Split indices into those of micro-batches."""
+        return index.reshape(self.config.optim.accumulate, -1)
+
+    def _take(self, tree: Any, index: jax.Array) -> Any:
+        rows = jax.tree.map(lambda x: x[index], tree)
+        return jax.lax.with_sharding_constraint(rows, meshes.batch_sharding(self._mesh))
+
+    def _means(self, adapters: Any, frozen: Frozen, chunks: Chunks, index: jax.Array) -> jax.Array:
+        def part(index: jax.Array) -> jax.Array:
+            rows, steps = self._take(chunks, index), self.config.evaluation.denoise_steps
+            return means(adapters, frozen, rows, self._graphdef, steps)[0]
+
+        found = jax.lax.map(part, self._parts(index))
+        return found.reshape(-1, *found.shape[2:])
+
+    def _gradient(
+        self, adapters: Any, frozen: Frozen, batch: WeightedChunks, index: jax.Array, key: jax.Array
+    ) -> tuple[Any, Metrics]:
+        """Return the means of gradient and metrics over micro-batches."""
+
+        def add(total: Any, index: jax.Array) -> tuple[Any, Metrics]:
+            found, metrics = self._gradient_of(adapters, frozen, self._take(batch, index), key)
+            return jax.tree.map(jnp.add, total, found), metrics
+
+        zeros, parts = jax.tree.map(jnp.zeros_like, adapters), self._parts(index)
+        total, metrics = jax.lax.scan(add, zeros, parts)
+        gradient = jax.tree.map(lambda x: x / len(parts), total)
+        return gradient, jax.tree.map(lambda x: x.mean(0), metrics)
+
+    def _update(
+        self,
+        state: Learner,
+        frozen: Frozen,
+        batch: WeightedChunks,
+        index: jax.Array,
+        key: jax.Array,
+    ) -> tuple[Learner, Metrics]:
+        gradient, metrics = self._gradient(state.adapters, frozen, batch, index, key)
+        norm, spike = optax.tree.norm(gradient), self.config.optim.spike
+        accept, guard = guards.check_step(state.guard, metrics["loss"], norm, spike)
+        updates, opt_state = self._optimizer.update(gradient, state.opt_state, state.adapters)
+        updates = jax.tree.map(lambda x: state.rate * x, updates)
+        adapters = optax.apply_updates(state.adapters, updates)
+        after = dataclasses.replace(state, adapters=adapters, opt_state=opt_state, guard=guard)
+        before = dataclasses.replace(state, guard=guard)
+        within = metrics.get("kl", 0.0) <= jnp.asarray(self.config.online.max_kl)
+        metrics |= {"grad_norm": norm, "in_a_row": guard.in_a_row, "within": within}
+        return guards.select(accept & within, after, before), metrics
 
 
 def improve(
@@ -233,8 +266,16 @@ def improve(
             state, metrics = programs.update(state, frozen, batch, index, step_key)
             rows.append(jax.device_get(metrics))
             if not rows[-1]["within"]:
-                return state, _stack(rows)
-    return state, _stack(rows)
+                return _adapt(config, state, rows), _stack(rows)
+    return _adapt(config, state, rows), _stack(rows)
+
+
+def _adapt(config: ReinforceConfig, state: Learner, rows: list[Metrics]) -> Learner:
+    """Adapt the learning rate so that an iteration ends with about the KL divergence allowed."""
+    last = float(rows[-1].get("kl", config.online.max_kl))
+    factor = 1 / _FACTOR if not rows[-1]["within"] else 1.0
+    factor = _FACTOR if last < config.online.max_kl / 2 else factor
+    return dataclasses.replace(state, rate=state.rate * factor)
 
 
 def _stack(rows: list[Metrics]) -> dict[str, np.ndarray]:

@@ -29,8 +29,8 @@ def test_generalized_advantages_are_sums_of_errors():
 
 def test_a_critic_learns_the_returns():
     """Reward 1 after one step if the state is positive."""
-    state = jax.random.normal(jax.random.key(0), (4, 128, 3))
-    ended, done = jnp.ones((4, 128), bool), jnp.zeros((4, 128), bool)
+    state = jax.random.normal(jax.random.key(0), (4, 512, 3))
+    ended, done = jnp.ones((4, 512), bool), jnp.zeros((4, 512), bool)
     reward = (state[..., 0] > 0).astype(jnp.float32)
     steps, model = (
         Transitions(state, done, ended, done, reward),
@@ -38,8 +38,8 @@ def test_a_critic_learns_the_returns():
     )
     learning = Learning(discount=DISCOUNT, trace=TRACE, critic_learning_rate=1e-2)
     learn = jax.jit(critic.learn, static_argnums=4)
-    keys = jax.random.split(jax.random.key(2), 4)
-    for number in range(4):
+    keys = jax.random.split(jax.random.key(2), 20)
+    for number in range(20):
         advantages, model, metrics = learn(model, steps, state[0], keys[number], learning)
     assert metrics["explained_variance"] > 0.8
     assert jnp.abs(model(jnp.array([[2.0, 0, 0], [-2.0, 0, 0]])) - jnp.array([1, 0])).max() < 0.1

@@ -47,8 +47,9 @@ def test_a_run_logs_what_the_report_shows(whole):
     assert np.all(np.diff([row["environment_steps"] for row in rows]) > 0)
     assert np.all(np.diff([row["minutes"] for row in rows]) > 0)
     names = {"rollout/press", "kl", "start_kl", "clipped", "explained_variance/press"}
-    assert names <= rows[0].keys()
-    assert rows[0]["start_kl"] < rows[-1]["start_kl"]
+    assert names <= rows[1].keys()
+    assert rows[0]["updates"] == 0  # the critic learns first
+    assert rows[1]["start_kl"] < rows[-1]["start_kl"]
 
 
 def test_a_stopped_run_resumes_to_the_bit(whole, tmp_path):
@@ -98,12 +99,19 @@ def test_the_best_adapters_are_kept(tmp_path):
 def test_a_policy_far_from_the_start_stops_the_run(tmp_path):
     learn = dataclasses.replace(rooms.config().online, max_start_kl=1e-6)
     run = train(tmp_path, online=learn)
-    assert len(read_metrics(tmp_path)) == 1
-    expected = "stopped after iteration 1: the KL divergence from the start policy is"
+    assert len(read_metrics(tmp_path)) == 2
+    expected = "stopped after iteration 2: the KL divergence from the start policy is"
     assert expected in run.console.file.getvalue().replace("\n", " ")
     resumed = train(tmp_path, online=learn, resume=True)
-    assert len(read_metrics(tmp_path)) == 1
+    assert len(read_metrics(tmp_path)) == 2
     assert expected in resumed.console.file.getvalue().replace("\n", " ")
+
+
+def test_a_run_ends_in_time(tmp_path):
+    learn = dataclasses.replace(rooms.config().online, minutes=1e-6)
+    run = train(tmp_path, online=learn)
+    assert len(read_metrics(tmp_path)) == 1
+    assert "stopped after iteration 1: it has learned for" in run.console.file.getvalue()
 
 
 def test_lost_success_stops_the_run():

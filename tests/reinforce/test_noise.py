@@ -7,12 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
-from jax.scipy.stats import norm
+from jax.scipy.stats import multivariate_normal
 
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.reinforce import noise
+from lorasp_jax.reinforce.noise import Spread
 from tests.models.random_models import random_backbone
 from tests.runs import CONFIG, make_run
 
@@ -23,32 +24,49 @@ def draw(seed, *shape):
     return jax.random.normal(jax.random.key(seed), shape)
 
 
-def test_log_probabilities_are_those_of_a_normal_distribution():
+def covariance(spread, length):
+    past = np.abs(np.subtract.outer(np.arange(length), np.arange(length)))
+    return spread.std**2 * spread.correlation**past
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.9])
+def test_log_probabilities_are_those_of_a_normal_distribution(correlation):
     mean, actions = draw(0, 5, 3, 4), draw(1, 5, 3, 4)
-    expected = norm.logpdf(actions, mean, 0.3)[..., SLOTS].sum(-1)
-    np.testing.assert_allclose(noise.log_prob(mean, actions, 0.3, SLOTS), expected, rtol=1e-5)
+    spread = Spread(0.3, correlation)
+    found = noise.log_prob(mean, actions, spread, SLOTS)
+    assert found.shape == (5, 3)
+    together = covariance(spread, 3)
+    change = jnp.swapaxes(actions - mean, 1, 2)[:, SLOTS]
+    for length in (1, 2, 3):  # each action given the earlier ones
+        part = change[..., :length], np.zeros(length), together[:length, :length]
+        expected = multivariate_normal.logpdf(*part).sum(-1)
+        np.testing.assert_allclose(found[:, :length].sum(-1), expected, rtol=2e-4)
 
 
 def test_probabilities_of_two_actions_integrate_to_one():
     grid = jnp.linspace(-1, 2, 301)
     actions = jnp.stack(jnp.meshgrid(grid, grid), axis=-1)
-    density = jnp.exp(noise.log_prob(jnp.array([0.4, 0.6]), actions, 0.1, np.ones(2, bool)))
+    actions = actions[..., None, :]
+    spread, mean = Spread(0.1, 0.5), jnp.array([[0.4, 0.6]])
+    density = jnp.exp(noise.log_prob(mean, actions, spread, np.ones(2, bool)))
     assert float(density.sum() * 0.01**2) == pytest.approx(1, abs=1e-4)
 
 
 def test_divergence_is_the_mean_difference_of_log_probabilities():
-    mean, other = draw(0, 4) * 0.1, draw(1, 4) * 0.1
-    actions = noise.explore(jax.random.key(2), jnp.broadcast_to(mean, (100_000, 4)), 0.2, SLOTS)
-    difference = [noise.log_prob(x, actions, 0.2, SLOTS) for x in (mean, other)]
-    sampled = float(jnp.mean(difference[0] - difference[1]))
-    assert sampled == pytest.approx(float(noise.divergence(mean, other, 0.2, SLOTS)), rel=0.03)
+    spread, mean, other = Spread(0.2, 0.7), draw(0, 3, 4) * 0.1, draw(1, 3, 4) * 0.1
+    many = jnp.broadcast_to(mean, (100_000, 3, 4))
+    actions = noise.explore(jax.random.key(2), many, spread, SLOTS)
+    difference = [noise.log_prob(x, actions, spread, SLOTS) for x in (mean, other)]
+    sampled = jnp.mean(difference[0] - difference[1], axis=0)
+    np.testing.assert_allclose(sampled, noise.divergence(mean, other, spread, SLOTS), rtol=0.04)
 
 
 def test_exploration_leaves_other_slots_alone():
-    mean = draw(0, 1000, 4)
-    change = noise.explore(jax.random.key(1), mean, 0.1, SLOTS) - mean
-    assert not change[:, ~SLOTS].any()
-    np.testing.assert_allclose(jnp.std(change[:, SLOTS], axis=0), 0.1, rtol=0.1)
+    mean, spread = draw(0, 20_000, 3, 4), Spread(0.1, 0.8)
+    change = noise.explore(jax.random.key(1), mean, spread, SLOTS) - mean
+    assert not change[..., ~SLOTS].any()
+    found = jnp.cov(change[..., 0].T)
+    np.testing.assert_allclose(found, covariance(spread, 3), rtol=0.05)
 
 
 @pytest.fixture(scope="module")

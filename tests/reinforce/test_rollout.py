@@ -17,7 +17,7 @@ def policy(tmp_path_factory):
 
 
 def collect(policy, room, std=0.2):
-    return rollout.collect(room, policy, jax.random.key(4), std, **OPTIONS)
+    return rollout.collect(room, policy, jax.random.key(4), noise.Spread(std, 0.0), **OPTIONS)
 
 
 def test_the_recorded_noise_gives_the_mean_of_the_actions(policy):
@@ -75,7 +75,7 @@ def test_restarts_and_noise_have_keys_of_their_own(policy, monkeypatch):
     image = np.zeros((8, 32, 32, 3), np.uint8)
     raw = {"image": {"side": image, "wrist": image}, "state": np.zeros((8, 7), "f")}
     sampled = type(policy)(policy.with_sampler().model, policy.processor.shared())
-    rollout.explore(sampled, key, raw, np.zeros(8, np.int32), 0.1, 1, 2)
+    rollout.explore(sampled, key, raw, np.zeros(8, np.int32), noise.Spread(0.1, 0.5), 1, 2)
     rollout._restart.__wrapped__(room, None, key, None)
     first, second = map(jax.random.key_data, drawn)
     assert not np.array_equal(first, second)

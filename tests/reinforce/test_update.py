@@ -31,7 +31,8 @@ KEY = jax.random.key(9)
 def settings(size=32, epochs=4, method="ppo", **changes):
     if method == "ppo":
         changes = {"max_kl": 0.1} | changes
-    learn = dataclasses.replace(Learning(method=method, std=STD, epochs=epochs), **changes)
+    learn = Learning(method=method, std=STD, correlation=0.0, epochs=epochs)
+    learn = dataclasses.replace(learn, **changes)
     optim = dataclasses.replace(rooms.config().optim, batch_size=size)
     auxiliary = AuxiliaryConfig(0, 0, 0, 0)
     return rooms.config(online=learn, optim=optim, auxiliary=auxiliary)
@@ -72,7 +73,7 @@ def make(model, processor, config=None, rate=3e-2):
     optimizer = optax.adam(rate)
     zero = jnp.zeros((), jnp.int32)
     adapters = jax.tree.map(jnp.copy, adapters)
-    state = Learner(zero, adapters, optimizer.init(adapters), Guard.initial(), {})
+    state = Learner(zero, adapters, optimizer.init(adapters), Guard.initial(), {}, jnp.ones(()))
     shardings = meshes.shardings(state, meshes.make_mesh(devices=jax.devices()[:1]))
     programs = update.Programs(config or settings(), graphdef, optimizer, shardings)
     return programs, jax.device_put(state, shardings), Frozen(parameters, processor)
@@ -86,7 +87,7 @@ def chunks(processor, means, key, std=STD, count=CHUNKS):
     raw = {"image": {"side": image, "wrist": image}, "state": state}
     flow = jax.random.normal(jax.random.key(1), (count, config.chunk, config.action_dim))
     mean = jnp.broadcast_to(means, (count, *means.shape))
-    actions = noise.explore(key, mean, std, noise.action_slots(processor))
+    actions = noise.explore(key, mean, noise.Spread(std, 0.0), noise.action_slots(processor))
     return Chunks(raw, np.zeros(count, np.int32), flow, actions)
 
 
@@ -154,7 +155,8 @@ def test_without_learning_the_ratio_is_exactly_one(processor, tmp_path):
     programs, state, frozen = make(policy.model, processor, settings(8, 2), rate=0.0)
     data = chunks(processor, jnp.zeros((EXECUTED, 8)), jax.random.key(0), count=24)
     advantages = jax.random.normal(jax.random.key(2), (24, EXECUTED))
-    _, rows = update.improve(programs, state, frozen, batch(data, advantages), KEY)
+    state, rows = update.improve(programs, state, frozen, batch(data, advantages), KEY)
+    assert float(state.rate) == 1.5  # the policy may change more
     assert len(rows["ratio"]) == 6
     np.testing.assert_array_equal(rows["ratio"], 1)
     np.testing.assert_array_equal(rows["clipped"], 0)
@@ -168,8 +170,25 @@ def test_an_iteration_ends_when_the_policy_has_changed_enough(processor):
     state, rows = update.improve(programs, state, frozen, batch(data, advantages), KEY)
     assert rows["within"].tolist() == [True, False]  # the second step is undone
     assert rows["kl"][1] > 0.1
+    assert float(state.rate) == pytest.approx(1 / 1.5)
     change = np.abs(np.asarray(state.adapters["chunk"].get_value()) - before).max()
     assert change == pytest.approx(1.0, rel=1e-3)  # that of Adam's first step
+
+
+def test_micro_batches_add_up(processor):
+    found = []
+    for parts in (1, 4):
+        config = settings(CHUNKS, 1)
+        optim = dataclasses.replace(config.optim, accumulate=parts)
+        config = dataclasses.replace(config, optim=optim)
+        programs, state, frozen = make(Bandit(), processor, config)
+        data = chunks(processor, jnp.zeros((EXECUTED, 8)), jax.random.key(0))
+        advantages = jax.random.normal(jax.random.key(2), (CHUNKS, EXECUTED))
+        state, rows = update.improve(programs, state, frozen, batch(data, advantages), KEY)
+        assert rows["loss"].shape == (1,)
+        found.append((state.adapters["chunk"].get_value(), rows["grad_norm"]))
+    for one, four in zip(*found, strict=True):
+        np.testing.assert_allclose(one, four, rtol=1e-4)
 
 
 def test_a_step_that_is_not_finite_is_skipped(processor):
