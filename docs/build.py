@@ -37,6 +37,7 @@ API = {
 OUTSIDE = (
     "assets/**/*.gif",
     "assets/*.png",
+    "assets/README.md",
     "deploy/README.md",
     "examples/*/README.md",
     "notebooks/*.ipynb",

@@ -151,12 +151,13 @@ def test_an_incomplete_policy_is_rejected(tmp_path, changes):
 
 
 @pytest.mark.parametrize("path", BASES, ids=lambda path: path.name)
-def test_bundled_bases_load_and_match_their_model_cards(path):
+def test_bundled_bases_load_and_match_the_model_card(path):
     backbone, size = path.name.split("_")
     model_config = ModelConfig(backbone=backbone, size=size, dtype="bfloat16")
     model, base_hash = base.base_model(dataclasses.replace(CONFIG, model=model_config))
     assert base_hash == models.weights_hash(path)
-    assert f"{adaptation.count(model).total:,} parameters" in (path / "README.md").read_text()
+    size = f"{adaptation.count(model).total:,} parameters"
+    assert f"| `{path.name}` | {size}" in path.with_name("README.md").read_text()
     assert model.config.dtype == "bfloat16"
 
 
