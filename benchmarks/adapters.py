@@ -89,10 +89,12 @@ def observations(config: Any, batch: int) -> Observation:
     return jax.tree.map(draw, abstract_observation(config, batch))
 
 
-@functools.partial(jax.jit, static_argnames="steps", compiler_options=sampling_options())
-def sample(sampler: Any, obs: Observation, noise: jax.Array, *, steps: int) -> jax.Array:
+def chunks(sampler: Any, obs: Observation, noise: jax.Array, *, steps: int) -> jax.Array:
     """Sample with one adapter."""
     return sampler.sample_actions(None, obs, noise=noise, num_steps=steps)
+
+
+sample = jax.jit(chunks, static_argnames="steps", compiler_options=sampling_options())
 
 
 @functools.partial(jax.jit, static_argnames="steps", compiler_options=sampling_options())
@@ -107,7 +109,7 @@ def sample_mixed(
     """Sample each row with an adapter of its own."""
 
     def one(sampler: SharedSampler, row: tuple[Observation, jax.Array]) -> jax.Array:
-        return sample(sampler, *jax.tree.map(lambda a: a[None], row), steps=steps)[0]
+        return chunks(sampler, *jax.tree.map(lambda a: a[None], row), steps=steps)[0]
 
     return by_row(one, sampler, adapters, (obs, noise))
 
