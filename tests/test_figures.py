@@ -91,3 +91,26 @@ def test_the_table_of_other_programs_shows_what_was_measured():
         rate = 32e3 / np.mean([row["ms"] for row in rows])
         measured.append((f"{rate:.1f}", f"{rows[0]['GiB']:.1f}"))
     assert shown == measured
+
+
+def test_the_table_of_policy_calls_shows_what_was_measured():
+    found = json.loads((PERFORMANCE / "peers.json").read_text())["tables"]
+    page = (ROOT / "docs/benchmarks.md").read_text().partition("## Policy calls")[2]
+    shown = [
+        re.findall(r"\| ([\d.]+)(?= \|)", line) for line in page.split("\n") if line[:3] in _ROWS
+    ]
+    items = [f"batch {batch}, {n} denoising steps" for batch in (1, 8) for n in (10, 2, 1)]
+    measured = []
+    for name, *variant in _CALLS:
+        rows = [row for row in found[name] if [row["program"], row["variant"]] == variant]
+        times = [np.mean([row["ms"] for row in rows if row["item"] == item]) for item in items]
+        measured.append([f"{time:.1f}" for time in times])
+    assert shown == measured
+
+
+_ROWS = ("| π", "| S")
+_CALLS = [
+    (f"{backbone}-sample", program, variant)
+    for backbone, peer in (("pi0", "openpi"), ("smolvla", "lerobot"))
+    for program, variant in (("ours", "none"), ("ours", "LoRA-SP"), (peer, "none"))
+]

@@ -75,30 +75,44 @@ def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
     made = {"augmentation": _parts_table(results)}
     for backbone in BACKBONES:
         for scene in SCENES:
-            made[f"{backbone} {scene}"] = _success_table(points, backbone, scene)
+            made[f"{backbone} {scene}"] = _success_table(results, points, backbone, scene)
         made[f"{backbone} steps"] = _steps_table(results, backbone)
         made[f"{backbone} error"] = _error_table(results, backbone)
     return made
 
 
-def _success_table(points: Mapping[Any, Any], backbone: str, scene: str) -> str:
+def _success_table(results: Results, points: Mapping[Any, Any], backbone: str, scene: str) -> str:
     head = [f"{BACKBONES[backbone]}, {SCENES[scene]} [%]", "augmentation"]
     head += [f"N = {n}" for n in COUNTS]
-    rows = [
-        [LABELS[method], AUGMENT[kind], *map(page.percent, points[backbone, scene, kind][method])]
-        for method in LABELS
-        for kind in AUGMENT
-    ]
+    rows = []
+    for method, kind in itertools.product(LABELS, AUGMENT):
+        found = [_names(results, backbone, method, kind, n) for n in COUNTS]
+        cells = map(_percent, points[backbone, scene, kind][method], found)
+        rows.append([LABELS[method], AUGMENT[kind], *cells])
     return page.table(head, rows)
+
+
+def _names(results: Results, *where: Any) -> list[str]:
+    """Return the policies of a backbone, method, kind and N that have run."""
+    return [name for seed in SEEDS if (name := cell(*where, seed)) in results]
+
+
+def _percent(estimate: Estimate, names: Sequence[str]) -> str:
+    """Return a rate, with the number of seeds where some have not run."""
+    seeds = len(names)
+    return page.percent(estimate) + (f" ({seeds} of {len(SEEDS)})" if seeds < len(SEEDS) else "")
 
 
 def _parts_table(results: Results) -> str:
     """Return success by the parts of augmentation."""
     rows = []
     for part, label in PARTS.items():
-        found = [results[cell(b, STEPPED, part, COUNTS[-1], SEEDS[0])] for b in BACKBONES]
-        rates = [statistics.success(_outcomes([x], scene)) for x in found for scene in SCENES]
-        rows.append([label, *map(page.percent, rates)])
+        cells = []
+        for backbone, scene in itertools.product(BACKBONES, SCENES):
+            result = results.get(cell(backbone, STEPPED, part, COUNTS[-1], SEEDS[0]))
+            rate = statistics.success(_outcomes([result], scene)) if result else None
+            cells.append(page.percent(rate) if rate else page.NONE)
+        rows.append([label, *cells])
     head = [f"{name}, {scene}" for name in BACKBONES.values() for scene in SCENES.values()]
     return page.table(["augmentation", *head], rows)
 
@@ -111,8 +125,9 @@ def _steps_table(results: Results, backbone: str) -> str:
         cells = []
         for steps in lengths:
             at = backbone, STEPPED, kind(augment, steps), n
-            errors = [results[cell(*at, seed)]["action_error"] for seed in SEEDS]
-            shown = page.percent(_estimate(results, *at, "recorded"))
+            names = _names(results, *at)
+            errors = [results[name]["action_error"] for name in names]
+            shown = _percent(_estimate(results, *at, "recorded"), names)
             cells.append(f"{shown}; {np.mean(errors):.3f}")
         rows.append([AUGMENT[augment], f"{n}", *cells])
     head = [f"{BACKBONES[backbone]}: augmentation", "N", *(f"{n:,} steps" for n in lengths)]
@@ -123,7 +138,7 @@ def _error_table(results: Results, backbone: str) -> str:
     """Return how well measures of held-out demonstrations rank policies by success."""
     rows = []
     names = {
-        n: [cell(backbone, m, a, n, s) for m in LABELS for a in AUGMENT for s in SEEDS]
+        n: [name for m in LABELS for a in AUGMENT for name in _names(results, backbone, m, a, n)]
         for n in COUNTS
     }
     everything = [name for group in names.values() for name in group]
@@ -156,7 +171,7 @@ def _correlation(errors: Sequence[float], rates: Sequence[float]) -> str:
 def _estimate(
     results: Results, backbone: str, method: str, kind: str, count: int, scene: str
 ) -> Estimate:
-    found = [results[cell(backbone, method, kind, count, seed)] for seed in SEEDS]
+    found = [results[name] for name in _names(results, backbone, method, kind, count)]
     return statistics.success(_outcomes(found, scene))
 
 

@@ -66,4 +66,5 @@ def get_study(scale: str) -> Study:
                 evaluate = functools.partial(judge, delay=delay)
                 group = f"{backbone}/{name}"
                 cells.append(Cell(f"{group}/s{seed}", made, (), group, evaluate=evaluate))
-    return Study("flow_steps", tuple(cells), measure=measure, page=page.blocks)
+    made = {"measure": measure, "page": page.blocks, "partial": True}
+    return Study("flow_steps", tuple(cells), **made)

@@ -103,8 +103,9 @@ def test_cameras_on_the_wrist():
 
 def test_default_recipe():
     assert AugmentConfig().chosen(simulated=True) is None
-    assert AugmentConfig().chosen(simulated=False) == AugmentConfig("openpi", crop=1.0)
-    assert AugmentConfig(crop=0.9).chosen(simulated=False) == AugmentConfig("openpi", crop=0.9)
+    colors = AugmentConfig("openpi", crop=1.0, rotation=0.0)
+    assert AugmentConfig().chosen(simulated=False) == colors
+    assert AugmentConfig(crop=0.9).chosen(simulated=False) == dataclasses.replace(colors, crop=0.9)
     assert AugmentConfig("openpi").numbers["crop"] == 0.95
     assert AugmentConfig("lerobot").chosen(simulated=True).numbers["at_most"] == 3
     assert AugmentConfig(hue=0.0).chosen(simulated=False).numbers["hue"] == 0

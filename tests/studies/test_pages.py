@@ -38,6 +38,14 @@ def test_metaworld(tmp_path):
     rebuild("metaworld", tmp_path)
 
 
+def test_few(tmp_path):
+    rebuild("few", tmp_path)
+
+
+def test_flow_steps(tmp_path):
+    rebuild("flow_steps", tmp_path)
+
+
 def test_latency(tmp_path):
     rebuild("latency", tmp_path)
 

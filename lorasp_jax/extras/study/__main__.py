@@ -81,7 +81,7 @@ def _execute(options: argparse.Namespace, console: Console) -> int:
 
 
 def _write(study: Study, path: Path, statuses: dict[str, Status], console: Console) -> None:
-    """Write the results of all finished cells; if all are, also the README.md beside the file.
+    """Write the results of all finished cells and, if they suffice, the README.md beside the file.
 
     Raises:
         ValueError: results that the study started from would be lost.
@@ -94,7 +94,8 @@ def _write(study: Study, path: Path, statuses: dict[str, Status], console: Conso
     results.write(path, study.name, found)
     _print(console, f"written: {path}")
     readme = path.with_name("README.md")
-    if study.page and readme.exists() and len(found) == len(study.cells):
+    suffices = study.partial or len(found) == len(study.cells)
+    if study.page and readme.exists() and suffices:
         page.fill(readme, study.page(study, results.load(path), path.parent))
         _print(console, f"written: {readme}")
 

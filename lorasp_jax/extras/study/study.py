@@ -116,6 +116,7 @@ class Study:
         measure: measures the policies of cells further.
         page: returns the generated parts of the README.md in a folder from the results of all cells
             (see `page.fill`), and writes its figures.
+        partial: whether `page` takes results that lack cells, too.
     """
 
     name: str
@@ -123,6 +124,7 @@ class Study:
     finished: Results = field(default_factory=dict)
     measure: Measure | None = None
     page: Callable[["Study", Results, Path], dict[str, str]] | None = None
+    partial: bool = False
 
     def __post_init__(self) -> None:
         """Validate names and order.

@@ -255,6 +255,9 @@ def test_the_readme_beside_the_results_gets_the_tables(start, committed, tmp_pat
     without(committed, "lr")
     start("--results", str(committed), "--no-run")  # not all cells are finished
     assert readme.read_text() == text.format("old\n")
+    (tmp_path / "study.py").write_text(code.replace(page, f"{page}, partial=True"))
+    start("--results", str(committed), "--no-run")
+    assert readme.read_text() == text.format("\n5 cells\n")
     start("--results", str(committed))
     assert readme.read_text() == text.format("\n6 cells\n")
     readme.write_text(text.format("").replace("count", "other"))
