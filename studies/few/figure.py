@@ -33,9 +33,9 @@ def write(path: Path, points: Points) -> None:
             methods = points[backbone, scene, kind]
             curves = {page.LABELS[name]: (COLORS[name], found) for name, found in methods.items()}
             figures.panel(axes[row, column], page.COUNTS, curves)
-            title = f"{page.BACKBONES[backbone]}, {page.SCENES[scene]}"
-            axes[row, column].set_title(f"{title}, {page.AUGMENT[kind]} augmentation", loc="left")
+        title = f"{page.BACKBONES[backbone]}, {page.AUGMENT[kind]} augmentation"
+        axes[0, column].set_title(title, loc="left")
         axes[-1, column].set_xlabel("demonstrations of each task")
-    for row in axes:
-        row[0].set_ylabel("success [%]")
+    for row, label in zip(axes, page.SCENES.values(), strict=True):
+        row[0].set_ylabel(f"success, {label} [%]")
     figures.write(figure, path, "few")

@@ -111,7 +111,7 @@ def _figure(results: Results, backbones: Sequence[str], path: Path) -> None:
         for backbone in backbones
         for title, tasks in (("four tasks", TASKS[:4]), ("two baskets", TASKS[4:]))
     ]
-    figure = Figure(figsize=(1 + 2.2 * len(panels), 2.9), layout="constrained")
+    figure = Figure(figsize=(1 + 3.2 * len(panels), 2.9), layout="constrained")
     axes = figure.subplots(1, len(panels), sharey=True)
     for axis, (backbone, title, tasks) in zip(axes, panels, strict=True):
         curves = {
