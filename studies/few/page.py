@@ -76,6 +76,7 @@ def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
     for backbone in BACKBONES:
         for scene in SCENES:
             made[f"{backbone} {scene}"] = _success_table(results, points, backbone, scene)
+        made[f"{backbone} methods"] = _difference_table(results, backbone)
         made[f"{backbone} steps"] = _steps_table(results, backbone)
         made[f"{backbone} error"] = _error_table(results, backbone)
     return made
@@ -92,15 +93,34 @@ def _success_table(results: Results, points: Mapping[Any, Any], backbone: str, s
     return page.table(head, rows)
 
 
-def _names(results: Results, *where: Any) -> list[str]:
-    """Return the policies of a backbone, method, kind and N that have run."""
-    return [name for seed in SEEDS if (name := cell(*where, seed)) in results]
+def _names(results: Results, backbone: str, method: str, kind: str, count: int) -> list[str]:
+    """Return the policies of all seeds that have run."""
+    names = [cell(backbone, method, kind, count, seed) for seed in SEEDS]
+    return [name for name in names if name in results]
 
 
 def _percent(estimate: Estimate, names: Sequence[str]) -> str:
     """Return a rate, with the number of seeds where some have not run."""
     seeds = len(names)
     return page.percent(estimate) + (f" ({seeds} of {len(SEEDS)})" if seeds < len(SEEDS) else "")
+
+
+def _difference_table(results: Results, backbone: str) -> str:
+    """Return success as recorded, without augmentation, minus that of `STEPPED`, by layout."""
+    rows = []
+    for method, label in LABELS.items():
+        if method == STEPPED:
+            continue
+        cells = []
+        for n in COUNTS:
+            pair = [
+                _outcomes([results[x] for x in _names(results, backbone, m, "none", n)], "recorded")
+                for m in (method, STEPPED)
+            ]
+            cells.append(statistics.bootstrap(lambda x, y: (x - y).mean(-1), *pair))
+        rows.append([label, *map(page.points, cells)])
+    head = [f"{BACKBONES[backbone]}, points", *(f"N = {n}" for n in COUNTS)]
+    return page.table(head, rows)
 
 
 def _parts_table(results: Results) -> str:
