@@ -123,22 +123,14 @@ def test_lost_success_stops_the_run():
 
 
 def collapse(first, now, **changes):
-    config = rooms.config(online=Learning(method="ppo", worlds=64, **changes))
+    config = rooms.config(online=Learning(worlds=64, **changes))
     clock = loop._Clock.__new__(loop._Clock)
     clock._first = {"rollout/press": first / 64}
     return clock.collapse(config, {"rollout/press": now / 64, "updates": 1})
 
 
-def test_imitation_of_successes_needs_no_critic(tmp_path):
-    train(tmp_path, online=Learning(worlds=8, std=5.0, max_start_kl=1e9))
-    rows = read_metrics(tmp_path)
-    assert not any("explained_variance/press" in row for row in rows)
-    assert any("task" in row for row in rows)
-
-
-@pytest.mark.parametrize("method", ["imitate", "ppo"])
-def test_a_run_without_any_success_stops(tmp_path, method):
-    run = train(tmp_path, online=Learning(method=method, worlds=8, std=1e-3))
+def test_a_run_without_any_success_stops(tmp_path):
+    run = train(tmp_path, online=Learning(worlds=8, std=1e-3))
     assert len(read_metrics(tmp_path)) == 1
     assert "no episode succeeded" in run.console.file.getvalue()
 
