@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from lorasp_jax.adapters import adaptation
+from lorasp_jax.config import OptimConfig
 from lorasp_jax.peft import AdaLoRA
 from lorasp_jax.reinforce import loop, setting, update
 from lorasp_jax.reinforce.config import Learning
@@ -73,6 +74,17 @@ def test_several_devices_learn_the_same(whole, tmp_path):
     expected = adapters(whole)
     for name, leaf in adapters(several).items():
         np.testing.assert_allclose(leaf, expected[name], atol=2e-4, err_msg=name)
+
+
+@pytest.mark.slow
+def test_a_policy_learns_from_success_alone(tmp_path, monkeypatch):
+    room = rooms.Room(num_envs=64, goal=0.15)
+    monkeypatch.setattr(setting, "environment", lambda *_: room)
+    learn = Learning(worlds=64, std=0.3, max_kl=0.2, max_start_kl=1e9)
+    train(tmp_path, online=learn, optim=OptimConfig(steps=20, batch_size=32, learning_rate=3e-3))
+    rates = [row["rollout/press"] for row in read_metrics(tmp_path)]
+    assert np.mean(rates[:4]) < 0.2
+    assert np.mean(rates[-4:]) > 0.4
 
 
 class Judge(Callback):
