@@ -13,7 +13,7 @@ from lorasp_jax.reinforce.config import Learning, ReinforceConfig
 
 def get_config(scale: str) -> ReinforceConfig:
     """Return the config at `scale`: smoke, cpu or accelerator."""
-    worlds = {"smoke": 16, "cpu": 128, "accelerator": 256}[scale]
+    worlds = {"smoke": 16, "cpu": 128, "accelerator": 512}[scale]
     episodes = {"smoke": 16, "cpu": 64, "accelerator": 256}[scale]
     return ReinforceConfig(
         name="reinforce",
@@ -21,11 +21,14 @@ def get_config(scale: str) -> ReinforceConfig:
         peft=LoRASP(),
         tasks=("press",),
         optim=OptimConfig(
-            steps={"smoke": 2, "cpu": 12, "accelerator": 100}[scale],
-            batch_size={"smoke": 16, "cpu": 64, "accelerator": 256}[scale],
-            learning_rate=1e-3,
+            steps={"smoke": 2, "cpu": 40, "accelerator": 100}[scale],
+            batch_size={"smoke": 64, "cpu": 512, "accelerator": 2048}[scale],
+            accumulate={"smoke": 1, "cpu": 2, "accelerator": 8}[scale],
+            learning_rate=1e-5 if scale == "accelerator" else 5e-5,
         ),
-        evaluation=EvaluationConfig(episodes=episodes, num_envs=episodes, every=2),
+        evaluation=EvaluationConfig(
+            episodes=episodes, num_envs=episodes, denoise_steps=2, every={"smoke": 2}.get(scale, 5)
+        ),
         online=Learning(worlds=worlds),
         checkpoint_every={"smoke": 1, "cpu": 1, "accelerator": 10}[scale],
     )

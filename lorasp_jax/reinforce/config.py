@@ -11,16 +11,16 @@ from lorasp_jax.peft import fields
 
 @dataclass(frozen=True)
 class Learning:
-    """How a flow policy learns from its own episodes, in which Gaussian noise explores."""
+    """How a flow policy learns from its own episodes, in which Gaussian noise explores.
+
+    By proximal policy optimization (PPO, arXiv 1707.06347) with a critic.
+    """
 
     start: Annotated[str, tyro.conf.arg(name="from", prefix_name=False)] = ""
     """Finished run to start from: its base, robot, adapters and, unless given, tasks. Empty: the
     base in model with new adapters, as `train.py` would start."""
     adapters: Literal["continue", "merge"] = "continue"
     """Train the adapters of the start run, or merge them into its base and train new ones."""
-    method: Literal["imitate", "ppo"] = "imitate"
-    """Imitate the policy's own successful episodes by its flow-matching loss, or proximal policy
-    optimization with a critic (ppo, arXiv 1707.06347)."""
     worlds: int = 64
     """Parallel worlds per task, one episode each in every iteration."""
     std: float = 0.05
@@ -38,7 +38,7 @@ class Learning:
     epochs: int = 4
     """Passes over the chunks of an iteration."""
     max_kl: float = 0.02
-    """With ppo, a step whose mean KL divergence per action from the policy that acted exceeds this
+    """A step whose mean KL divergence per action from the policy that acted exceeds this
     is undone and ends the iteration."""
     max_start_kl: float = 300.0
     """The run stops when an action's mean KL divergence from the start policy exceeds this."""
@@ -64,27 +64,21 @@ class Learning:
             raise ValueError(f"online.minutes must be at least 0, got {self.minutes}")
 
 
-_IGNORED = {
-    "reinforcement learning": (
-        *("optim.ema", "optim.warmup_steps", "optim.final_learning_rate"),
-        *("recap.steps", "recap.share", "recap.dropout", "learn", "keep", "log_every"),
-        *("auxiliary.warmup", "evaluation.before"),  # the start is a candidate for the best policy
-    ),
-    "imitate": (
-        *("online.reward", "online.discount", "online.trace", "online.clip", "online.max_kl"),
-        "online.critic_learning_rate",
-    ),
-    "ppo": ("optim.spike", "optim.state_noise", "optim.time_shape", "optim.rtc_max_delay"),
-}
-"""Settings that must keep their defaults, in all runs or by method."""
+_IGNORED = (
+    *("optim.ema", "optim.warmup_steps", "optim.final_learning_rate", "optim.spike"),
+    *("optim.state_noise", "optim.time_shape", "optim.rtc_max_delay"),
+    *("recap.steps", "recap.share", "recap.dropout", "learn", "keep", "log_every"),
+    *("auxiliary.warmup", "evaluation.before"),  # the start is a candidate for the best policy
+)
+"""Settings that must keep their defaults."""
 
 
 @dataclass(frozen=True)
 class ReinforceConfig(Config):
     """One run of online reinforcement learning; a step is an iteration of rollout and update.
 
-    `optim.batch_size` are the chunks of a gradient step. With ppo, the learning rate follows the KL
-    divergence of the iterations, else it is constant.
+    `optim.batch_size` are the chunks of a gradient step. The learning rate adapts to the KL
+    divergence of the iterations.
     """
 
     online: Learning = field(default_factory=Learning)
@@ -93,12 +87,11 @@ class ReinforceConfig(Config):
     """Iterations between log entries."""
 
     def __post_init__(self) -> None:
-        for what in ("reinforcement learning", self.online.method):
-            for name in _IGNORED[what]:
-                group, _, field_name = name.rpartition(".")
-                owner = getattr(self, group) if group else self
-                if getattr(owner, field_name) != getattr(type(owner), field_name):
-                    raise ValueError(f"{name} is not for {what}: drop it")
+        for name in _IGNORED:
+            group, _, field_name = name.rpartition(".")
+            owner = getattr(self, group) if group else self
+            if getattr(owner, field_name) != getattr(type(owner), field_name):
+                raise ValueError(f"{name} is not for reinforcement learning: drop it")
         if self.data.source and not self.online.start:
             raise ValueError("data.source is not for reinforcement learning: drop it")
         super().__post_init__()

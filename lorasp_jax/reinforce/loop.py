@@ -172,20 +172,17 @@ def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]
             denoise_steps=config.evaluation.denoise_steps,
             ranges=config.ranges,
         )
-        advantages, valid = jnp.ones(found.steps.done.shape), rollout.of_successes(found.steps)
-        if old := state.critics.get(task):
-            valid = ~found.steps.done
-            own = jax.random.fold_in(key, RandomStream.CRITIC)  # the rollout has split the key
-            learned = _learn(old, found.steps, found.last, own, config.online)
-            advantages, critics[task], metrics = learned
-            values |= {f"{name}/{task}": float(x) for name, x in metrics.items()}
-        batches.append(_batch(found, advantages, valid, execute))
+        own = jax.random.fold_in(key, RandomStream.CRITIC)  # the rollout has split the key
+        inputs = state.critics[task], found.steps, found.last, own, config.online
+        advantages, critics[task], metrics = _learn(*inputs)
+        values |= {f"{name}/{task}": float(x) for name, x in metrics.items()}
+        batches.append(_batch(found, advantages, ~found.steps.done, execute))
         values[f"rollout/{task}"] = float(jnp.mean(found.success))
         values["steps"] += float(jnp.sum(~found.steps.done))
     batch = jax.tree.map(lambda *x: jnp.concatenate(x), *batches)
     key = jax.random.fold_in(RandomStream.TRAINING.key(config.seed), step)
     rows = {}
-    if step or not critics:  # a critic that has learned nothing only adds noise
+    if step:  # a critic that has learned nothing only adds noise
         state, rows = update.improve(setting.programs, state, setting.frozen, batch, key)
     values |= _summary(setting, state, batch, rows)
     state = dataclasses.replace(state, step=state.step + 1, critics=critics)

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from envs import traced
 from envs.env import Env
@@ -97,7 +96,7 @@ def collect(
     worlds = Worlds(env, policy, key, ranges)
     rows = jnp.asarray(policy.processor.prompts.rows(env.instructions))
     worlds.state = _over_devices(worlds.state, policy)
-    spread, chunks, steps = Spread(*map(np.float32, spread)), [], []
+    spread, chunks, steps = Spread(*map(jnp.float32, spread)), [], []
     for call in range(-(-env.max_steps // execute_steps)):
         now = jax.random.fold_in(worlds.sample_key, call)
         if call:
@@ -113,16 +112,6 @@ def collect(
     end = jnp.argmax(joined.ended, axis=0)
     success = jnp.take_along_axis(joined.success, end[None], axis=0)[0]
     return Experience(jax.tree.map(join, *chunks), joined, _full_state(env, worlds.state), success)
-
-
-def of_successes(steps: Transitions) -> jax.Array:
-    """Return which steps belong to episodes that end in success, `[T, W]` bool."""
-
-    def body(later: jax.Array, step: Transitions) -> tuple[jax.Array, jax.Array]:
-        succeeds = jnp.where(step.ended & ~step.done, step.success, later)
-        return succeeds, succeeds & ~step.done
-
-    return jax.lax.scan(body, jnp.zeros_like(steps.done[0]), steps, reverse=True)[1]
 
 
 def _over_devices(tree: Any, policy: Policy) -> Any:

@@ -111,8 +111,6 @@ def check_memory(config: ReinforceConfig, environments: Mapping[str, Env]) -> No
 
 
 def _critics(config: ReinforceConfig, environments: Mapping[str, Env]) -> dict[str, Critic]:
-    if config.online.method != "ppo":
-        return {}
     return {
         task: Critic.init(
             RandomStream.CRITIC.key(config.seed, task),

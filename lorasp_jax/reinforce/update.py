@@ -1,4 +1,4 @@
-"""The update of the adapters on the chunks of one iteration, by one of two losses."""
+"""The update of the adapters on the chunks of one iteration."""
 
 import dataclasses
 import functools
@@ -12,18 +12,15 @@ import numpy as np
 import optax
 from flax import nnx
 
-from lorasp_jax.data.batches import Batch
-from lorasp_jax.models.flow_matching import Times
 from lorasp_jax.peft.auxiliary import AUXILIARY_WEIGHTS, auxiliary_losses
 from lorasp_jax.reinforce import noise
 from lorasp_jax.reinforce.config import ReinforceConfig
 from lorasp_jax.reinforce.critic import Critic
 from lorasp_jax.reinforce.rollout import Chunks
-from lorasp_jax.training import compilation, step
+from lorasp_jax.training import compilation
 from lorasp_jax.training import guard as guards
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.guard import Guard
-from lorasp_jax.training.optim import flow_times
 from lorasp_jax.training.program import Frozen
 from lorasp_jax.training.step import Metrics, active_ranks
 
@@ -37,7 +34,7 @@ class Learner:
         step: `[]` int32, number of iterations.
         adapters: trainable parameters, an `nnx.State`.
         guard: statistics that decide which updates to skip.
-        critics: by task; empty unless the method is ppo.
+        critics: by task.
         rate: `[]` factor of the learning rate, which follows the KL divergence of the iterations.
     """
 
@@ -53,9 +50,9 @@ class WeightedChunks(NamedTuple):
     """N chunks of C actions.
 
     Attributes:
-        advantages: `[N, C]`, of mean 0 and variance 1; or ones.
+        advantages: `[N, C]`, of mean 0 and variance 1.
         valid: `[N, C]` bool, the actions to learn from.
-        means: `[N, C, A]` means of the policy that acted, for ppo.
+        means: `[N, C, A]` means of the policy that acted.
     """
 
     chunks: Chunks
@@ -67,59 +64,26 @@ class WeightedChunks(NamedTuple):
 _FACTOR = 1.5
 """By how much an iteration changes the learning rate; our choice."""
 
-Loss = Callable[[Any, Frozen, WeightedChunks, jax.Array], tuple[jax.Array, Metrics]]
-"""(adapters, frozen, batch, key) -> loss and metrics."""
+Loss = Callable[[Any, Frozen, WeightedChunks], tuple[jax.Array, Metrics]]
+"""(adapters, frozen, batch) -> loss and metrics."""
 
 
 def make_loss(config: ReinforceConfig, graphdef: Any) -> Loss:
-    """Return the loss of the method that the config names."""
-    weights: dict[str, Any] = {x: getattr(config.auxiliary, x) for x in AUXILIARY_WEIGHTS}
-    if config.online.method == "imitate":
-        return functools.partial(
-            imitation_loss,
-            graphdef=graphdef,
-            weights=weights,
-            state_noise=config.optim.state_noise,
-            times=flow_times(config.optim),
-        )
+    """Return the loss that the config describes."""
     return functools.partial(
         surrogate_loss,
         graphdef=graphdef,
-        weights=weights,
+        weights={name: getattr(config.auxiliary, name) for name in AUXILIARY_WEIGHTS},
         spread=noise.Spread.of(config.online),
         clip=config.online.clip,
         denoise_steps=config.evaluation.denoise_steps,
     )
 
 
-def imitation_loss(
-    adapters: Any,
-    frozen: Frozen,
-    batch: WeightedChunks,
-    key: jax.Array,
-    *,
-    graphdef: Any,
-    weights: dict[str, Any],
-    state_noise: float,
-    times: Times,
-) -> tuple[jax.Array, Metrics]:
-    """Return the flow-matching loss of the valid actions, as in training from demonstrations."""
-    chunks, processor = batch.chunks, frozen.processor
-    state_key, loss_key = jax.random.split(key)
-    jitter = jax.random.normal(state_key, (len(chunks.prompts), processor.statistics.dim))
-    observation = processor.encode(
-        chunks.observation, chunks.prompts, state_noise=state_noise * jitter
-    )
-    own = Batch(observation, chunks.actions, batch.valid[..., None] & processor.flow_slots)
-    inputs = adapters, frozen.parameters, graphdef, own, loss_key, weights
-    return step.loss_fn(*inputs, times=times)
-
-
 def surrogate_loss(
     adapters: Any,
     frozen: Frozen,
     batch: WeightedChunks,
-    key: jax.Array,  # noqa: ARG001
     *,
     graphdef: Any,
     weights: dict[str, Any],
@@ -203,12 +167,12 @@ class Programs:
         return found.reshape(-1, *found.shape[2:])
 
     def _gradient(
-        self, adapters: Any, frozen: Frozen, batch: WeightedChunks, index: jax.Array, key: jax.Array
+        self, adapters: Any, frozen: Frozen, batch: WeightedChunks, index: jax.Array
     ) -> tuple[Any, Metrics]:
         """Return the means of gradient and metrics over micro-batches."""
 
         def add(total: Any, index: jax.Array) -> tuple[Any, Metrics]:
-            found, metrics = self._gradient_of(adapters, frozen, self._take(batch, index), key)
+            found, metrics = self._gradient_of(adapters, frozen, self._take(batch, index))
             return jax.tree.map(jnp.add, total, found), metrics
 
         zeros, parts = jax.tree.map(jnp.zeros_like, adapters), self._parts(index)
@@ -217,22 +181,17 @@ class Programs:
         return gradient, jax.tree.map(lambda x: x.mean(0), metrics)
 
     def _update(
-        self,
-        state: Learner,
-        frozen: Frozen,
-        batch: WeightedChunks,
-        index: jax.Array,
-        key: jax.Array,
+        self, state: Learner, frozen: Frozen, batch: WeightedChunks, index: jax.Array
     ) -> tuple[Learner, Metrics]:
-        gradient, metrics = self._gradient(state.adapters, frozen, batch, index, key)
-        norm, spike = optax.tree.norm(gradient), self.config.optim.spike
-        accept, guard = guards.check_step(state.guard, metrics["loss"], norm, spike)
+        gradient, metrics = self._gradient(state.adapters, frozen, batch, index)
+        norm = optax.tree.norm(gradient)
+        accept, guard = guards.check_step(state.guard, metrics["loss"], norm, spike=0)
         updates, opt_state = self._optimizer.update(gradient, state.opt_state, state.adapters)
         updates = jax.tree.map(lambda x: state.rate * x, updates)
         adapters = optax.apply_updates(state.adapters, updates)
         after = dataclasses.replace(state, adapters=adapters, opt_state=opt_state, guard=guard)
         before = dataclasses.replace(state, guard=guard)
-        within = metrics.get("kl", 0.0) <= jnp.asarray(self.config.online.max_kl)
+        within = metrics["kl"] <= self.config.online.max_kl
         metrics |= {"grad_norm": norm, "in_a_row": guard.in_a_row, "within": within}
         return guards.select(accept & within, after, before), metrics
 
@@ -240,11 +199,11 @@ class Programs:
 def improve(
     programs: Programs, state: Learner, frozen: Frozen, batch: WeightedChunks, key: jax.Array
 ) -> tuple[Learner, dict[str, np.ndarray]]:
-    """Take gradient steps on minibatches of chunks, for ppo until the policy has changed enough.
+    """Take gradient steps on minibatches of chunks until the policy has changed enough.
 
     Args:
         batch: chunks with any means.
-        key: orders the chunks; for their noise.
+        key: orders the chunks.
 
     Returns:
         The state, and the metrics of all steps; none if no action is valid.
@@ -256,14 +215,12 @@ def improve(
         return state, {}
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     length = -(-len(useful) // size) * size
-    if config.online.method == "ppo":
-        for index in np.resize(useful, length).reshape(-1, size):
-            found = programs.means(state.adapters, frozen, batch.chunks, index)
-            batch = batch._replace(means=batch.means.at[index].set(found))
+    for index in np.resize(useful, length).reshape(-1, size):
+        found = programs.means(state.adapters, frozen, batch.chunks, index)
+        batch = batch._replace(means=batch.means.at[index].set(found))
     for _ in range(config.online.epochs):
         for index in np.resize(rng.permutation(useful), length).reshape(-1, size):
-            step_key = jax.random.fold_in(key, len(rows))
-            state, metrics = programs.update(state, frozen, batch, index, step_key)
+            state, metrics = programs.update(state, frozen, batch, index)
             rows.append(jax.device_get(metrics))
             if not rows[-1]["within"]:
                 return _adapt(config, state, rows), _stack(rows)
@@ -272,7 +229,7 @@ def improve(
 
 def _adapt(config: ReinforceConfig, state: Learner, rows: list[Metrics]) -> Learner:
     """Adapt the learning rate so that an iteration ends with about the KL divergence allowed."""
-    last = float(rows[-1].get("kl", config.online.max_kl))
+    last = float(rows[-1]["kl"])
     factor = 1 / _FACTOR if not rows[-1]["within"] else 1.0
     factor = _FACTOR if last < config.online.max_kl / 2 else factor
     return dataclasses.replace(state, rate=state.rate * factor)

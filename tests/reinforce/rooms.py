@@ -17,13 +17,14 @@ from tests.runs import CONFIG, make_run
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Room:
-    """A world succeeds when its first joint is commanded to a sum of more than 1.
+    """A world succeeds when its first joint is commanded to a sum of more than `goal`.
 
     Its observation is the same in all layouts but for the first joint angle.
     """
 
     num_envs: int = 8
     max_steps: int = 4
+    goal: float = 1.0
     instructions: tuple[str, ...] = ("press the button",)
 
     @property
@@ -56,7 +57,7 @@ class Room:
     def step(self, state, action):
         running = ~state.done
         qpos = jnp.where(running[:, None], state.data.qpos + 0.3 * action, state.data.qpos)
-        success = state.info["success"] | (qpos[:, 0] > 1)
+        success = state.info["success"] | (qpos[:, 0] > self.goal)
         steps = state.info["steps"] + running
         info = state.info | {"success": success, "steps": steps}
         reward = (success & running).astype(jnp.float32)
@@ -67,7 +68,7 @@ class Room:
 def config(**changes) -> ReinforceConfig:
     fields = {field.name: getattr(CONFIG, field.name) for field in dataclasses.fields(CONFIG)}
     # Rarely does an episode succeed; a run with sparse reward would stop then.
-    learn = Learning(method="ppo", worlds=8, std=0.2, reward="dense", epochs=2, max_kl=1.0)
+    learn = Learning(worlds=8, std=0.2, reward="dense", epochs=2, max_kl=1.0)
     optim = OptimConfig(steps=4, batch_size=8, learning_rate=1e-3)
     evaluation = EvaluationConfig(episodes=8, num_envs=8, execute_steps=2, denoise_steps=2)
     fields |= {"tasks": ("press",), "optim": optim, "evaluation": evaluation, "online": learn}

@@ -57,16 +57,6 @@ def test_finished_worlds_restart(policy):
     assert ended.sum() > 8
 
 
-def test_steps_of_successes():
-    """World 0 succeeds, restarts and fails; world 1 fails; world 2 is cut off."""
-    ended = jnp.array([[0, 1, 1, 0, 1], [0, 0, 0, 1, 1], [0, 0, 0, 0, 0]], bool).T
-    done = jnp.array([[0, 0, 1, 0, 0], [0, 0, 0, 0, 1], [0, 0, 0, 0, 0]], bool).T
-    success = jnp.array([[0, 1, 1, 0, 0], [0, 0, 0, 0, 0], [0, 0, 0, 0, 0]], bool).T
-    steps = rollout.Transitions(jnp.zeros((5, 3, 1)), done, ended, success, jnp.zeros((5, 3)))
-    expected = [[1, 1, 0, 0, 0], [0] * 5, [0] * 5]
-    np.testing.assert_array_equal(rollout.of_successes(steps).T, np.array(expected, bool))
-
-
 def test_restarts_and_noise_have_keys_of_their_own(policy, monkeypatch):
     drawn = []
     monkeypatch.setattr(noise, "explore", lambda key, mean, *_: drawn.append(key) or mean)
