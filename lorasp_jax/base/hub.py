@@ -13,6 +13,7 @@ from typing import Any, Literal
 from lorasp_jax.base import shipped
 from lorasp_jax.base.files import first_line, join_inside
 from lorasp_jax.base.locks import locked
+from lorasp_jax.base.user_cache import user_cache
 from lorasp_jax.base.writing import atomic_file, atomic_folder
 
 HUB = "hf://"
@@ -124,8 +125,7 @@ def _from_hub(name: str, only: list[str] | None, repository: str) -> Path:
 def _from_bucket(url: str) -> Path:
     import fsspec
 
-    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "lorasp_jax"
-    target = cache / url.rstrip("/").replace("://", "/", 1)
+    target = user_cache() / url.rstrip("/").replace("://", "/", 1)
     waiting = f"waiting: another process is downloading {url}"
     try:
         with locked(target, lambda: print(waiting, file=sys.stderr)):
