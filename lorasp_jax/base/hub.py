@@ -3,10 +3,13 @@
 Only hf:// paths reach the Hub, so a missing folder never resolves to a repository of the same name.
 """
 
+import contextlib
 import importlib
+import logging
 import os
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -132,12 +135,25 @@ def _from_bucket(url: str) -> Path:
             if not target.exists():
                 if url.startswith("gs://"):  # fsspec would report its absence in its own words
                     importlib.import_module("gcsfs")
-                _copy(*fsspec.core.url_to_fs(url), target)
+                with _one_report():
+                    _copy(*fsspec.core.url_to_fs(url), target)
     except ModuleNotFoundError:
         raise
     except Exception as error:  # each backend raises its own errors
         raise ValueError(f"cannot download {url}: {first_line(error)}") from error
     return target
+
+
+@contextlib.contextmanager
+def _one_report() -> Iterator[None]:
+    """Keep gcsfs from printing a traceback of each error that it also raises."""
+    logger = logging.getLogger("gcsfs")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def _copy(store: Any, root: str, target: Path) -> None:
