@@ -37,7 +37,11 @@ class Waiting(ServedPolicies):
         names = tuple(f"camera{i}" for i in range(cameras))
         self.sizes, self.together, self.metadata = (1, 2, 4, 8), 1, {}
         self.spec, self._seconds = PolicySpec(names, image_size, 7, 50), seconds
-        self.instructions = {"base": ()}
+
+    @property
+    def instructions(self) -> dict[str, tuple[str, ...]]:
+        """The only adapter, trained for no instruction in particular."""
+        return {"base": ()}
 
     def route(self, request: Request) -> str:
         """Return the only adapter."""

@@ -30,9 +30,13 @@ def main(arguments: Sequence[str], program: str = "python -m envs") -> int:
     console = Console(stderr=True)
     # Preallocating GPU memory would add a second to commands that take half a minute (measured).
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    cache.enable()
     interrupted = "interrupted; temporary files were removed"
-    return run_command(lambda: options.command(options, console), console, interrupted)
+
+    def command() -> None:
+        cache.enable()
+        options.command(options, console)
+
+    return run_command(command, console, interrupted)
 
 
 def parser(program: str) -> argparse.ArgumentParser:

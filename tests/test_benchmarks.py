@@ -228,3 +228,11 @@ def test_jpeg_costs_fewer_bytes_and_some_time():
     raw, small = (pictures.costs(observation, quality) for quality in (None, 90))
     assert small["kB a call"] < raw["kB a call"] / 5
     assert raw["encode ms"] == 0 < min(small.values())
+
+
+def test_a_policy_that_waits_answers_over_a_link():
+    images = {f"camera{i}": np.zeros((64, 64, 3), np.uint8) for i in range(pictures.CAMERAS)}
+    observation = {"image": images, "state": np.zeros(7, np.float32), "prompt": "go"}
+    link = {"number": 1, "bits": 1e9, "round_trip": 0.0}
+    times = pictures.over_link(observation, [None, 90], **link)
+    assert min(times) >= 20  # milliseconds of the policy

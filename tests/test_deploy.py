@@ -17,6 +17,7 @@ from configparser import RawConfigParser
 import pytest
 import yaml
 
+from lorasp_jax.base.errors import INTERRUPTED
 from lorasp_jax.cli.commands import COMMANDS
 from lorasp_jax.extras.piper import __main__ as piper
 from lorasp_jax.extras.serving import __main__ as serving
@@ -86,6 +87,7 @@ def test_the_server_is_started_again_and_the_arm_is_not():
         "Restart": "no",
         "KillSignal": "SIGTERM",
         "KillMode": "mixed",
+        "SuccessExitStatus": str(INTERRUPTED),
     }.items()
     assert "Install" not in arm
 

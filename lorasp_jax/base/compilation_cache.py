@@ -1,9 +1,10 @@
 """Enable JAX's persistent compilation cache."""
 
 import os
-from pathlib import Path
 
 import jax
+
+from lorasp_jax.base.user_cache import user_cache
 
 MAX_BYTES = 32 * 2**30
 """Size of our own folder. JAX locks the files of a limited cache, so that no process reads an entry
@@ -14,10 +15,12 @@ def enable() -> None:
     """Cache compiled programs in JAX_COMPILATION_CACHE_DIR, by default ~/.cache/lorasp_jax/jax.
 
     Call this before anything is compiled.
+
+    Raises:
+        ValueError: neither that variable nor a home directory is there.
     """
     if jax.config.jax_compilation_cache_dir is None:
-        folder = Path.home() / ".cache" / "lorasp_jax" / "jax"
-        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_compilation_cache_dir", str(user_cache() / "jax"))
         if "JAX_COMPILATION_CACHE_MAX_SIZE" not in os.environ:
             jax.config.update("jax_compilation_cache_max_size", MAX_BYTES)
     # Below JAX's default of 1 s: initializing adapters compiles dozens of small programs.

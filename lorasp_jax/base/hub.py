@@ -3,16 +3,20 @@
 Only hf:// paths reach the Hub, so a missing folder never resolves to a repository of the same name.
 """
 
+import contextlib
 import importlib
+import logging
 import os
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
 from lorasp_jax.base import shipped
 from lorasp_jax.base.files import first_line, join_inside
 from lorasp_jax.base.locks import locked
+from lorasp_jax.base.user_cache import user_cache
 from lorasp_jax.base.writing import atomic_file, atomic_folder
 
 HUB = "hf://"
@@ -124,20 +128,32 @@ def _from_hub(name: str, only: list[str] | None, repository: str) -> Path:
 def _from_bucket(url: str) -> Path:
     import fsspec
 
-    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "lorasp_jax"
-    target = cache / url.rstrip("/").replace("://", "/", 1)
+    target = user_cache() / url.rstrip("/").replace("://", "/", 1)
     waiting = f"waiting: another process is downloading {url}"
     try:
         with locked(target, lambda: print(waiting, file=sys.stderr)):
             if not target.exists():
                 if url.startswith("gs://"):  # fsspec would report its absence in its own words
                     importlib.import_module("gcsfs")
-                _copy(*fsspec.core.url_to_fs(url), target)
+                with _one_report():
+                    _copy(*fsspec.core.url_to_fs(url), target)
     except ModuleNotFoundError:
         raise
     except Exception as error:  # each backend raises its own errors
         raise ValueError(f"cannot download {url}: {first_line(error)}") from error
     return target
+
+
+@contextlib.contextmanager
+def _one_report() -> Iterator[None]:
+    """Keep gcsfs from printing a traceback of each error that it also raises."""
+    logger = logging.getLogger("gcsfs")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def _copy(store: Any, root: str, target: Path) -> None:

@@ -29,7 +29,6 @@ def main(arguments: Sequence[str], program: str = "python train.py") -> int:
     if any(text.partition("=")[0] == "--fit" for text in arguments):
         # JAX leaves a quarter of the GPU to others unless told otherwise before it starts.
         os.environ.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", "0.95")
-    cache.enable()
     import flax
     import jax
 
@@ -43,6 +42,7 @@ def main(arguments: Sequence[str], program: str = "python train.py") -> int:
     resume = resume_command(arguments, program)
 
     def adapt() -> None:
+        cache.enable()
         with sigterm_as_interrupt():
             if "--distributed" in arguments:
                 processes.initialize(console)

@@ -19,6 +19,7 @@ from rich.table import Table
 
 from envs.datasets.episodes import Episodes, joint_names, labelled
 from envs.rendering.video import side_by_side
+from lorasp_jax.base.user_cache import user_cache
 from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.config import AugmentConfig, Config
 from lorasp_jax.data.augmentation import Augment, on_wrist, recipe
@@ -197,8 +198,7 @@ def default_path(dataset: str) -> Path:
     """
     path = Path(os.path.realpath(dataset))
     digest = hashlib.sha256(str(path if path.exists() else dataset).encode()).hexdigest()[:8]
-    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    return cache / "lorasp_jax" / "inspect" / f"{path.name}-{digest}.png"
+    return user_cache() / "inspect" / f"{path.name}-{digest}.png"
 
 
 def write_contact_sheet(source: Source, path: Path, preset: str = "none") -> None:

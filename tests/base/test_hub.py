@@ -1,7 +1,9 @@
 """No test uses the network: the Hub client is patched, and the bucket is in memory."""
 
+import logging
 import re
 import sys
+import types
 
 import fsspec
 import huggingface_hub
@@ -131,6 +133,19 @@ def test_unreadable_bucket(bucket, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"cannot download .*: connection lost$"):
         hub.local("memory://models/pi0")
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".")]
+
+
+def test_an_unreachable_bucket_is_reported_once(monkeypatch, caplog, tmp_path):
+    def url_to_fs(url):
+        logging.getLogger("gcsfs").error("out of retries")
+        raise OSError("no such host")
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setitem(sys.modules, "gcsfs", types.ModuleType("gcsfs"))
+    monkeypatch.setattr(fsspec.core, "url_to_fs", url_to_fs)
+    with pytest.raises(ValueError, match=r"cannot download gs://bucket/folder: no such host$"):
+        hub.local("gs://bucket/folder")
+    assert caplog.records == []
 
 
 @pytest.mark.parametrize(

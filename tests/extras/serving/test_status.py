@@ -240,6 +240,8 @@ def test_a_browser_shows_it(server, new_tab):
         for width, dark in itertools.product((1000, 400), (False, True)):
             tab.look(width=width, dark=dark)
             assert tab.run("document.documentElement.scrollWidth") <= width
+            table = "document.querySelector('.scroll')"  # all its columns are in sight
+            assert tab.run(f"{table}.scrollWidth - {table}.clientWidth") == 0
             assert tab.run(CONTRAST)[0] >= 4.5, tab.run(CONTRAST)  # WCAG 2.1, level AA
             ground = tab.run("getComputedStyle(document.body).backgroundColor")
             assert (int(ground.split("(")[1].split(",")[0]) < 128) == dark
