@@ -1,12 +1,11 @@
-"""Several adapters on one base: memory, swapping, and batches of one and of several adapters.
+"""Several adapters on one base: memory, swapping, and batches.
 
     python -m benchmarks.adapters                            # pi0 nano
     python -m benchmarks.adapters --size base --dtype bfloat16 --method lora_sp
 
 Weights are random. "own weights" is a policy served alone, whose adapter is fused with its base in
-advance. A batch of several adapters runs as one batch each, or as the server's mixed batch, whose
-rows have their adapters stacked, without fused kernels. --shapes-only computes the memory without
-allocating it.
+advance. Requests to several adapters run as one batch each. --shapes-only computes the memory
+without allocating it.
 """
 
 import argparse
@@ -27,7 +26,7 @@ from lorasp_jax.extras.serving.adapters import OnDevice
 from lorasp_jax.extras.serving.exported import sampling_options
 from lorasp_jax.models import backbone, presets
 from lorasp_jax.models.observation import Observation, abstract_observation
-from lorasp_jax.models.shared_base import SharedBase, SharedSampler, by_row
+from lorasp_jax.models.shared_base import SharedBase, SharedSampler
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,29 +88,10 @@ def observations(config: Any, batch: int) -> Observation:
     return jax.tree.map(draw, abstract_observation(config, batch))
 
 
-def chunks(sampler: Any, obs: Observation, noise: jax.Array, *, steps: int) -> jax.Array:
+@functools.partial(jax.jit, static_argnames="steps", compiler_options=sampling_options())
+def sample(sampler: Any, obs: Observation, noise: jax.Array, *, steps: int) -> jax.Array:
     """Sample with one adapter."""
     return sampler.sample_actions(None, obs, noise=noise, num_steps=steps)
-
-
-sample = jax.jit(chunks, static_argnames="steps", compiler_options=sampling_options())
-
-
-@functools.partial(jax.jit, static_argnames="steps", compiler_options=sampling_options())
-def sample_mixed(
-    sampler: SharedSampler,
-    adapters: list[list[jax.Array]],
-    obs: Observation,
-    noise: jax.Array,
-    *,
-    steps: int,
-) -> jax.Array:
-    """Sample each row with an adapter of its own."""
-
-    def one(sampler: SharedSampler, row: tuple[Observation, jax.Array]) -> jax.Array:
-        return chunks(sampler, *jax.tree.map(lambda a: a[None], row), steps=steps)[0]
-
-    return by_row(one, sampler, adapters, (obs, noise))
 
 
 def device_rows(samplers: list[SharedSampler]) -> list[dict[str, Any]]:
@@ -142,8 +122,7 @@ def batch_rows(
     single = [jax.tree.map(lambda a, i=i: a[i : i + 1], (obs, noise)) for i in range(batch)]
     chosen = [samplers[i % len(samplers)] for i in range(batch)]
     placed = [dataclasses.replace(each, own=jax.device_put(each.own)) for each in chosen]
-    bare, owns = dataclasses.replace(placed[0], own=[]), [each.own for each in placed]
-    run, steps_ = functools.partial(sample, steps=steps), {"steps": steps}
+    run = functools.partial(sample, steps=steps)
     calls = {
         "own weights, 1": (1, lambda: run(alone, *single[0])),
         f"own weights, {batch}": (batch, lambda: run(alone, obs, noise)),
@@ -152,10 +131,6 @@ def batch_rows(
         f"{batch} adapters, one batch each": (
             batch,
             lambda: [run(p, *each) for p, each in zip(placed, single, strict=True)],
-        ),
-        f"{batch} adapters, one mixed batch": (
-            batch,
-            lambda: sample_mixed(bare, owns, obs, noise, **steps_),
         ),
     }
     table = []

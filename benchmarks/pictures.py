@@ -158,7 +158,7 @@ class Closed:
                     message = jpeg.compress(message, quality)
                 index = seed * len(prompts) + world, call
                 rows.append(self._served.prepare(adapter, requests.parse(message, spec), index))
-            chunk = self._served.run(adapter, rows)
+            chunk, _ = self._served.run(adapter, rows)
             state = self._act(state, jnp.moveaxis(chunk[:, :EXECUTE], 1, 0))
             if np.asarray(state.done).all():
                 break

@@ -35,7 +35,7 @@ class Waiting(ServedPolicies):
 
     def __init__(self, image_size: int, cameras: int, seconds: float) -> None:
         names = tuple(f"camera{i}" for i in range(cameras))
-        self.sizes, self.together, self.metadata = (1, 2, 4, 8), 1, {}
+        self.sizes, self.metadata = (1, 2, 4, 8), {}
         self.spec, self._seconds = PolicySpec(names, image_size, 7, 50), seconds
 
     @property
@@ -53,15 +53,9 @@ class Waiting(ServedPolicies):
         del adapter, index
         return request.state
 
-    def group(self, adapter: str) -> str:
-        """Return the only adapter."""
-        return adapter
-
-    def run_mixed(
-        self, adapters: Sequence[str], rows: Sequence[np.ndarray]
-    ) -> tuple[np.ndarray, None]:
+    def run(self, adapter: str, rows: Sequence[np.ndarray]) -> tuple[np.ndarray, None]:
         """Return chunks of the states."""
-        del adapters
+        del adapter
         time.sleep(self._seconds)
         return np.repeat(np.stack(rows)[:, None], self.spec.chunk, axis=1), None
 

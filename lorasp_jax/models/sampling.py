@@ -44,16 +44,15 @@ class Sampler:
     """Distinct adapter methods of the backbone."""
 
     @classmethod
-    def from_model(cls, model: "Backbone", *, once: bool = False, fuse: bool = True) -> Self:
+    def from_model(cls, model: "Backbone", *, once: bool = False) -> Self:
         """Create a sampler; the backbone is not modified.
 
         Args:
             model: the backbone.
             once: the sampler is used only once. The prefix then uses the kernels as they are:
                 copying them would take longer than it saves.
-            fuse: the flow steps use kernels fused with adapters, which copies them.
         """
-        models = (_prefix_model(model, once), suffix_model(model, fuse=fuse))
+        models = (_prefix_model(model, once), suffix_model(model))
         graphdefs, states = zip(*map(nnx.split, models), strict=True)
         weights, tree = jax.tree.flatten(states)
         methods = dict.fromkeys(adaptation.methods(model).values())
@@ -167,7 +166,7 @@ def _prefix_model(model: "Backbone", once: bool) -> "Backbone":
     return model
 
 
-def suffix_model(model: "Backbone", *, fuse: bool = True) -> "Backbone":
+def suffix_model(model: "Backbone") -> "Backbone":
     """Copy a model for the flow steps, with input-independent results precomputed."""
     model = nnx.merge(*nnx.split(model))
     del model.vision, model.language
@@ -175,5 +174,5 @@ def suffix_model(model: "Backbone", *, fuse: bool = True) -> "Backbone":
         model.action.blocks = unstack(model.action.blocks)
     quantization.dequantize(model)
     for module in (model, *(module for _, module in nnx.iter_modules(model.action))):
-        prepared.fuse_projections(module, copy_kernels=fuse)
+        prepared.fuse_projections(module)
     return model

@@ -6,7 +6,7 @@ the flow steps use once per call. Adapters with equal methods and shapes share t
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -57,30 +57,17 @@ class SharedSampler:
         base: the base's arrays, which other samplers use too.
         own: the adapter's arrays, still stacked over layers: fewer arrays take less time to pass.
             They are in host memory unless the caller moves them.
-        fuse: whether a call fuses the kernels of the flow steps with the adapter. Without, `own`
-            may differ between the rows of a `jax.vmap` that does not map `base`.
     """
 
     base: list[jax.Array]
     own: list[Any]
     structure: _Structure = dataclasses.field(metadata={"static": True})
     config: BackboneConfig = dataclasses.field(metadata={"static": True})
-    fuse: bool = dataclasses.field(default=True, metadata={"static": True})
 
     def sample_actions(self, key: jax.Array, obs: Observation, **options: Any) -> Any:
         """Sample action chunks; see `Sampler.sample_actions` for the arguments."""
-        sampler = Sampler.from_model(self._model(), once=True, fuse=self.fuse)
+        sampler = Sampler.from_model(self._model(), once=True)
         return sampler.sample_actions(key, obs, **options)
-
-    @property
-    def replaces_kernels(self) -> bool:
-        """Whether the adapter has whole matrices of its own in place of the base's."""
-        structure = self.structure
-        own = ((n, place) for n, place in zip(structure.names, structure.own, strict=True) if place)
-        return any(
-            "/adapter/" not in name and self.own[k].ndim - (layer is not None) > 1
-            for name, (k, layer) in own
-        )
 
     def array(self, name: str) -> jax.Array:
         """Return an array of the model by its name."""
@@ -100,27 +87,6 @@ class SharedSampler:
                 array, layer = self.own[place[0]], place[1]
                 leaves.append(array if layer is None else array[layer])
         return leaves
-
-
-def by_row(
-    function: Callable[[SharedSampler, Any], Any],
-    model: SharedSampler,
-    adapters: Sequence[list[jax.Array]],
-    rows: Any,
-) -> Any:
-    """Apply a function to rows that have an adapter each.
-
-    The adapters are stacked, and each product with the base's weights is one for all rows.
-
-    Args:
-        function: of a sampler and a row.
-        model: has the base's weights.
-        adapters: `own` of each row's sampler, all of the same structure.
-        rows: arrays with a leading axis.
-    """
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *adapters)
-    call = lambda own, row: function(dataclasses.replace(model, own=own, fuse=False), row)  # noqa: E731
-    return jax.vmap(call)(stacked, rows)
 
 
 class SharedBase:
@@ -248,7 +214,7 @@ def _common_ranks(
 ) -> tuple[dict[str, Method], dict[str, np.ndarray]]:
     """Return LoRAs as ones of scale 1 whose rank is a multiple of `_RANKS`, padded with zeros.
 
-    Adapters that differ in these, or in settings of training, so share programs and batches.
+    Adapters that differ in these, or in settings of training, so share programs.
     """
     methods, arrays = dict(methods), dict(arrays)
     for path, method in methods.items():

@@ -22,8 +22,8 @@ class Turning(StandIn):
         self.last_request = request
         return request.state
 
-    def run_mixed(self, adapters, rows):
-        chunks, ranks = super().run_mixed(adapters, rows)
+    def run(self, adapter, rows):
+        chunks, ranks = super().run(adapter, rows)
         chunks[..., 0] += 0.03 * np.arange(1, self.spec.chunk + 1)
         return chunks, ranks
 

@@ -61,6 +61,18 @@ def test_actions_are_those_of_weights_of_its_own(case, tmp_path):
     assert np.abs(expected).max() > 0.1
 
 
+def test_loras_of_almost_equal_ranks_have_one_structure():
+    model = random_backbone(Pi0Config.dummy())
+    base = SharedBase(model)
+    first, same, wider = (
+        base.attach_model(adapt(model, presets.rules("openpi", method), rngs=nnx.Rngs(0)), model)
+        for method in (LoRA(rank=4), LoRA(rank=2, alpha=1, dropout=0.1), LoRA(rank=20))
+    )
+    shapes = [[array.shape for array in each.own] for each in (first, same, wider)]
+    assert first.structure is same.structure is not wider.structure
+    assert shapes[0] == shapes[1] != shapes[2]
+
+
 def test_an_adapter_that_splits_kernels_or_is_of_another_base_is_refused(tmp_path):
     config = Pi0Config.dummy()
     model = random_backbone(config)

@@ -95,7 +95,7 @@ class RunActor:
         adapter = self._policy.route(request)
         row = self._policy.prepare(adapter, request, index)
         self._calls += 1
-        return self._policy.run(adapter, [row])[0]
+        return self._policy.run(adapter, [row])[0][0]
 
 
 Actor: TypeAlias = ServerActor | RunActor

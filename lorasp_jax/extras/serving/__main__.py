@@ -5,7 +5,6 @@ import asyncio
 import contextlib
 import functools
 import logging
-import math
 import os
 import secrets
 import signal
@@ -80,8 +79,6 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--adapters-on-device", type=positive, metavar="K", help="keep the weights of "
         "K adapters on the device and the others in host memory, on one base (default: with "
         "several adapters, all on the device)")  # fmt: skip
-    add("--adapters-per-batch", type=positive, metavar="N", help="how many adapters on one base "
-        "may answer in one batch; on a CPU, more than one costs time (default: 1)")  # fmt: skip
     add("--route", choices=("name", "exact", "nearest"), default="name", help="which adapter "
         "answers requests that name none: the first, the one trained with the instruction, or with "
         "the nearest one; both refuse what is not clear (default: %(default)s)")  # fmt: skip
@@ -190,8 +187,7 @@ def _load(options: argparse.Namespace, console: Console) -> Any:
     exported = all(is_exported(path) or is_bundle(path) for path in named.values())
     policies, load = (_exported if exported else _compiled)(options, named)
     settings = {"prompt": options.prompt, "execution": options.execution, "route": options.route}
-    together = min(options.adapters_per_batch or 1, options.adapters_on_device or math.inf)
-    policy = ServedPolicies(policies, seed=seed, load=load, together=int(together), **settings)
+    policy = ServedPolicies(policies, seed=seed, load=load, **settings)
     policy.warm_up(functools.partial(_say, console))
     _say(console, f"ready after {time.monotonic() - start:.0f} s")
     return policy
@@ -202,7 +198,6 @@ def _exported(options: argparse.Namespace, named: dict[str, str]) -> tuple[dict[
     from lorasp_jax.extras.serving.exported import is_bundle, load, load_bundle
 
     settings = ("num_steps", "max_batch", "guidance", "base", "tokenizer", "adapters_on_device")
-    settings += ("adapters_per_batch",)
     _refuse(options, (*settings, *CHECKPOINT_OPTIONS), "has no effect on exported policies")
     if options.execution == "guided":
         raise ValueError("exported policies cannot be guided: use --execution naive or trained")

@@ -5,7 +5,7 @@ fixed sizes, compiled in advance; missing rows are copies of the first.
 
 A lone request never waits. After a batch, the worker waits until the clients of that batch have
 sent their next requests, at most `WAIT` seconds: clients that ask again at once, each as fast as it
-can, so share batches instead of taking turns. Adapters of one group share batches, others do not.
+can, so share batches instead of taking turns. Every adapter has its own batches.
 """
 
 import asyncio
@@ -76,7 +76,7 @@ class Batcher:
         self._finished, self._begun = 0.0, 0.0
         self._running: list[_Job] = []
         self._closing = self._failed = False
-        self._last: Any = None  # group of the previous batch; an adapter would be kept in memory
+        self._last = ""  # name of the previous adapter, which itself would be kept in memory
         self._thread = threading.Thread(target=self._work, name="policy", daemon=True)
         self._thread.start()
 
@@ -143,7 +143,7 @@ class Batcher:
             self._run(batch)
             self._running = []
             self._awaited = {job.client for job in batch}
-            self._last = self._policy.group(batch[0].adapter)
+            self._last = str(batch[0].adapter)
             self._finished = time.monotonic()
 
     def _collect(self) -> bool:
@@ -163,28 +163,24 @@ class Batcher:
         """Return how long to wait for a further job; None: as long as it takes."""
         if not self._pending:
             return None
-        # No awaited request can join a batch of another group.
-        other = self._policy.group(self._pending[0].adapter) != self._last
+        other = str(self._pending[0].adapter) != self._last  # which no awaited request can join
         if other or not self._awaited or len(self._pending) >= self._policy.sizes[-1]:
             return 0
         return max(0.0, self._finished + WAIT - time.monotonic())
 
     def _take_batch(self) -> list[_Job]:
-        """Take the oldest job and others of its group, skipping clients that have gone."""
+        """Take the oldest job and others with its adapter, skipping clients that have gone."""
         alive = [job for job in self._pending if not job.future.cancelled()]
-        group = self._policy.group(alive[0].adapter) if alive else None
-        chosen = [job for job in alive if self._policy.group(job.adapter) == group]
-        most = [*dict.fromkeys(job.adapter for job in chosen)][: self._policy.together]
-        batch = [job for job in chosen if job.adapter in most][: self._policy.sizes[-1]]
+        chosen = [job for job in alive if job.adapter == alive[0].adapter]
+        batch = chosen[: self._policy.sizes[-1]]
         self._pending = [job for job in alive if job not in batch]
         return [job for job in batch if job.future.set_running_or_notify_cancel()]
 
     def _run(self, batch: list[_Job]) -> None:
-        rows = padded([job.row for job in batch], self._policy.sizes)
-        adapters = padded([job.adapter for job in batch], self._policy.sizes)
+        adapter, rows = batch[0].adapter, padded([job.row for job in batch], self._policy.sizes)
         start = time.perf_counter()
         try:
-            actions, ranks = self._policy.run_mixed(adapters, rows)
+            actions, ranks = self._policy.run(adapter, rows)
             self._failed = False
         except Exception:  # a failed batch must not stop the server
             self._failed = True
@@ -193,8 +189,7 @@ class Batcher:
                 job.fail("the policy failed: see the server's log")
             return
         milliseconds = (time.perf_counter() - start) * 1e3
-        for name in {str(adapter) for adapter in adapters}:
-            self.seconds.observe(name, milliseconds / 1e3)
+        self.seconds.observe(str(adapter), milliseconds / 1e3)
         self._counts["batches"] += 1
         self._counts["batched_requests"] += len(batch)
         for number, (job, chunk) in enumerate(zip(batch, actions, strict=False)):

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -13,7 +13,6 @@ from lorasp_jax.extras.serving import ranks
 from lorasp_jax.extras.serving.adapters import OnDevice, is_shared
 from lorasp_jax.extras.serving.exported import Description, sampling_options
 from lorasp_jax.extras.serving.loading import Loaded
-from lorasp_jax.models.shared_base import SharedSampler, by_row
 from lorasp_jax.policies.policy import Observation, Policy
 from lorasp_jax.policies.processor import Processor
 from lorasp_jax.policies.prompt_table import Ids, PromptTable
@@ -38,7 +37,6 @@ class CompiledPolicy:
         instructions: those of its training.
         plausible: see `plausible_states`.
         policy: the policy itself.
-        group: equal for policies that can share a batch, see `run_mixed`; None: there are none.
         tokens: gives the tokens of an instruction as `ExportedPolicy.tokens` does.
     """
 
@@ -73,7 +71,6 @@ class CompiledPolicy:
         self.policy: Policy = without_prompts(policy)
         self._place = place
         self._guidance = None if guidance is None else np.float32(guidance)
-        self.group: Any = _group(self.policy)
         # Not a method: a cycle of references would keep the weights of a policy that was unloaded.
         self.tokens = _tokens(policy.processor.prompts, loaded.words)
 
@@ -84,44 +81,12 @@ class CompiledPolicy:
         away = moves and isinstance(place, OnDevice) and self.policy not in place
         return "in host memory" if away else "on the device"
 
-    def run(self, batch: Mapping[str, Any]) -> np.ndarray:
-        """Return actions f32 `[B, C, J+1]`; see `sample`."""
-        return self.answer(batch)[0]
-
-    def answer(self, batch: Mapping[str, Any]) -> Answer:
+    def run(self, batch: Mapping[str, Any]) -> Answer:
         """Return actions and active ranks; see `answer`."""
         steps = self.description.num_steps
         return jax.device_get(
             _program()(self._place(self.policy), batch, self._guidance, num_steps=steps)
         )
-
-
-def run_mixed(policies: Sequence[CompiledPolicy], batch: Mapping[str, Any]) -> Answer:
-    """Return actions and active ranks, each row with a policy of its own; see `sample_mixed`.
-
-    All must be of one group. While it runs, an adapter takes its memory on the device once more for
-    each of its rows.
-    """
-    placed = {each: each._place(each.policy) for each in dict.fromkeys(policies)}
-    rows = [(placed[each].model.own, placed[each].processor) for each in policies]
-    model, guidance = dataclasses.replace(policies[0].policy.model, own=[]), policies[0]._guidance
-    steps = policies[0].description.num_steps
-    return jax.device_get(_mixed_program()(model, rows, batch, guidance, num_steps=steps))
-
-
-def _group(policy: Policy) -> Any:
-    """Return what is equal for policies that `sample_mixed` can run together.
-
-    They have one base, and adapters of the same layers, methods and shapes, since these make one
-    program; and processors that differ only in numbers, such as statistics. Whole kernels in place
-    of the base's would be copied for each row.
-    """
-    model = policy.model
-    if not isinstance(model, SharedSampler) or not model.own or model.replaces_kernels:
-        return None
-    leaves, tree = jax.tree.flatten((model.own, policy.processor))
-    # A base has one such object for equal adapters.
-    return id(model.structure), tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
 
 
 def _tokens(table: PromptTable, words: Tokenizer) -> Callable[[str], dict[str, np.ndarray]]:
@@ -139,13 +104,6 @@ def _tokens(table: PromptTable, words: Tokenizer) -> Callable[[str], dict[str, n
 def _program() -> Any:
     """Return the compiled `answer`, which all policies share."""
     return jax.jit(answer, static_argnames="num_steps", compiler_options=sampling_options())
-
-
-@functools.cache
-def _mixed_program() -> Any:
-    """Return the compiled `sample_mixed`."""
-    options = sampling_options()
-    return jax.jit(sample_mixed, static_argnames="num_steps", compiler_options=options)
 
 
 def batch_sizes(max_batch: int) -> tuple[int, ...]:
@@ -244,32 +202,6 @@ def answer(
         **condition,
     )
     return processor.decode(chunk, batch["state"]), ranks.mean(once, steps)
-
-
-def sample_mixed(
-    model: SharedSampler,
-    policies: Sequence[tuple[list[jax.Array], Processor]],
-    batch: Mapping[str, Any],
-    guidance: jax.Array | None = None,
-    *,
-    num_steps: int,
-) -> tuple[jax.Array, jax.Array | None]:
-    """Do the same, each row with a policy of its own; the other arguments are those of `answer`.
-
-    Args:
-        model: with the base's weights.
-        policies: of each row the adapter's arrays, and the processor.
-    """
-    adapters, processors = zip(*policies, strict=True)
-    processors = jax.tree.map(lambda *leaves: jnp.stack(leaves), *processors)
-
-    def one(model: SharedSampler, row: tuple[Processor, dict[str, Any]]) -> Any:
-        processor, inputs = row
-        inputs = jax.tree.map(lambda leaf: leaf[None], inputs)
-        found = answer(Policy(model, processor), inputs, guidance, num_steps=num_steps)
-        return jax.tree.map(lambda leaf: leaf[0], found)
-
-    return by_row(one, model, adapters, (processors, dict(batch)))
 
 
 def _encode(processor: Processor, batch: Mapping[str, Any]) -> Observation:

@@ -116,14 +116,7 @@ class Adapters:
 
     def listed(self) -> str:
         """Return the adapters as JSON, and how the last change ended."""
-        adapters = [
-            {
-                "name": each.name,
-                "instructions": each.policy.instructions,
-                "batches_with": self._policy.companions(each),
-            }
-            for each in self._policy.adapters
-        ]
+        adapters = [{"name": n, "instructions": t} for n, t in self._policy.instructions.items()]
         return json.dumps({"adapters": adapters, **self.state()}) + "\n"
 
     def state(self) -> dict[str, Any]:

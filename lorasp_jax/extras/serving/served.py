@@ -21,7 +21,7 @@ from lorasp_jax.extras.serving.exported import (
     PolicyInterface,
     build_row,
 )
-from lorasp_jax.extras.serving.policies import CACHED_PROMPTS, Answer, CompiledPolicy, run_mixed
+from lorasp_jax.extras.serving.policies import CACHED_PROMPTS, Answer, CompiledPolicy
 from lorasp_jax.extras.serving.requests import PolicySpec, Request
 
 _log = logging.getLogger(__name__)
@@ -35,15 +35,11 @@ class Adapter:
         name: its name.
         policy: the policy.
         warned: whether the log was told of an absurd state.
-        group: equal for adapters that can share a batch.
     """
 
     name: str
     policy: CompiledPolicy | ExportedPolicy
     warned: bool = False
-
-    def __post_init__(self) -> None:
-        self.group: Any = getattr(self.policy, "group", None) or object()
 
     def __str__(self) -> str:
         """Return the name."""
@@ -62,7 +58,6 @@ class ServedPolicies:
         spec: what requests must have, and what is returned.
         metadata: what the first policy's run says of its robot.
         sizes: batch sizes, ascending.
-        together: how many adapters a batch may have.
         routing: how requests without a name find their adapter, one of `routing.MODES`.
     """
 
@@ -77,7 +72,6 @@ class ServedPolicies:
         execution: str = "naive",
         route: str = "name",
         load: Callable[[str], CompiledPolicy] | None = None,
-        together: int = 1,
     ) -> None:
         """Check that the policies fit; `warm_up` compiles.
 
@@ -90,7 +84,6 @@ class ServedPolicies:
                 Exported policies cannot be guided.
             route: one of `routing.MODES`; "nearest" needs policies on a `SharedBase`.
             load: loads another adapter from a path, for `put`; None: adapters do not change.
-            together: how many adapters a batch may have.
 
         Raises:
             ValueError: the policies need different observations or are of different robots, or
@@ -105,7 +98,6 @@ class ServedPolicies:
         self._change = threading.Lock()
         sizes = [set(policy.description.batch_sizes) for policy in policies.values()]
         self.sizes: tuple[int, ...] = tuple(sorted(set.intersection(*sizes)))
-        self.together: int = together
         # The key is an argument, as a constant would make a program of its own for every seed.
         self._key = jax.random.key(seed)
         self._draw = jax.jit(jax.vmap(draw_noise, (None, 0, None)), static_argnums=2)
@@ -129,33 +121,20 @@ class ServedPolicies:
 
     def warm_up(self, say: Callable[[str], None] = lambda _: None) -> None:
         """Compile and run every program; `say` is told of each before it starts."""
-        alone = [(each,) for each in self.adapters]
-        programs = [*itertools.product(alone, self.sizes), *self._mixtures(self.adapters)]
-        for number, (adapters, size) in enumerate(programs, start=1):
-            names = " with ".join(map(str, adapters))
-            say(f"compiling {names}, batch {size} ({number} of {len(programs)})")
-            self._try_out(adapters, size)
+        programs = [*itertools.product(self.adapters, self.sizes)]
+        for number, (adapter, size) in enumerate(programs, start=1):
+            say(f"compiling {adapter}, batch {size} ({number} of {len(programs)})")
+            self._try_out(adapter, size)
 
-    def _mixtures(self, adapters: Sequence[Adapter]) -> list[tuple[tuple[Adapter, ...], int]]:
-        """Return two adapters of each group that has as many, with each size of their batches."""
-        by_group: dict[Any, list[Adapter]] = {}
-        for each in adapters:
-            by_group.setdefault(each.group, []).append(each)
-        pairs = [(*each[:2],) for each in by_group.values() if len(each) > 1 < self.together]
-        return [*itertools.product(pairs, self.sizes[1:])]
-
-    def _try_out(self, adapters: Sequence[Adapter], size: int) -> None:
-        """Run a batch twice, which compiles the program if no other adapters have the same."""
-        spec, turns = self.spec, [*itertools.islice(itertools.cycle(adapters), size)]
+    def _try_out(self, adapter: Adapter, size: int) -> None:
+        """Run a batch twice, which compiles the program if no other adapter has the same."""
+        spec = self.spec
         picture = np.zeros((spec.image_size, spec.image_size, 3), np.uint8)
         images, state = dict.fromkeys(spec.cameras, picture), np.zeros(spec.state_dim, np.float32)
-        rows = []
-        for adapter in turns:
-            prompt = (self._prompt, *adapter.policy.instructions, "press the button")
-            request = Request(images, state, next(filter(None, prompt)))
-            rows.append(self._row(adapter, request, (0, 0)))
+        prompt = (self._prompt, *adapter.policy.instructions, "press the button")
+        request = Request(images, state, next(filter(None, prompt)))
         for _ in range(2):
-            self.run_mixed(turns, rows)
+            self.run(adapter, [self._row(adapter, request, (0, 0))] * size)
 
     def put(self, name: str, path: str) -> None:
         """Load an adapter and serve it from the next batch on, in place of one of the same name.
@@ -177,11 +156,8 @@ class ServedPolicies:
             adapter, first = Adapter(name, self._load(path)), self._adapters[self._default]
             both = {f"the present {first.name}": first.policy, name: adapter.policy}
             common_spec(_descriptions(both), self.spec.execution)
-            others = [each for each in self.adapters if each.name != name]
-            same = [each for each in others if each.group == adapter.group][:1]
-            alone = itertools.product([(adapter,)], self.sizes)
-            for adapters, size in (*alone, *self._mixtures([adapter, *same])):
-                self._try_out(adapters, size)
+            for size in self.sizes:
+                self._try_out(adapter, size)
             self._adapters = self._adapters | {name: adapter}
 
     def remove(self, name: str) -> None:
@@ -195,15 +171,6 @@ class ServedPolicies:
                 raise ValueError(f"{name} answers requests that name no adapter: replace it")
             self._find(name)
             self._adapters = {n: each for n, each in self._adapters.items() if n != name}
-
-    def group(self, adapter: Adapter) -> Any:
-        """Return what is equal for adapters whose requests can share a batch."""
-        return adapter.group if self.together > 1 else adapter.name
-
-    def companions(self, adapter: Adapter) -> list[str]:
-        """Return the adapters whose requests share batches with one's, see `policies.run_mixed`."""
-        group = self.group(adapter)
-        return [x.name for x in self.adapters if self.group(x) == group and x.name != adapter.name]
 
     def _find(self, name: str) -> Adapter:
         adapters = self._adapters
@@ -282,26 +249,14 @@ class ServedPolicies:
                 *(number, state[number], *bounds[:, number]),
             )
 
-    def run(self, adapter: Adapter, rows: Sequence[dict[str, Any]]) -> np.ndarray:
-        """Return actions f32 `[B, C, J+1]`; B is one of `sizes`."""
-        return self.run_mixed([adapter] * len(rows), rows)[0]
-
-    def run_mixed(self, adapters: Sequence[Adapter], rows: Sequence[dict[str, Any]]) -> Answer:
-        """Return actions and active ranks of the adapters of B rows, all of one group."""
-        batch, policies = self._batch(adapters[0], rows), [each.policy for each in adapters]
-        if len({*adapters}) > 1:
-            return run_mixed(policies, batch)  # type: ignore[arg-type]
-        if isinstance(policies[0], CompiledPolicy):
-            return policies[0].answer(batch)
-        return policies[0].run(batch), None
-
-    def _batch(self, adapter: Adapter, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-        """Stack rows, and draw their noise."""
-        batch = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
-        description = adapter.policy.description
-        shape = description.chunk, description.action_dim
-        noise = self._draw(self._key, batch.pop("index"), shape)
-        return {**batch, "noise": noise}
+    def run(self, adapter: Adapter, rows: Sequence[dict[str, Any]]) -> Answer:
+        """Return actions and active ranks of B rows; B is one of `sizes`."""
+        policy, batch = adapter.policy, jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
+        shape = policy.description.chunk, policy.description.action_dim
+        batch["noise"] = self._draw(self._key, batch.pop("index"), shape)
+        if isinstance(policy, ExportedPolicy):
+            return policy.run(batch), None
+        return policy.run(batch)
 
 
 def draw_noise(key: jax.Array, index: jax.Array, shape: tuple[int, ...]) -> jax.Array:

@@ -73,7 +73,8 @@ class VlaEvalServer(PredictModelServer):
         rows, chunks = [each["row"] for each in obs_batch], []
         for start in range(0, len(rows), sizes[-1]):  # clients may raise max_batch_size
             batch = rows[start : start + sizes[-1]]
-            chunks += [*self._policies.run(adapter, padded(batch, sizes))[: len(batch)]]
+            actions, _ = self._policies.run(adapter, padded(batch, sizes))
+            chunks += [*actions[: len(batch)]]
         return [{"actions": chunk} for chunk in chunks]
 
     def _row(self, observation: Mapping[str, Any], context: SessionContext) -> dict[str, Any]:

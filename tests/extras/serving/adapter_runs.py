@@ -42,11 +42,10 @@ def write_run(source, folder, seed, instructions=TEXTS["press"], config=None, **
     return str(folder)
 
 
-def serve_runs(runs, *, capacity=None, max_batch=2, share=True, guidance=None, **options):
+def serve_runs(runs, *, capacity=None, max_batch=2, share=True, **options):
     """Return `ServedPolicies` of runs by name, on one base."""
     bases, place = Bases(), OnDevice(capacity)
-    settings = {"num_steps": 2, "max_batch": max_batch, "guidance": guidance, "place": place}
-    compiled = functools.partial(CompiledPolicy, **settings)
+    compiled = functools.partial(CompiledPolicy, num_steps=2, max_batch=max_batch, place=place)
 
     def load(run, first=False):
         model = functools.partial(bases.sampler, load=first) if share else None

@@ -4,8 +4,6 @@ import asyncio
 import contextlib
 import threading
 import time
-from types import SimpleNamespace
-from typing import ClassVar
 
 import numpy as np
 
@@ -21,17 +19,14 @@ class StandIn:
 
     `indices` keeps the numbers of connections and of requests on them, `gate` holds every batch
     back until it is set, `seconds` is the time a batch takes, and `failure` is raised instead of an
-    answer. `ranks` are the active ranks of a batch. Adapters that `groups` maps to the same name
-    share batches.
+    answer. `ranks` are the active ranks of a batch.
     """
-
-    groups: ClassVar[dict[str, str]] = {}
 
     def __init__(self, spec=SPEC, *, seconds=0.0, adapters=("base",), instructions=(), metadata=()):
         self.metadata = dict(metadata)
         self.spec, self.sizes, self.seconds = spec, (1, 2, 4, 8), seconds
         self.instructions = dict.fromkeys(adapters, instructions)
-        self.routing, self.together = "name", 8
+        self.routing = "name"
         self.gate, self.failure, self.ranks = threading.Event(), None, None
         self.batches, self.indices = [], []
         self.gate.set()
@@ -54,34 +49,15 @@ class StandIn:
         first = request.images[self.spec.cameras[0]]
         return request.state + index[1] + first.mean(dtype=np.float32)
 
-    def group(self, adapter):
-        return self.groups.get(adapter, adapter)
-
-    @property
-    def adapters(self):
-        """What lists read; requests have names."""
-        make = lambda name, texts: SimpleNamespace(  # noqa: E731
-            name=name, policy=SimpleNamespace(instructions=texts)
-        )
-        return [make(*item) for item in self.instructions.items()]
-
-    def companions(self, adapter):
-        name, group = adapter.name, self.group(adapter.name)
-        return [each for each in self.instructions if self.group(each) == group and each != name]
-
-    def run_mixed(self, adapters, rows):
-        self.batches.append((" ".join(dict.fromkeys(map(str, adapters))), len(rows)))
+    def run(self, adapter, rows):
+        self.batches.append((str(adapter), len(rows)))
         self.gate.wait()
         time.sleep(self.seconds)
         if self.failure:
             raise self.failure
-        offsets = [list(self.instructions).index(each) * 1000 for each in adapters]
-        chunks = np.repeat(np.stack(rows)[:, None], self.spec.chunk, axis=1)
-        ranks = None if self.ranks is None else self.ranks[: len(rows)]
-        return chunks + np.float32(offsets)[:, None, None], ranks
-
-    def run(self, adapter, rows):
-        return self.run_mixed([adapter] * len(rows), rows)[0]
+        offset = list(self.instructions).index(adapter) * 1000
+        chunks = np.repeat(np.stack(rows)[:, None], self.spec.chunk, axis=1) + np.float32(offset)
+        return chunks, None if self.ranks is None else self.ranks[: len(rows)]
 
 
 @contextlib.contextmanager

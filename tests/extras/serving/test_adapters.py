@@ -115,7 +115,7 @@ def test_an_unloaded_adapter_leaves_the_device_after_its_last_request(runs):
     gc.collect()
     before, own = live_bytes(), sum(array.nbytes for array in adapter.policy.policy.model.own)
     served.remove("pour")
-    np.testing.assert_array_equal(served.run(adapter, [row]), expected)
+    np.testing.assert_array_equal(served.run(adapter, [row])[0], expected)
     with pytest.raises(ValueError, match="one of press, open, got 'pour'"):
         served.route(sent)
     del adapter

@@ -69,20 +69,6 @@ def test_every_adapter_has_its_own_batches_in_order_of_arrival():
     assert clients.policy.batches == [("base", 1), ("a", 2), ("b", 2)]
 
 
-def test_adapters_of_a_group_share_batches_up_to_a_number_of_adapters():
-    policy = StandIn(adapters=("base", "a", "b", "c"))
-    policy.groups = dict.fromkeys("abc", "one")
-    clients = Clients(policy)
-    asked = [*enumerate(["base", "a", "b", "base", "a", "c"])]
-    assert clients.run(clients.gather(*asked)) == [0, 1001, 2002, 3, 1004, 3005]
-    assert policy.batches == [("base", 1), ("a b c", 4), ("base", 1)]
-    policy.together, policy.batches = 2, []
-    clients = Clients(policy)
-    assert clients.run(clients.gather(*asked)) == [0, 1001, 2002, 3, 1004, 3005]
-    assert policy.batches == [("base", 1), ("a b", 4), ("base", 1), ("c", 1)]
-    assert {*clients.batcher.seconds._counts} == {"base", "a", "b", "c"}
-
-
 def test_an_adapter_of_the_last_batch_is_not_kept():
     """One that was unloaded leaves memory even if nobody asks again."""
 
@@ -90,7 +76,6 @@ def test_an_adapter_of_the_last_batch_is_not_kept():
         __slots__ = ("__weakref__",)
 
     clients, kept = Clients(StandIn()), []
-    clients.policy.group = str
 
     async def work():
         adapter = Adapter("base")

@@ -90,7 +90,7 @@ def noise_of(spec, connection=0, request=0):
 
 def actions(served, *requests, index=(0, 0)):
     adapter = served.route(requests[0])
-    return served.run(adapter, [served.prepare(adapter, each, index) for each in requests])
+    return served.run(adapter, [served.prepare(adapter, each, index) for each in requests])[0]
 
 
 def prepared(served, sent):

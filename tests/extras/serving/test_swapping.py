@@ -22,7 +22,6 @@ import psutil
 import pytest
 
 from lorasp_jax.extras.serving import requests
-from lorasp_jax.extras.serving import served as served_module
 from lorasp_jax.extras.serving.client import PolicyClient, PolicyError
 from lorasp_jax.extras.serving.served import ServedPolicies
 from tests.cases import mostly_slow
@@ -68,21 +67,13 @@ def fixed_noise(monkeypatch):
     )
 
 
-def count_mixed(monkeypatch):
-    """Return a list that gets the size of each batch of several adapters."""
-    sizes, run = [], served_module.run_mixed
-    count = lambda policies, batch: sizes.append(len(policies)) or run(policies, batch)  # noqa: E731
-    monkeypatch.setattr(served_module, "run_mixed", count)
-    return sizes
-
-
 def answers_alone(served):
     """Answers of each adapter alone [adapters, pictures, C, J+1]."""
     pictures = [observation(served.spec, value * 100) for value in range(PICTURES)]
     asked = [requests.parse(picture, served.spec) for picture in pictures]
     return np.stack(
         [
-            [served.run(each, [served.prepare(each, one, (0, 0))])[0] for one in asked]
+            [served.run(each, [served.prepare(each, one, (0, 0))])[0][0] for one in asked]
             for each in served.adapters
         ]
     )
@@ -188,16 +179,14 @@ def swaps(source, folder, total, patch, pause=0.05):
     assert min(apart) > 100 * TOLERANCE, "no two adapters have nearly equal answers"
     del alone
     gc.collect()
-    first = {name: paths[name, 0] for name in NAMES}
-    served = serve_runs(first, max_batch=4, capacity=3, together=3)
+    served = serve_runs({name: paths[name, 0] for name in NAMES}, max_batch=4, capacity=2)
     served.warm_up()
-    mixed = count_mixed(patch)
     with serving(served, token="secret") as server:
         result = Swaps(server, paths, expected, total, pause)
         start = time.monotonic()
         result.run()
         result.seconds = time.monotonic() - start
-        result.counts.update(server.counts, mixed=len(mixed))
+        result.counts.update(server.counts)
         result.apart = float(min(apart))
     return result
 
@@ -208,7 +197,6 @@ def test_no_adapter_answers_for_another(total, finished, tmp_path, monkeypatch):
     assert result.faults == []
     assert result.counts["answers"] >= total
     assert result.counts["swaps"] >= 3
-    assert result.counts["mixed"] > 0
     if total > 1000:  # memory is flat
         third = result.memory[len(result.memory) // 3]
         _, arrays, resident = result.memory[-1]

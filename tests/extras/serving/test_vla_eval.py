@@ -73,7 +73,8 @@ class Counting(StandIn):
     """Adds 100 times its number to each action of a chunk."""
 
     def run(self, adapter, rows):
-        return super().run(adapter, rows) + 100 * np.arange(self.spec.chunk)[None, :, None]
+        chunks, ranks = super().run(adapter, rows)
+        return chunks + 100 * np.arange(self.spec.chunk)[None, :, None], ranks
 
 
 @pytest.fixture
