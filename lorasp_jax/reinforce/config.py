@@ -23,7 +23,7 @@ class Learning:
     """Train the adapters of the start run, or merge them into its base and train new ones."""
     worlds: int = 64
     """Parallel worlds per task, one episode each in every iteration."""
-    std: float = 0.05
+    std: float = 0.1
     """Standard deviation of exploration [normalized action units]."""
     correlation: float = 0.9
     """Correlation of this noise in successive actions of a chunk; 0: new noise in each."""
