@@ -104,7 +104,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     sub.add_argument("--save", type=Path, metavar="FILE", help=text)
     sub.add_argument("--overwrite", action="store_true", help="replace existing files")
     text = "show what training makes of a frame, by this recipe (default: %(const)s)"
-    recipes = {"nargs": "?", "const": "openpi", "choices": ("openpi", "lerobot")}
+    recipes = {"nargs": "?", "const": "auto", "choices": ("auto", "openpi", "lerobot")}
     sub.add_argument("--augment", default="none", help=text, **recipes)
     add_keys(sub)
 

@@ -71,10 +71,11 @@ def _openpi(
     sizes = int(width * numbers["crop"]), int(height * numbers["crop"])
     turn = numbers["rotation"]
     moves = [augmax.RandomCrop(*sizes), augmax.Resize(width, height), augmax.Rotate((-turn, turn))]
+    still = wrist or (numbers["crop"] == 1 and turn == 0)
     strengths = {name: numbers[name] for name in ("brightness", "contrast", "hue")}
     # With a saturation, augmax has a random key for each of the others, even if some are 0.
     jitter = augmax.ColorJitter(**strengths, saturation=1.0)
-    chain: Any = augmax.Chain(*([] if wrist else moves), jitter)
+    chain: Any = augmax.Chain(*([] if still else moves), jitter)
     return chain(key, image)
 
 

@@ -8,6 +8,7 @@ import math
 import os
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -255,7 +256,8 @@ def changed(image: np.ndarray, camera: str, preset: str, seed: int) -> np.ndarra
 @functools.cache
 def _recipe(preset: str, wrist: bool) -> Augment:
     """Return the jitted recipe: all tiles of a size share its program."""
-    return jax.jit(recipe(AugmentConfig(preset), wrist=wrist))  # type: ignore[arg-type]
+    settings: Any = AugmentConfig(preset).chosen(simulated=False)  # type: ignore[arg-type]
+    return jax.jit(recipe(settings, wrist=wrist))
 
 
 def _spread(count: int, number: int) -> list[int]:

@@ -205,4 +205,5 @@ def _line(axes: Any, rows: Rows, name: str, color: str, label: str) -> None:
     """Plot one metric at the steps that recorded it."""
     points = [(row["step"], row[name]) for row in rows if name in row]
     if points:
-        axes.plot(*zip(*points, strict=True), color=color, label=label, lw=1.5)
+        marker = "o" if len(points) == 1 else None  # a line needs two
+        axes.plot(*zip(*points, strict=True), color=color, label=label, lw=1.5, marker=marker)

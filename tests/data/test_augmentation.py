@@ -101,6 +101,15 @@ def test_cameras_on_the_wrist():
     assert [augmentation.on_wrist(name) for name in named] == 4 * [True] + 3 * [False]
 
 
+def test_recordings_change_in_color_alone():
+    still = AugmentConfig(brightness=0.0, contrast=0.0, hue=0.0).chosen(simulated=False)
+    image = jnp.asarray(np.random.default_rng(0).random((16, 16, 3), np.float32))
+    assert still is not None
+    for seed in range(4):
+        changed = recipe(still)(jax.random.key(seed), image)
+        np.testing.assert_allclose(changed, image, atol=1e-6)  # hue and back
+
+
 def test_default_recipe():
     assert AugmentConfig().chosen(simulated=True) is None
     colors = AugmentConfig("openpi", crop=1.0, rotation=0.0)
