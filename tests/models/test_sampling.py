@@ -114,4 +114,5 @@ def test_a_float8_sampler_gives_the_actions_of_its_model(in_float8, adapted):
     prepared = jax.jit(lambda model: model.sampler())(model)
     assert len(quantized_shapes(towers(prepared)[1])) == 3 * DUMMY.language.depth
     for sampler in (prepared, jax.jit(lambda m: Sampler.from_model(m, once=True))(model)):
-        np.testing.assert_allclose(sample(sampler), expected, rtol=1e-4, atol=1e-5)
+        # Sums in another order; a number that rounds to another float8 differs by 1e-3 and more.
+        np.testing.assert_allclose(sample(sampler), expected, rtol=1e-4, atol=5e-5)
