@@ -12,7 +12,7 @@ that another is still writing; those of an unlimited one it does not."""
 
 
 def enable() -> None:
-    """Cache compiled programs in JAX_COMPILATION_CACHE_DIR, by default ~/.cache/lorasp_jax/jax.
+    """Cache compiled programs in JAX_COMPILATION_CACHE_DIR, by default in `user_cache()`.
 
     Call this before anything is compiled.
 

@@ -19,8 +19,8 @@ class AugmentConfig:
     """Random changes of training images. A number that is not given is the preset's."""
 
     preset: Literal["auto", "none", "openpi", "lerobot"] = "auto"
-    """The recipe of openpi or LeRobot; auto: openpi's colors alone, which did best in the shifted
-    scene of studies/few, for recordings, none for simulated episodes."""
+    """The recipe of openpi or LeRobot; auto: for recordings openpi's colors alone, which gain in
+    the shifted scene of studies/few and cost least in the recorded one, for simulation none."""
     crop: float | None = None
     """Side of a random crop, relative to the image's (openpi, not for wrist cameras)."""
     rotation: float | None = None

@@ -23,9 +23,9 @@ Points = Mapping[tuple[str, str, str], Mapping[str, Sequence[Estimate]]]
 
 
 @mpl.rc_context(STYLE)
-def write(path: Path, points: Points) -> None:
+def write(path: Path, backbones: Sequence[str], points: Points) -> None:
     """Draw a row per scene, and a column per backbone and augmentation; write it as SVG."""
-    columns = [(backbone, kind) for backbone in page.BACKBONES for kind in page.AUGMENT]
+    columns = [(backbone, kind) for backbone in backbones for kind in page.AUGMENT]
     figure = Figure(figsize=(1.2 + 3.2 * len(columns), 5.4), layout="constrained")
     axes = figure.subplots(len(page.SCENES), len(columns), sharex=True, sharey=True, squeeze=False)
     for column, (backbone, kind) in enumerate(columns):

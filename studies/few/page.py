@@ -61,19 +61,22 @@ def success(result: Mapping[str, Any], scene: str = "recorded") -> float:
 
 
 def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
-    """Write the figure into `folder`; return the tables."""
+    """Write the figure into `folder`; return the tables, of backbones whose policies have run."""
+    cases = [*itertools.product(LABELS, AUGMENT, COUNTS)]
+    backbones = [b for b in BACKBONES if all(_names(results, b, *case) for case in cases)]
     points = {
         (backbone, scene, kind): {
             method: [_estimate(results, backbone, method, kind, n, scene) for n in COUNTS]
             for method in LABELS
         }
-        for backbone in BACKBONES
+        for backbone in backbones
         for scene in SCENES
         for kind in AUGMENT
     }
-    figure.write(folder / "success.svg", points)
+    if backbones:
+        figure.write(folder / "success.svg", backbones, points)
     made = {"augmentation": _parts_table(results)}
-    for backbone in BACKBONES:
+    for backbone in backbones:
         for scene in SCENES:
             made[f"{backbone} {scene}"] = _success_table(results, points, backbone, scene)
         made[f"{backbone} methods"] = _difference_table(results, backbone)
@@ -113,10 +116,10 @@ def _difference_table(results: Results, backbone: str) -> str:
             continue
         cells = []
         for n in COUNTS:
-            pair = [
-                _outcomes([results[x] for x in _names(results, backbone, m, "none", n)], "recorded")
-                for m in (method, STEPPED)
-            ]
+            both = [[cell(backbone, m, "none", n, s) for m in (method, STEPPED)] for s in SEEDS]
+            ran = [pair for pair in both if all(name in results for name in pair)]
+            columns = zip(*ran, strict=True)
+            pair = [_outcomes([results[name] for name in names], "recorded") for names in columns]
             cells.append(statistics.bootstrap(lambda x, y: (x - y).mean(-1), *pair))
         rows.append([label, *map(page.points, cells)])
     head = [f"{BACKBONES[backbone]}, points", *(f"N = {n}" for n in COUNTS)]
@@ -147,6 +150,9 @@ def _steps_table(results: Results, backbone: str) -> str:
             at = backbone, STEPPED, kind(augment, steps), n
             names = _names(results, *at)
             errors = [results[name]["action_error"] for name in names]
+            if not names:
+                cells.append(page.NONE)
+                continue
             shown = _percent(_estimate(results, *at, "recorded"), names)
             cells.append(f"{shown}; {np.mean(errors):.3f}")
         rows.append([AUGMENT[augment], f"{n}", *cells])

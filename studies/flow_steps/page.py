@@ -36,7 +36,8 @@ def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
     backbones = [
         b for b in BACKBONES if all(f"{b}/{p}/s{s}" in results for p in POLICIES for s in SEEDS)
     ]
-    _figure(results, backbones, folder / "success.svg")
+    if backbones:
+        _figure(results, backbones, folder / "success.svg")
     made = {}
     for backbone in backbones:
         made[f"{backbone} success"] = _table(results, backbone, _success)

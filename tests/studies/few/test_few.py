@@ -103,3 +103,17 @@ def test_a_cropped_camera_shows_the_middle_of_its_pictures():
     np.testing.assert_allclose(shown["side"][:, 0, 0], middle[:, 0, 0], atol=1)  # its corners
     np.testing.assert_allclose(shown["side"][:, -1, -1], middle[:, -1, -1], atol=1)
     assert abs(shown["side"].mean() - middle.mean()) < 0.5
+
+
+def test_the_page_of_results_that_lack_policies(results, tmp_path, monkeypatch):
+    monkeypatch.setattr(statistics, "DRAWS", 20)
+    monkeypatch.setattr(page, "DRAWS", 20)
+    monkeypatch.setattr(statistics, "_counts", statistics._counts.__wrapped__)
+    some = {name: x for name, x in results.items() if not name.startswith("smolvla/full/none/n50")}
+    some = {name: x for name, x in some.items() if "pi0/lora_r64/none_8000/n10" not in name}
+    some.pop("pi0/full/none/n10/s2")
+    made = page.blocks(STUDY, some, tmp_path)
+    assert not [name for name in made if name.startswith("smolvla")]
+    assert "(2 of 3)" in made["pi0 recorded"]
+    assert made["pi0 steps"].splitlines()[2].endswith("| – |")
+    assert [*page.blocks(STUDY, {}, tmp_path)] == ["augmentation"]

@@ -82,3 +82,11 @@ def test_spread_is_that_over_noise():
     found = judge._spread(Policy(), Raw(), 2)
     assert found.shape == (300, judge._EXECUTED, 2)
     assert found.mean() == pytest.approx(2 * 0.95, abs=0.05)
+
+
+def test_the_page_leaves_out_a_backbone_that_lacks_policies(results, tmp_path, monkeypatch):
+    monkeypatch.setattr(statistics, "DRAWS", 20)
+    monkeypatch.setattr(statistics, "_counts", statistics._counts.__wrapped__)
+    some = {name: x for name, x in results.items() if name != "smolvla/rtc/s1"}
+    assert {name.split()[0] for name in page.blocks(STUDY, some, tmp_path)} == {"pi0"}
+    assert page.blocks(STUDY, {}, tmp_path) == {}
