@@ -79,7 +79,7 @@ class Evaluation(Callback):
         Returns:
             The success rate of each task, named `success/<task>`; empty if no evaluation is due.
         """
-        if not run.config.evaluates(step):
+        if not (run.stops or run.config.evaluates(step)):
             return {}
         results = self._evaluate_tasks(run, f"at step {step}", run.config.evaluation.worlds)
         if self._pending_videos:

@@ -38,10 +38,11 @@ class Learning:
     epochs: int = 4
     """Passes over the chunks of an iteration."""
     max_kl: float = 0.02
-    """A step whose mean KL divergence per action from the policy that acted exceeds this
-    is undone and ends the iteration."""
-    max_start_kl: float = 300.0
-    """The run stops when an action's mean KL divergence from the start policy exceeds this."""
+    """A step that brings the mean KL divergence per action from the policy that acted above this
+    is the last of its iteration. The learning rate adapts to end iterations near it."""
+    max_start_kl: float = 20.0
+    """The run stops when the mean KL divergence per executed action from the start policy exceeds
+    this. An offset by 0.5 of the 7 slots of 5 actions is 21 with the default noise."""
     critic_learning_rate: float = 1e-3
     """Learning rate of the critic."""
     minutes: float = 0.0
@@ -78,7 +79,7 @@ class ReinforceConfig(Config):
     """One run of online reinforcement learning; a step is an iteration of rollout and update.
 
     `optim.batch_size` are the chunks of a gradient step. The learning rate adapts to the KL
-    divergence of the iterations.
+    divergence of the iterations. The first iteration trains only the critic.
     """
 
     online: Learning = field(default_factory=Learning)
@@ -94,6 +95,10 @@ class ReinforceConfig(Config):
                 raise ValueError(f"{name} is not for reinforcement learning: drop it")
         if self.data.source and not self.online.start:
             raise ValueError("data.source is not for reinforcement learning: drop it")
+        if self.optim.steps == 1:
+            raise ValueError(
+                "optim.steps must be at least 2, got 1: the first iteration trains only the critic"
+            )
         super().__post_init__()
 
     def evaluates(self, step: int) -> bool:

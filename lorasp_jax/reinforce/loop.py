@@ -77,13 +77,13 @@ def _loop(
             if values.pop("in_a_row") >= config.optim.max_skipped:
                 raise RunError(_SKIPPED.format(config.optim.max_skipped, saved))
             values = clock.count(values)
-            run.policy = setting.policy(state.adapters)
+            reason = clock.collapse(config, values)
+            run.policy, run.stops = setting.policy(state.adapters), bool(reason)
             for callback in callbacks:
                 values = values | (callback.on_log(run, done, values) or {})
             _keep_best(run, done, values)
             log.write(done, values)
             progress.update(bar, completed=done, description=_text(values))
-            reason = clock.collapse(config, values)
             if done // config.checkpoint_every > saved // config.checkpoint_every:
                 checkpoints.save(state)
                 saved = done
@@ -211,7 +211,7 @@ def _summary(
         return {"updates": 0, "in_a_row": 0}
     values = {n: float(x.mean()) for n, x in summarize(rows).items() if x.ndim == 0}
     useful = np.flatnonzero(np.any(batch.valid, axis=1))  # of all calls, in their order
-    index = useful[np.linspace(0, len(useful) - 1, setting.config.optim.batch_size).astype(int)]
+    index = update.evenly(useful, setting.config.optim.batch_size)
     now, start = (
         setting.programs.means(x, setting.frozen, batch.chunks, index)
         for x in (state.adapters, setting.start)

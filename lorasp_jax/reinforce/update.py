@@ -63,9 +63,11 @@ class WeightedChunks(NamedTuple):
 
 _FACTOR = 1.5
 """By how much an iteration changes the learning rate; our choice."""
+_LARGEST = 64.0
+"""Bound of the product of these factors, and of its inverse; our choice."""
 
-Loss = Callable[[Any, Frozen, WeightedChunks], tuple[jax.Array, Metrics]]
-"""(adapters, frozen, batch) -> loss and metrics."""
+Loss = Callable[..., tuple[jax.Array, Metrics]]
+"""(adapters, frozen, batch, *, num_valid=None) -> loss and metrics."""
 
 
 def make_loss(config: ReinforceConfig, graphdef: Any) -> Loss:
@@ -90,13 +92,18 @@ def surrogate_loss(
     spread: noise.Spread,
     clip: float,
     denoise_steps: int,
+    num_valid: jax.Array | None = None,
 ) -> tuple[jax.Array, Metrics]:
-    """Return PPO's loss (arXiv 1707.06347, eq. 7), with one probability ratio per action."""
+    """Return PPO's loss (arXiv 1707.06347, eq. 7), with one probability ratio per action.
+
+    It is the mean over valid actions; `num_valid` overrides their number.
+    """
     mean, aux = means(adapters, frozen, batch.chunks, graphdef, denoise_steps)
     slots = noise.action_slots(frozen.processor)
     new, old = (noise.log_prob(x, batch.chunks.actions, spread, slots) for x in (mean, batch.means))
     ratio, advantages = jnp.exp(new - old), batch.advantages
-    average = lambda x: jnp.sum(x * batch.valid) / jnp.maximum(jnp.sum(batch.valid), 1)  # noqa: E731
+    num_valid = jnp.sum(batch.valid) if num_valid is None else num_valid
+    average = lambda x: jnp.sum(x * batch.valid) / jnp.maximum(num_valid, 1)  # noqa: E731
     clipped = jnp.clip(ratio, 1 - clip, 1 + clip)
     losses = auxiliary_losses(aux)
     total = -average(jnp.minimum(ratio * advantages, clipped * advantages))
@@ -169,13 +176,18 @@ class Programs:
     def _gradient(
         self, adapters: Any, frozen: Frozen, batch: WeightedChunks, index: jax.Array
     ) -> tuple[Any, Metrics]:
-        """Return the means of gradient and metrics over micro-batches."""
+        """Return gradient and metrics, all valid actions of the micro-batches weighing the same.
+
+        Auxiliary losses and active ranks are means over the micro-batches.
+        """
+        zeros, parts = jax.tree.map(jnp.zeros_like, adapters), self._parts(index)
+        num_valid = jnp.sum(batch.valid[index]) / len(parts)
 
         def add(total: Any, index: jax.Array) -> tuple[Any, Metrics]:
-            found, metrics = self._gradient_of(adapters, frozen, self._take(batch, index))
+            rows = self._take(batch, index)
+            found, metrics = self._gradient_of(adapters, frozen, rows, num_valid=num_valid)
             return jax.tree.map(jnp.add, total, found), metrics
 
-        zeros, parts = jax.tree.map(jnp.zeros_like, adapters), self._parts(index)
         total, metrics = jax.lax.scan(add, zeros, parts)
         gradient = jax.tree.map(lambda x: x / len(parts), total)
         return gradient, jax.tree.map(lambda x: x.mean(0), metrics)
@@ -218,21 +230,38 @@ def improve(
     for index in np.resize(useful, length).reshape(-1, size):
         found = programs.means(state.adapters, frozen, batch.chunks, index)
         batch = batch._replace(means=batch.means.at[index].set(found))
-    for _ in range(config.online.epochs):
-        for index in np.resize(rng.permutation(useful), length).reshape(-1, size):
-            state, metrics = programs.update(state, frozen, batch, index)
-            rows.append(jax.device_get(metrics))
-            if not rows[-1]["within"]:
-                return _adapt(config, state, rows), _stack(rows)
-    return _adapt(config, state, rows), _stack(rows)
+    epochs = [np.resize(rng.permutation(useful), length) for _ in range(config.online.epochs)]
+    for index in np.concatenate(epochs).reshape(-1, size):
+        state, metrics = programs.update(state, frozen, batch, index)
+        rows.append(jax.device_get(metrics))
+        if not rows[-1]["within"]:
+            break
+    taken = rows[-1]["within"] and not rows[-1]["in_a_row"]
+    kl = _change(programs, state, frozen, batch, evenly(useful, size)) if taken else np.inf
+    return _adapt(config, state, kl), _stack(rows)
 
 
-def _adapt(config: ReinforceConfig, state: Learner, rows: list[Metrics]) -> Learner:
+def evenly(rows: np.ndarray, count: int) -> np.ndarray:
+    """Return `count` of the rows at equal distances."""
+    return rows[np.linspace(0, len(rows) - 1, count).astype(int)]
+
+
+def _change(
+    programs: Programs, state: Learner, frozen: Frozen, batch: WeightedChunks, index: np.ndarray
+) -> float:
+    """Return the mean KL divergence of the valid actions from the policy that acted."""
+    mean = programs.means(state.adapters, frozen, batch.chunks, index)
+    spread, slots = noise.Spread.of(programs.config.online), noise.action_slots(frozen.processor)
+    kl = noise.divergence(mean, batch.means[index], spread, slots)
+    return float(jnp.mean(kl, where=batch.valid[index]))
+
+
+def _adapt(config: ReinforceConfig, state: Learner, kl: float) -> Learner:
     """Adapt the learning rate so that an iteration ends with about the KL divergence allowed."""
-    last = float(rows[-1]["kl"])
-    factor = 1 / _FACTOR if not rows[-1]["within"] else 1.0
-    factor = _FACTOR if last < config.online.max_kl / 2 else factor
-    return dataclasses.replace(state, rate=state.rate * factor)
+    allowed = config.online.max_kl
+    factor = _FACTOR if kl < allowed / 2 else 1.0 if kl <= allowed else 1 / _FACTOR
+    rate = jnp.clip(state.rate * factor, 1 / _LARGEST, _LARGEST)
+    return dataclasses.replace(state, rate=rate)
 
 
 def _stack(rows: list[Metrics]) -> dict[str, np.ndarray]:

@@ -36,6 +36,7 @@ class Run:
         streams: whether batches are read from disk because the dataset does not fit on the device.
         devices: devices to train on; None: all.
         simulated: whether the tasks can be evaluated in simulation.
+        stops: whether training ends with this step, before the last of the config.
         programs: jitted training programs by their inputs; see `program.jit_steps`.
         policy: the current policy; read it in callbacks or after training, since each step donates
             its buffers.
@@ -56,6 +57,7 @@ class Run:
     streams: bool = False
     devices: Sequence[Any] | None = None
     simulated: bool = True
+    stops: bool = False
     programs: dict[Any, Callable[..., Any]] = field(default_factory=dict)
     policy: Policy = field(init=False)
     seconds: dict[str, float] = field(init=False)

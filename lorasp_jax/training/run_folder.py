@@ -146,6 +146,11 @@ def open_run(config: Config, root: Path, *, resume: bool | Literal["auto"]) -> I
             check_only_files(folder, folder)
             recorded = _recorded(folder)
             if changed := changed_settings(recorded, to_json(config)):
+                if removed := _removed(recorded, config):
+                    raise ValueError(
+                        f"{folder} contains a run of another version, with settings that this one "
+                        f"does not have ({', '.join(removed)}): use another --name"
+                    )
                 if "data.validation" in changed and "validation" not in recorded["data"]:
                     changed += ["an older run has --data.validation 0 --data.augment.preset none"]
                 raise ValueError(
@@ -216,6 +221,18 @@ def changed_settings(recorded: Mapping[str, Any], current: Mapping[str, Any]) ->
     """Return the dotted names of settings that differ between two results of `to_json`."""
     recorded = {**recorded, "peft": without_removed(recorded["peft"])}
     return _differences(recorded, current)
+
+
+def _removed(recorded: Mapping[str, Any], config: Config) -> list[str]:
+    """Return the dotted names of recorded settings that the config's groups do not have."""
+    groups = {name: x for name, x in dataclasses.asdict(config).items() if isinstance(x, dict)}
+    del groups["peft"]  # another method has other settings
+    return [
+        f"{group}.{name}"
+        for group, known in groups.items()
+        for name in recorded.get(group, {})
+        if name not in known
+    ]
 
 
 def _differences(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> list[str]:

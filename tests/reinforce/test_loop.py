@@ -8,6 +8,7 @@ import pytest
 
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import OptimConfig
+from lorasp_jax.evaluation.callback import Evaluation
 from lorasp_jax.peft import AdaLoRA
 from lorasp_jax.reinforce import loop, setting, update
 from lorasp_jax.reinforce.config import Learning
@@ -124,6 +125,33 @@ def test_a_run_ends_in_time(tmp_path):
     run = train(tmp_path, online=learn)
     assert len(read_metrics(tmp_path)) == 1
     assert "stopped after iteration 1: it has learned for" in run.console.file.getvalue()
+
+
+class Measured(Evaluation):
+    """Measures more success in every evaluation; writes nothing."""
+
+    count = 0
+
+    def on_start(self, run):
+        pass
+
+    def on_end(self, run):
+        pass
+
+    def _evaluate_tasks(self, run, when, episodes=0):
+        self.count += 1
+        return {"press": SimpleNamespace(success=self.count / 10)}
+
+
+@pytest.mark.parametrize("limits", [{"minutes": 1e-6}, {"max_start_kl": 1e-6}])
+def test_a_run_that_stops_early_evaluates_its_last_policy(tmp_path, limits):
+    learn = dataclasses.replace(rooms.config().online, **limits)
+    run = train(tmp_path, [Measured(media=False)], online=learn)
+    last = read_metrics(tmp_path)[-1]
+    assert last["step"] < run.config.optim.steps
+    assert last["success/press"] == 0.1
+    kept = f"kept the adapters of iteration {last['step']:.0f}"
+    assert kept in run.console.file.getvalue()
 
 
 def test_lost_success_stops_the_run():

@@ -155,27 +155,45 @@ def test_an_iteration_ends_when_the_policy_has_changed_enough(processor):
     data = chunks(processor, jnp.zeros((EXECUTED, 8)), jax.random.key(0))
     advantages = jax.random.normal(jax.random.key(2), (CHUNKS, EXECUTED))
     state, rows = update.improve(programs, state, frozen, batch(data, advantages), KEY)
-    assert rows["within"].tolist() == [True, False]  # the second step is undone
+    assert rows["within"].tolist() == [True, False]  # the second step is not taken
     assert rows["kl"][1] > 0.1
     assert float(state.rate) == pytest.approx(1 / 1.5)
     change = np.abs(np.asarray(state.adapters["chunk"].get_value()) - before).max()
     assert change == pytest.approx(1.0, rel=1e-3)  # that of Adam's first step
 
 
+@pytest.mark.parametrize(
+    ("step", "before", "after"), [(1.0, 1.0, 1 / 1.5), (0.0, 60.0, 64.0), (1.0, 1 / 60, 1 / 64)]
+)
+def test_the_rate_follows_the_change_of_a_single_step(processor, step, before, after):
+    config = settings(CHUNKS, 1, max_kl=1e-3)
+    programs, state, frozen = make(Bandit(), processor, config, step)
+    state = dataclasses.replace(state, rate=jnp.asarray(before))
+    data = chunks(processor, jnp.zeros((EXECUTED, 8)), jax.random.key(0))
+    advantages = jax.random.normal(jax.random.key(2), (CHUNKS, EXECUTED))
+    state, rows = update.improve(programs, state, frozen, batch(data, advantages), KEY)
+    assert rows["kl"].tolist() == [0]  # before the step
+    assert float(state.rate) == pytest.approx(after)
+
+
 def test_micro_batches_add_up(processor):
+    """Whatever the number of their valid actions."""
     found = []
-    for parts in (1, 4):
+    valid = jnp.ones((CHUNKS, EXECUTED), bool).at[: CHUNKS // 2, 1].set(False)
+    for parts in (1, 4, 16):
         config = settings(CHUNKS, 1)
         optim = dataclasses.replace(config.optim, accumulate=parts)
         config = dataclasses.replace(config, optim=optim)
         programs, state, frozen = make(Bandit(), processor, config)
         data = chunks(processor, jnp.zeros((EXECUTED, 8)), jax.random.key(0))
         advantages = jax.random.normal(jax.random.key(2), (CHUNKS, EXECUTED))
-        state, rows = update.improve(programs, state, frozen, batch(data, advantages), KEY)
+        weighted = batch(data, advantages, valid)
+        state, rows = update.improve(programs, state, frozen, weighted, KEY)
         assert rows["loss"].shape == (1,)
-        found.append((state.adapters["chunk"].get_value(), rows["grad_norm"]))
-    for one, four in zip(*found, strict=True):
-        np.testing.assert_allclose(one, four, rtol=1e-4)
+        found.append((state.adapters["chunk"].get_value(), rows["grad_norm"], rows["loss"]))
+    for one, *others in zip(*found, strict=True):
+        for other in others:
+            np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
 
 
 def test_a_step_that_is_not_finite_is_skipped(processor):
@@ -184,6 +202,7 @@ def test_a_step_that_is_not_finite_is_skipped(processor):
     advantages = jnp.full((CHUNKS, EXECUTED), jnp.nan)
     state, rows = update.improve(programs, state, frozen, batch(data, advantages), KEY)
     assert rows["in_a_row"].tolist() == [*range(1, 9)]
+    assert float(state.rate) == pytest.approx(1 / 1.5)
     assert not np.asarray(state.adapters["chunk"].get_value()).any()
 
 

@@ -102,6 +102,18 @@ def test_a_run_from_before_held_out_episodes_says_how_to_resume(tmp_path):
     open_run(recorded, tmp_path, resume=True)
 
 
+def test_a_run_of_another_version_needs_another_name(tmp_path):
+    folder = open_run(CONFIG, tmp_path, resume=False)
+    recorded = run_folder.to_json(CONFIG)
+    recorded["optim"]["momentum"] = 0.9
+    run_folder.write_json(folder / "config.json", recorded)
+    expected = r"of another version, .* does not have \(optim\.momentum\): use another --name"
+    with pytest.raises(ValueError, match=expected):
+        open_run(CONFIG, tmp_path, resume=True)
+    with pytest.raises(ValueError, match=expected):
+        open_run(dataclasses.replace(CONFIG, seed=3), tmp_path, resume=True)
+
+
 def test_only_ranges_that_change_something_are_recorded(tmp_path):
     """So that runs from before a range existed go on."""
     assert "scene" not in run_folder.to_json(CONFIG)
