@@ -224,7 +224,7 @@ class EvaluationConfig:
     """Parallel worlds per task."""
     execute_steps: int = 5
     """Actions executed from each predicted chunk (execution horizon)."""
-    denoise_steps: int = 10
+    denoise_steps: int = 3
     """Euler steps of the flow-matching sampler."""
     before: bool = True
     """Evaluate the base before training."""
