@@ -151,7 +151,7 @@ def main() -> None:
     parser.add_argument("--targets", default="paper", help="preset or regular expression")
     parser.add_argument("--adapters", type=int, default=10)
     parser.add_argument("--batch", type=int, default=8)
-    parser.add_argument("--num-steps", type=int, default=10)
+    parser.add_argument("--denoise-steps", type=int, default=10)
     parser.add_argument("--shapes-only", action="store_true", help="only compute the memory")
     options = parser.parse_args()
     console = Console()
@@ -166,7 +166,7 @@ def main() -> None:
     samplers, alone = make_samplers(config, rules, options.adapters)
     print_table(console, device_rows(samplers), "memory, measured")
     print_table(console, swap_rows(samplers), "from host memory to the device")
-    table = batch_rows(config, samplers, alone, options.batch, options.num_steps)
+    table = batch_rows(config, samplers, alone, options.batch, options.denoise_steps)
     print_table(console, table, f"{options.batch} requests")
 
 

@@ -43,6 +43,11 @@ class Waiting(ServedPolicies):
         """The only adapter, trained for no instruction in particular."""
         return {"base": ()}
 
+    @property
+    def denoise_steps(self) -> dict[str, int]:
+        """No adapter has a flow."""
+        return {}
+
     def route(self, request: Request) -> str:
         """Return the only adapter."""
         del request

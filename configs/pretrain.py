@@ -26,7 +26,7 @@ def get_config(scale: str) -> Config:
         robot="panda",
         data=DataConfig(episodes=1024, num_envs=256),
         optim=OptimConfig(steps=12_000, batch_size=512, learning_rate=1e-3, warmup_steps=300),
-        evaluation=EvaluationConfig(episodes=256, num_envs=256),
+        evaluation=EvaluationConfig(episodes=256, num_envs=256, denoise_steps=10),
         log_every=200,
         checkpoint_every=2000,
     )
@@ -37,7 +37,7 @@ def get_config(scale: str) -> Config:
         model=ModelConfig(checkpoint=""),
         data=DataConfig(episodes=4, num_envs=8),
         optim=OptimConfig(steps=4, batch_size=8, warmup_steps=1),
-        evaluation=EvaluationConfig(episodes=8, num_envs=8),
+        evaluation=EvaluationConfig(episodes=8, num_envs=8, denoise_steps=10),
         log_every=2,
         checkpoint_every=2,
     )

@@ -26,6 +26,7 @@ from lorasp_jax.evaluation import make_rollout
 from lorasp_jax.evaluation.programs import Rollout
 from lorasp_jax.policies import Policy
 from lorasp_jax.training import load_policy
+from lorasp_jax.training.export import denoise_steps
 from lorasp_jax.training.run_folder import read_json
 
 WORLDS = 8
@@ -93,10 +94,13 @@ def record_run(run: Path, key: jax.Array) -> list[Column]:
     trained, metadata = load_policy(run), read_json(run / "adapter.json")["metadata"]
     base = models.load(hub.resolve_portable(metadata["base"]), trained.model.config)
     policies = [policy.with_sampler() for policy in (Policy(base, trained.processor), trained)]
-    return [record_task(policies, metadata, task, key) for task in metadata["tasks"]]
+    steps = denoise_steps(run)
+    return [record_task(policies, metadata, task, key, steps) for task in metadata["tasks"]]
 
 
-def record_task(policies: list[Policy], metadata: dict, task: str, key: jax.Array) -> Column:
+def record_task(
+    policies: list[Policy], metadata: dict, task: str, key: jax.Array, steps: int
+) -> Column:
     """Record one task with both policies from the same initial state."""
     env = envs.make(
         task,
@@ -105,7 +109,7 @@ def record_task(policies: list[Policy], metadata: dict, task: str, key: jax.Arra
         image_size=policies[0].processor.image_size,
         control_dt=metadata["control_dt"],
     )
-    rollout = make_rollout(env)
+    rollout = make_rollout(env, denoise_steps=steps)
     before, after = (rollout(with_prompts(policy, env), key) for policy in policies)
     improved = np.asarray(after.success & ~before.success)
     world = int(np.argmax(improved))

@@ -17,6 +17,7 @@ from lorasp_jax.models.transformer.siglip import patches
 from lorasp_jax.peft.lora_sp import reference
 from lorasp_jax.policies import Policy
 from lorasp_jax.training import load_policy
+from lorasp_jax.training.export import denoise_steps
 from lorasp_jax.training.run_folder import read_json
 
 WORLDS, PIXELS = 4, 320
@@ -49,7 +50,7 @@ def measure(run: Path, task: str, steps: int) -> dict[str, Any]:
         raise ValueError(f"{run} has no LoRA-SP adapter in its vision tower")
     env = envs.make(task, robot=metadata["robot"], num_envs=WORLDS, image_size=config.image_size)
     policy = with_prompts(policy, env)
-    state = run_policy(policy, env, steps)
+    state = run_policy(policy, env, steps, denoise_steps(run))
     inputs = policy.processor.encode(env.observe(state), state.info["instruction"])
     _, _, aux = jax.jit(lambda model, inputs: model.encode_images(inputs))(policy.model, inputs)
     camera = config.cameras.index(CAMERA)
@@ -74,13 +75,14 @@ def measure(run: Path, task: str, steps: int) -> dict[str, Any]:
     }
 
 
-def run_policy(policy: Policy, env: envs.Env, steps: int) -> envs.State:
+def run_policy(policy: Policy, env: envs.Env, steps: int, flow_steps: int) -> envs.State:
     """Run the policy for some control steps; return the final state."""
 
     @jax.jit
     def rollout(policy: Policy, key: jax.Array) -> envs.State:
         def observe_and_act(state: envs.State, key: jax.Array) -> tuple[envs.State, None]:
-            chunk = policy.sample(key, env.observe(state), state.info["instruction"])
+            observed = env.observe(state), state.info["instruction"]
+            chunk = policy.sample(key, *observed, num_steps=flow_steps)
             return jax.lax.scan(act, state, jnp.moveaxis(chunk[:, :4], 1, 0))
 
         def act(state: envs.State, action: jax.Array) -> tuple[envs.State, None]:

@@ -224,8 +224,8 @@ class EvaluationConfig:
     """Parallel worlds per task."""
     execute_steps: int = 5
     """Actions executed from each predicted chunk (execution horizon)."""
-    denoise_steps: int = 10
-    """Euler steps of the flow-matching sampler."""
+    denoise_steps: int = 3
+    """Euler steps of the flow-matching sampler; the finished run is served with as many."""
     before: bool = True
     """Evaluate the base before training."""
     validate_every: int = 500

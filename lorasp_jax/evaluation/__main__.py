@@ -51,7 +51,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     parser.add_argument("--dataset", default="", metavar="NAME", help=text)
     text = "numbers of the episodes (default: all, or those of --dataset in a cache of several)"
     parser.add_argument("--episodes", nargs="+", type=int, metavar="N", help=text)
-    text = "flow-matching steps per chunk (default: 10; with --record: as in the run's evaluation)"
+    text = "flow-matching steps per chunk (default: as in the run's evaluation)"
     parser.add_argument("--denoise-steps", type=positive, metavar="N", help=text)
     text = "folder for the pictures (default: a folder of the run, named after the dataset)"
     parser.add_argument("--out", type=Path, help=text)
@@ -89,7 +89,7 @@ def evaluate(options: argparse.Namespace, console: Console) -> None:
     if wrong := [number for number in numbers if not 0 <= number < len(source)]:
         raise ValueError(f"--episodes must be 0 to {len(source) - 1}, got {wrong[0]}")
     policy = export.load_policy(options.run, dataset=options.dataset)
-    steps = {"num_steps": options.denoise_steps or 10}
+    steps = {"num_steps": options.denoise_steps or export.denoise_steps(options.run)}
     found = held_out.measure(policy, held_out.windows(source, numbers, policy), **steps)
     console.print(_table("mean error", held_out.COLUMNS, held_out.table(found), 2))
     if len(found.instructions) > 1:

@@ -236,7 +236,7 @@ def _evenly(values: Sequence[int], count: int) -> list[int]:
     return [values[i * len(values) // count] for i in range(count)]
 
 
-def measure(policy: Policy, found: Windows, *, num_steps: int = 10) -> HeldOut:
+def measure(policy: Policy, found: Windows, *, num_steps: int) -> HeldOut:
     """Measure a policy on windows; the same policy and windows give the same values.
 
     Args:
@@ -256,7 +256,7 @@ def measure(policy: Policy, found: Windows, *, num_steps: int = 10) -> HeldOut:
     )
 
 
-def sample(policy: Policy, found: Windows, *, num_steps: int = 10) -> np.ndarray:
+def sample(policy: Policy, found: Windows, *, num_steps: int) -> np.ndarray:
     """Return the chunks `[N, C, J+1]` that `measure` compares; same arguments."""
     return _run(policy, found, num_steps)[0]
 

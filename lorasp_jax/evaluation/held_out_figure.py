@@ -26,7 +26,7 @@ def path(folder: Path, task: str) -> Path:
 
 
 def write(
-    folder: Path, policy: Policy, source: Source, episodes: Sequence[int], *, num_steps: int = 10
+    folder: Path, policy: Policy, source: Source, episodes: Sequence[int], *, num_steps: int
 ) -> list[Path]:
     """Draw the first of these episodes of each task; return the files."""
     first: dict[str, int] = {}

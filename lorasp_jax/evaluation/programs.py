@@ -22,6 +22,7 @@ from envs.scene.ranges import Randomization
 from envs.state import Poses, State
 from lorasp_jax.base import fast_cpu
 from lorasp_jax.evaluation import metrics
+from lorasp_jax.models.sampling import NUM_STEPS
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import RawObservation
 from lorasp_jax.training.distributed import mesh as meshes
@@ -130,7 +131,7 @@ def make_rollout(
     env: Env,
     *,
     execute_steps: int = 5,
-    denoise_steps: int = 10,
+    denoise_steps: int = NUM_STEPS,
     ranges: Randomization | None = None,
 ) -> SplitRollout:
     """Create a function (policy, key) that runs `env.num_envs` episodes.

@@ -25,7 +25,7 @@ def record(
     key: jax.Array,
     *,
     execute_steps: int = 5,
-    denoise_steps: int = 10,
+    denoise_steps: int,
     ranges: Randomization | None = None,
 ) -> Episodes:
     """Run an episode in every world and return all of them, labelled, in host memory.

@@ -22,6 +22,9 @@ from lorasp_jax.peft import Method
 if TYPE_CHECKING:
     from lorasp_jax.models.backbone import Backbone
 
+NUM_STEPS = 10
+"""Flow steps by default: openpi's and LeRobot's number, and so that of published checkpoints."""
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -67,7 +70,7 @@ class Sampler:
         key: jax.Array,
         obs: Observation,
         *,
-        num_steps: int = 10,
+        num_steps: int = NUM_STEPS,
         noise: jax.Array | None = None,
         slots: jax.Array | None = None,
         return_aux: bool = False,

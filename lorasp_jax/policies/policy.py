@@ -7,7 +7,7 @@ from typing import Any, Self
 import jax
 
 from lorasp_jax.models.observation import Observation
-from lorasp_jax.models.sampling import Sampler
+from lorasp_jax.models.sampling import NUM_STEPS, Sampler
 from lorasp_jax.models.shared_base import SharedSampler
 from lorasp_jax.models.transformer.layers import ModelAux
 from lorasp_jax.policies.processor import Processor, RawObservation
@@ -43,7 +43,7 @@ class Policy:
         observation: RawObservation,
         instruction: jax.Array,
         *,
-        num_steps: int = 10,
+        num_steps: int = NUM_STEPS,
         return_aux: bool = False,
         previous: jax.Array | None = None,
         prefix_length: jax.Array | int = 0,

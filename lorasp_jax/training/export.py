@@ -20,6 +20,7 @@ from lorasp_jax.base import hub
 from lorasp_jax.base.digest import digest
 from lorasp_jax.models import backbone
 from lorasp_jax.models.config import BackboneConfig
+from lorasp_jax.models.sampling import NUM_STEPS
 from lorasp_jax.policies import tokenizer
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor
@@ -28,12 +29,14 @@ from lorasp_jax.policies.statistics import Statistics
 from lorasp_jax.training import rules
 from lorasp_jax.training.base import TRAINING, on_host, quantized
 from lorasp_jax.training.run import Callback, Run
-from lorasp_jax.training.run_folder import read_json, write_json
+from lorasp_jax.training.run_folder import CONFIG_FILE, read_json, write_json
 
 BASE = "base"
 """Folder of a fully fine-tuned base."""
 QUANTIZED = "quantized"
 """Key of the kind of a base that is quantized after loading."""
+STEPS = "denoise_steps"
+"""Key of the flow steps of a run, in its config and in the files of its variants."""
 
 
 class Export(Callback):
@@ -72,7 +75,7 @@ def write_variant(
     """
     metadata = describe(source)
     fields = metadata["policy"] | {"config": dataclasses.asdict(policy.model.config)}
-    metadata |= {"policy": fields, QUANTIZED: quantized}
+    metadata |= {"policy": fields, QUANTIZED: quantized, STEPS: denoise_steps(source)}
     if adaptation.methods(policy.model):
         base = native.read_description(source)["base"]
         native.save_adapters(folder, policy.model, base=base, metadata=metadata)
@@ -225,6 +228,15 @@ def describe(folder: str | os.PathLike[str]) -> dict[str, Any]:
         ValueError: there is no such folder, the run is not finished, or its files are corrupt.
     """
     return _read_metadata(Path(folder))[0]
+
+
+def denoise_steps(folder: str | os.PathLike[str]) -> int:
+    """Return the flow steps per chunk with which a finished run was evaluated.
+
+    `NUM_STEPS` if its folder does not say. Errors are those of `describe`.
+    """
+    config = read_json(Path(folder) / CONFIG_FILE, {"evaluation": {STEPS: int}})
+    return config["evaluation"][STEPS] if config else describe(folder).get(STEPS, NUM_STEPS)
 
 
 def datasets(metadata: Mapping[str, Any]) -> list[str]:

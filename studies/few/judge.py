@@ -46,9 +46,8 @@ def judge(run: Run, scenes: Iterable[str] = SCENES, *, cropped: bool = False) ->
 
     def one(case: tuple[str, str]) -> str:
         scene, task = case
-        env, rollout = _rollout(
-            scene, task, run.config.robot, settings.worlds, run.config.image_size, cropped
-        )
+        sizes = settings.worlds, run.config.image_size, settings.denoise_steps
+        env, rollout = _rollout(scene, task, run.config.robot, *sizes, cropped)
         key = RandomStream.FINAL_EVALUATION.key(run.config.seed, task)
         result = evaluate(policy, env, key, settings.episodes, rollout=rollout)
         return "".join("01"[succeeded] for succeeded in result.outcomes)
@@ -67,7 +66,7 @@ def judge(run: Run, scenes: Iterable[str] = SCENES, *, cropped: bool = False) ->
 
 @functools.cache
 def _rollout(
-    scene: str, task: str, robot: str, worlds: int, size: int, cropped: bool
+    scene: str, task: str, robot: str, worlds: int, size: int, steps: int, cropped: bool
 ) -> tuple[Env, Callable[..., Rollout]]:
     distractors, ranges = (DISTRACTORS, SHIFT) if scene == "shifted" else (0, None)
     env = envs.make(task, robot=robot, num_envs=worlds, image_size=size, distractors=distractors)
@@ -75,7 +74,7 @@ def _rollout(
         env = _Cropped(
             **{field.name: getattr(env, field.name) for field in dataclasses.fields(env)}
         )
-    return env, make_rollout(env, ranges=ranges)
+    return env, make_rollout(env, denoise_steps=steps, ranges=ranges)
 
 
 class _Cropped(Env):

@@ -83,7 +83,7 @@ _ACCELERATOR = Scale(
         model=ModelConfig(size="small", dtype="bfloat16"),
         data=DataConfig(num_envs=256),
         optim=OptimConfig(steps=page.STEPS, batch_size=64, warmup_steps=100),
-        evaluation=EvaluationConfig(episodes=256, num_envs=256, before=False),
+        evaluation=EvaluationConfig(episodes=256, num_envs=256, denoise_steps=10, before=False),
         log_every=250,
         checkpoint_every=10_000,
     )
@@ -96,7 +96,7 @@ _SMOKE = Scale(
         tasks=("press", "pick_place"),
         data=DataConfig(num_envs=4),
         optim=OptimConfig(steps=2, batch_size=4, warmup_steps=1),
-        evaluation=EvaluationConfig(episodes=4, num_envs=4, before=False),
+        evaluation=replace(_ACCELERATOR.config.evaluation, episodes=4, num_envs=4),
         log_every=2,
     ),
     counts=(2, 3),

@@ -32,7 +32,7 @@ _ACCELERATOR = Config(
     tasks=page.TASKS,
     data=DataConfig(episodes=256, num_envs=256),
     optim=OptimConfig(steps=4000, batch_size=128, learning_rate=1e-3, warmup_steps=100),
-    evaluation=EvaluationConfig(episodes=256, num_envs=256, before=False),
+    evaluation=EvaluationConfig(episodes=256, num_envs=256, denoise_steps=10, before=False),
     log_every=250,
     checkpoint_every=10_000,
 )
@@ -42,7 +42,7 @@ _SMOKE = replace(
     model=ModelConfig(),
     data=DataConfig(episodes=2, num_envs=4),
     optim=OptimConfig(steps=2, batch_size=4, warmup_steps=1),
-    evaluation=EvaluationConfig(episodes=4, num_envs=4, before=False),
+    evaluation=replace(_ACCELERATOR.evaluation, episodes=4, num_envs=4),
     log_every=2,
 )
 

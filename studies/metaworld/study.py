@@ -135,5 +135,6 @@ def _config(name: str, seed: int, rate: float) -> Config:
             validation=("0",),
         ),
         optim=dataclasses.replace(config.optim, steps=stage.steps, learning_rate=rate),
+        evaluation=dataclasses.replace(config.evaluation, denoise_steps=10),
         seed=seed,
     )

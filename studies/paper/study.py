@@ -56,7 +56,7 @@ CONFIG = Config(
     model=ModelConfig(size="small", dtype="bfloat16"),
     data=DataConfig(episodes=512, num_envs=256),
     optim=OptimConfig(steps=5000, batch_size=128, warmup_steps=100),
-    evaluation=EvaluationConfig(episodes=256, num_envs=256, before=False),
+    evaluation=EvaluationConfig(episodes=256, num_envs=256, denoise_steps=10, before=False),
     log_every=125,
     checkpoint_every=1250,
 )

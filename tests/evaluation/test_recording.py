@@ -118,6 +118,6 @@ def test_options_that_would_not_count_are_refused(words, capsys):
 
 
 def test_other_seeds_give_other_episodes():
-    keys = jax.random.split(KEY, 2)
-    first, second = (recording.record(policy(), LAB, key, execute_steps=3).state for key in keys)
+    keys, settings = jax.random.split(KEY, 2), {"execute_steps": 3, "denoise_steps": 2}
+    first, second = (recording.record(policy(), LAB, key, **settings).state for key in keys)
     assert first.shape != second.shape or np.abs(first - second).max() > 0.1

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -297,6 +298,20 @@ def test_runs_without_held_out_episodes_have_the_settings_of_before():
     )
     with pytest.raises(ValueError, match=r"data\.source"):
         DataConfig(validation=("0.1",))
+
+
+@pytest.mark.parametrize(("words", "expected"), [([], 4), (["--denoise-steps", "2"], 2)])
+def test_evaluate_takes_the_flow_steps_of_the_run(words, expected, recorded, tmp_path, monkeypatch):
+    evaluation = dataclasses.replace(CONFIG.evaluation, denoise_steps=4)
+    write_json(
+        tmp_path / "config.json", to_json(dataclasses.replace(CONFIG, evaluation=evaluation))
+    )
+    monkeypatch.setattr(export, "load_policy", lambda *_, **__: recorded.policy)
+    monkeypatch.setattr(export, "describe", lambda _: {"control_dt": 0.1})
+    measured = mock.Mock(side_effect=ValueError("measured"))
+    monkeypatch.setattr(held_out, "measure", measured)
+    assert main([str(tmp_path), "--data", str(golden("v21")), *words]) == 2
+    assert measured.call_args.kwargs == {"num_steps": expected}
 
 
 def test_evaluate_on_another_dataset(recorded, tmp_path, monkeypatch, capsys):

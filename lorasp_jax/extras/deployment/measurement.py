@@ -56,7 +56,9 @@ def measure(run: Run, _: Demonstrations, __: lorasp_jax.policies.Policy | None) 
         "measures": {
             "loss": mean_loss(run.policy, episodes),
             "bytes": weight_bytes(run.policy),
-            "milliseconds": call_milliseconds(run.policy, episodes),
+            "milliseconds": call_milliseconds(
+                run.policy, episodes, run.config.evaluation.denoise_steps
+            ),
             "machine": f"{jax.devices()[0].device_kind}, jax {jax.__version__}",
         }
     }
@@ -84,24 +86,30 @@ def weight_bytes(policy: lorasp_jax.policies.Policy) -> int:
     return sum(leaf.nbytes for leaf in jax.tree.leaves(policy.model) if hasattr(leaf, "nbytes"))
 
 
-def call_milliseconds(policy: lorasp_jax.policies.Policy, episodes: Demonstrations) -> float:
+def call_milliseconds(
+    policy: lorasp_jax.policies.Policy, episodes: Demonstrations, num_steps: int
+) -> float:
     """Return the median time to sample one action chunk from one observation [ms]."""
     policy, first = policy.with_sampler(), next(iter(episodes.values()))
     images = {name: jnp.asarray(image[0, :1]) for name, image in first.image.items()}
     observation = {"image": images, "state": jnp.asarray(first.state[0, :1])}
     phrase = first.instructions[int(first.instruction[0])]
     row = jnp.array(policy.processor.prompts.rows([phrase]))
+    sample = functools.partial(_sample, num_steps=num_steps)
     arguments = policy, jax.random.key(0), observation, row
-    jax.block_until_ready(_sample(*arguments))  # compiles
+    jax.block_until_ready(sample(*arguments))  # compiles
     times = []
     for _ in range(CALLS):
         start = time.perf_counter()
-        jax.block_until_ready(_sample(*arguments))
+        jax.block_until_ready(sample(*arguments))
         times.append(time.perf_counter() - start)
     return 1000 * medians.median(times)
 
 
-_sample = jax.jit(lambda policy, *arguments: policy.sample(*arguments))
+_sample = jax.jit(
+    lambda policy, *arguments, num_steps: policy.sample(*arguments, num_steps=num_steps),
+    static_argnames="num_steps",
+)
 
 
 def table(results: Results, prefix: str = "") -> str:

@@ -52,8 +52,8 @@ class ServerActor:
 class RunActor:
     """Samples the policy of a finished run in this process, as its server would."""
 
-    def __init__(self, run: Path, instructions: Sequence[str], *, num_steps: int = 10) -> None:
-        """Load the policy.
+    def __init__(self, run: Path, instructions: Sequence[str]) -> None:
+        """Load the policy, which takes the flow steps of the run's evaluation.
 
         Raises:
             ValueError: the run has no policy, an instruction is too long for it, or this project's
@@ -69,7 +69,7 @@ class RunActor:
             ) from error
 
         self._parse = requests.parse
-        policy = CompiledPolicy(loading.load_run(str(run)), num_steps=num_steps, max_batch=1)
+        policy = CompiledPolicy(loading.load_run(str(run)), max_batch=1)
         for text in instructions:
             policy.tokens(text)
         self._policy = served.ServedPolicies({"run": policy})

@@ -83,7 +83,7 @@ def check_delay(delay: int, execute_steps: int, chunk: int) -> None:
 
 
 def delayed_rollout(
-    env: Env, execution: Execution, *, denoise_steps: int = 10, ranges: Randomization | None = None
+    env: Env, execution: Execution, *, denoise_steps: int, ranges: Randomization | None = None
 ) -> Rollout:
     """Create a function (policy, key, d) that runs `env.num_envs` episodes with a delay of d steps.
 

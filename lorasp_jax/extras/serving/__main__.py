@@ -66,7 +66,8 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--max-clients", type=positive, help="maximum number of connections (default: 64)")
     add("--prompt", default="", help="instruction of requests that have none")
     add("--max-batch", type=int, help="largest batch (default: 8)")
-    add("--num-steps", type=int, help="flow steps (default: 10)")
+    add("--denoise-steps", type=positive, metavar="N", help="flow steps (default: as in a run's "
+        "evaluation; 10 for a checkpoint)")  # fmt: skip
     add("--seed", type=int, help="seed of the flow's noise, which repeats what a server answered "
         "(default: a fresh one, which is printed)")  # fmt: skip
     add(
@@ -197,7 +198,7 @@ def _exported(options: argparse.Namespace, named: dict[str, str]) -> tuple[dict[
     """Load exported policies."""
     from lorasp_jax.extras.serving.exported import is_bundle, load, load_bundle
 
-    settings = ("num_steps", "max_batch", "guidance", "base", "tokenizer", "adapters_on_device")
+    settings = ("denoise_steps", "max_batch", "guidance", "base", "tokenizer", "adapters_on_device")
     _refuse(options, (*settings, *CHECKPOINT_OPTIONS), "has no effect on exported policies")
     if options.execution == "guided":
         raise ValueError("exported policies cannot be guided: use --execution naive or trained")
@@ -220,7 +221,7 @@ def _compiled(
 
     if options.max_batch is not None:
         batch_sizes(options.max_batch)  # an invalid one is refused before what takes long
-    given = {name: getattr(options, name) for name in ("num_steps", "max_batch")}
+    given = {"num_steps": options.denoise_steps, "max_batch": options.max_batch}
     settings = {name: value for name, value in given.items() if value is not None}
     if options.execution == "guided":
         settings["guidance"] = 10.0 if options.guidance is None else options.guidance

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from lorasp_jax.base.arguments import NAME, named
+from lorasp_jax.base.arguments import NAME, named, positive
 from lorasp_jax.base.errors import run_command
 
 
@@ -34,7 +34,8 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--base", default="", help="the run's base, if it has moved")
     add("--tokenizer", default="", help="the policy's tokenizer, if it has moved")
     add("--dataset", default="", help="for which of the run's datasets, if they differ")
-    add("--num-steps", type=int, default=10, help="flow steps (default: %(default)s)")
+    text = "flow steps (default: as in the run's evaluation)"
+    add("--denoise-steps", type=positive, metavar="N", help=text)
     add("--max-batch", type=int, default=8, help="largest batch (default: %(default)s)")
     return parser
 
@@ -53,17 +54,18 @@ def _export(options: argparse.Namespace, console: Console) -> None:
     from lorasp_jax.extras.serving.adapters import Bases
 
     where = {"base": options.base, "words": options.tokenizer, "dataset": options.dataset}
-    settings = {"num_steps": options.num_steps, "max_batch": options.max_batch}
+    steps, settings = options.denoise_steps, {"max_batch": options.max_batch}
     if len(runs) == 1:
         loaded = loading.load_run(*runs.values(), **where)
         settings |= {"continues": bool(loaded.continues), "metadata": loaded.metadata}
+        settings |= {"num_steps": steps or loaded.denoise_steps}
         exporting.write(loaded.policy, options.out, **settings)
     else:
         bases, policies = Bases(), {}
         for name, run in runs.items():
             model = functools.partial(bases.sampler, load=not policies)
             policies[name] = loading.load_run(run, **where, model=model)
-        exporting.write_bundle(policies, options.out, **settings)
+        exporting.write_bundle(policies, options.out, num_steps=steps, **settings)
     megabytes = sum(file.stat().st_size for file in options.out.rglob("*")) / 1e6
     console.print(f"wrote {options.out}, {megabytes:.1f} MB", soft_wrap=True, highlight=False)
 

@@ -27,6 +27,7 @@ from lorasp_jax.extras.serving.exported import Description
 from lorasp_jax.extras.serving.loading import Loaded
 from lorasp_jax.extras.serving.policies import batch_sizes, describe, sample, without_prompts
 from lorasp_jax.extras.serving.served import common_spec
+from lorasp_jax.models.sampling import NUM_STEPS
 from lorasp_jax.models.shared_base import SharedSampler
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.statistics import Statistics
@@ -37,7 +38,7 @@ def write(
     folder: str | os.PathLike[str],
     *,
     continues: bool = False,
-    num_steps: int = 10,
+    num_steps: int = NUM_STEPS,
     max_batch: int = 8,
     metadata: Mapping[str, Any] | None = None,
 ) -> None:
@@ -70,7 +71,7 @@ def write_bundle(
     policies: Mapping[str, Loaded],
     folder: str | os.PathLike[str],
     *,
-    num_steps: int = 10,
+    num_steps: int | None = None,
     max_batch: int = 8,
 ) -> None:
     """Export policies of one base, which is stored once; see `exported.load_bundle`.
@@ -78,17 +79,20 @@ def write_bundle(
     Args:
         policies: by name, each with a `SharedSampler` as its model; the first is the default.
         folder: to be created, completely or not at all.
-        num_steps: Euler steps of the flow-matching sampler.
+        num_steps: Euler steps of the flow-matching sampler; None: each policy has its own.
         max_batch: largest batch; see `batch_sizes`.
 
     Raises:
         ValueError: as for `write`, or the policies cannot be served together.
     """
     folder, traced = Path(folder), _Programs()
-    settings: Any = {"num_steps": num_steps, "max_batch": max_batch}
     descriptions = {
         name: _describe(
-            each.policy, continues=bool(each.continues), metadata=each.metadata, **settings
+            each.policy,
+            continues=bool(each.continues),
+            num_steps=num_steps or each.denoise_steps,
+            max_batch=max_batch,
+            metadata=each.metadata,
         )
         for name, each in policies.items()
     }

@@ -14,6 +14,7 @@ from lorasp_jax.base import hub
 from lorasp_jax.extras.serving.checkpoint import Checkpoint, Unsaid
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig
+from lorasp_jax.models.sampling import NUM_STEPS
 from lorasp_jax.models.shared_base import SharedBase
 from lorasp_jax.policies import statistics_files
 from lorasp_jax.policies.policy import Policy
@@ -38,6 +39,7 @@ class Loaded:
         continues: whether it was trained to continue chunks; None: its files do not say.
         metadata: what they say of its robot.
         base: the base that its adapters share with others, if they do.
+        denoise_steps: flow steps per chunk: those of the run's evaluation.
     """
 
     policy: Policy
@@ -45,6 +47,7 @@ class Loaded:
     continues: bool | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
     base: SharedBase | None = None
+    denoise_steps: int = NUM_STEPS
 
     def with_adapters(self, folder: str, any_base: bool = False) -> "Loaded":
         """Return this policy with other adapters on its shared base; see `load_checkpoint`."""
@@ -88,6 +91,7 @@ def load_run(
         load_tokenizer(words or recorded),
         continues=bool(config["optim"].get("rtc_max_delay")) if config else None,
         metadata={key: described.get(key) for key in ("robot", "control_dt")},
+        denoise_steps=export.denoise_steps(folder),
     )
 
 

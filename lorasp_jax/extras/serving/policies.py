@@ -44,7 +44,7 @@ class CompiledPolicy:
         self,
         loaded: Loaded,
         *,
-        num_steps: int = 10,
+        num_steps: int | None = None,
         max_batch: int = 8,
         guidance: float | None = None,
         place: Callable[[Policy], Policy] = lambda policy: policy,
@@ -53,7 +53,7 @@ class CompiledPolicy:
 
         Args:
             loaded: any policy, with its tokenizer.
-            num_steps: Euler steps of the flow-matching sampler.
+            num_steps: Euler steps of the flow-matching sampler; None: those of `loaded`.
             max_batch: largest batch.
             guidance: β of guided execution, see `real_time_chunking.sample`; None: no guidance.
             place: applied to the policy before each call, such as an `OnDevice`.
@@ -61,7 +61,7 @@ class CompiledPolicy:
         policy = loaded.policy
         self.description: Description = describe(
             policy,
-            num_steps=num_steps,
+            num_steps=num_steps or loaded.denoise_steps,
             batch_sizes=batch_sizes(max_batch),
             continues=loaded.continues is not False,  # its files may not say it
             metadata=loaded.metadata,

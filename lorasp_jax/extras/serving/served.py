@@ -114,6 +114,11 @@ class ServedPolicies:
         return [*self._adapters.values()]
 
     @property
+    def denoise_steps(self) -> dict[str, int]:
+        """Flow steps of each adapter."""
+        return {str(each): each.policy.description.num_steps for each in self.adapters}
+
+    @property
     def places(self) -> dict[str, str]:
         """Where the weights of each adapter are, in words."""
         on = "on the device"  # exported ones do not move

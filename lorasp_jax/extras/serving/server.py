@@ -304,6 +304,7 @@ def describe(policy: "ServedPolicies") -> dict[str, Any]:
         "adapters": list(policy.instructions),
         "instructions": {name: list(texts) for name, texts in policy.instructions.items()},
         "execution": spec.execution,
+        "denoise_steps": policy.denoise_steps,
         "route": policy.routing,
         **policy.metadata,
     }

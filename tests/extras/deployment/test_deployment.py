@@ -24,7 +24,7 @@ from tests.cases import mostly_slow
 from tests.runs import CONFIG, RESULTS, make_run, random_episodes
 from tests.studies.paper.updates import add_noise
 
-RANK = CONFIG.peft.rank
+RANK, STEPS = CONFIG.peft.rank, 4
 HELD_OUT = random_episodes("press", 0)
 EPISODES = {"press": HELD_OUT}
 
@@ -32,7 +32,8 @@ EPISODES = {"press": HELD_OUT}
 def finished_run(folder, base, method=CONFIG.peft):
     options = dataclasses.replace(CONFIG.model, checkpoint=str(base))
     settings = {"peft": method, "tasks": ("press",), "targets": ("action/blocks/q_proj",)}
-    config = dataclasses.replace(CONFIG, model=options, **settings)
+    evaluation = dataclasses.replace(CONFIG.evaluation, denoise_steps=STEPS)
+    config = dataclasses.replace(CONFIG, model=options, evaluation=evaluation, **settings)
     run = make_run(folder, config, models.load(base))
     run.policy = dataclasses.replace(run.policy, model=add_noise(run.policy.model, 0.1))
     run.base_hash = models.weights_hash(base)
@@ -111,7 +112,7 @@ def test_table(run, capsys, name):
 
 @pytest.mark.slow
 def test_a_call_takes_time(run):
-    assert call_milliseconds(export.load_policy(run), EPISODES) > 0
+    assert call_milliseconds(export.load_policy(run), EPISODES, STEPS) > 0
 
 
 @pytest.mark.slow
@@ -147,6 +148,7 @@ def test_a_saved_variant_is_served(run, tmp_path, capsys, name):
     assert capsys.readouterr().out == f"written: {out}\n"
     loaded = loading.load_run(str(out))
     assert loaded.metadata == {"robot": "piper", "control_dt": 0.1}
+    assert loaded.denoise_steps == export.denoise_steps(run) == STEPS
     served = loaded.policy
     policy, kind = export.load_policy(run), name.split("-")[1]
     made = variants.transform(name, policy, EPISODES)

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -19,11 +20,13 @@ from lorasp_jax.extras.judge.actors import RunActor
 from lorasp_jax.extras.judge.judge import judge
 from lorasp_jax.extras.judge.parallel import judge_in_processes
 from lorasp_jax.extras.judge.task import load_tasks
+from lorasp_jax.training.run_folder import to_json, write_json
 from tests import ROOT
 from tests.cases import mostly_slow
 from tests.evaluation.line_world import TASK, Line, tasks
 from tests.evaluation.policy_servers import policy_server
-from tests.extras.serving.test_policies import noise_of, reference, request
+from tests.extras.serving.test_policies import STEPS, noise_of, reference, request
+from tests.runs import CONFIG
 
 
 class Mover:
@@ -234,9 +237,13 @@ def test_only_a_run_needs_jax():
     assert re.fullmatch(r"error: runs/x needs jax.* give --server", run)
 
 
-def test_run_acts_as_its_policy(finished):
-    """With a server's noise, here of the fifth connection."""
-    actor = RunActor(finished.folder, ["push the button", "push button"], num_steps=2)
+def test_run_acts_as_its_policy(finished, tmp_path):
+    """In the flow steps of its evaluation, with a server's noise, here of the fifth connection."""
+    evaluation = dataclasses.replace(CONFIG.evaluation, denoise_steps=STEPS)
+    config = dataclasses.replace(CONFIG, evaluation=evaluation)
+    folder = shutil.copytree(finished.folder, tmp_path / "run")
+    write_json(folder / "config.json", to_json(config))
+    actor = RunActor(folder, ["push the button", "push button"])
     sent = request(actor._policy.spec, prompt="push the button")
     images, state = sent.images, sent.state
     actor.reset(4)

@@ -154,7 +154,7 @@ def test_delays_that_do_not_fit_are_refused(numbering):
         text = f"of which {steps} are executed, the delay must be from 0 to {longest} .* {delay}$"
         with pytest.raises(ValueError, match=text):
             check_delay(delay, steps, CHUNK)
-    rollout = delayed_rollout(ENV, Execution("naive", STEPS))
+    rollout = delayed_rollout(ENV, Execution("naive", STEPS), denoise_steps=2)
     with pytest.raises(ValueError, match="with chunks of 10 actions"):
         rollout(numbering, jax.random.key(0), 5)
 

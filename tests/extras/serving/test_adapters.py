@@ -255,7 +255,7 @@ def rewrite(folder, **fields):
 def test_a_bundle_holds_the_base_once_and_acts_alike(served, runs, tmp_path, capsys):
     from lorasp_jax.extras.serving import export as exporting
 
-    out, words = tmp_path / "policy", ["--num-steps", "2", "--max-batch", "1"]
+    out, words = tmp_path / "policy", ["--denoise-steps", "2", "--max-batch", "1"]
     named = [f"{name}={run}" for name, run in runs.items()]
     assert exporting.main([*named, "--out", str(out), *words]) == 0
     assert "wrote" in capsys.readouterr().out
@@ -298,7 +298,7 @@ def test_a_checkpoint_shares_its_base_with_its_adapters(dummy_base, tmp_path):
     native.save_adapters(tmp_path / "a", adapted)
     words = [str(dummy_base), "--adapter", f"a={tmp_path / 'a'}", "--max-batch", "1", "--seed", "0"]
     served = command._load(
-        command.parser("serve").parse_args([*words, "--num-steps", "1"]), Console(quiet=True)
+        command.parser("serve").parse_args([*words, "--denoise-steps", "1"]), Console(quiet=True)
     )
     served.put("b", str(tmp_path / "a"))
     base, a, b = (each.policy.policy.model for each in served.adapters)
@@ -319,7 +319,7 @@ def test_a_checkpoint_takes_the_same_adapters_by_post_as_at_start(method, dummy_
     lorasp_jax.save_peft(folder, adapted, names=models.lerobot_names(adapted))
     words = [str(dummy_base), "--adapter", f"a={folder}", "--max-batch", "1", "--seed", "0"]
     served = command._load(
-        command.parser("serve").parse_args([*words, "--num-steps", "1"]), Console(quiet=True)
+        command.parser("serve").parse_args([*words, "--denoise-steps", "1"]), Console(quiet=True)
     )
     served.put("b", folder)
     _, a, b = (each.policy.policy.model for each in served.adapters)

@@ -1,8 +1,10 @@
 """Test the command line and what it loads."""
 
 import contextlib
+import dataclasses
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -24,10 +26,12 @@ from lorasp_jax.extras.serving import __main__ as command
 from lorasp_jax.extras.serving import loading
 from lorasp_jax.extras.serving.client import PolicyClient, PolicyError, ServerGone
 from lorasp_jax.peft import LoRA
+from lorasp_jax.training.run_folder import to_json, write_json
 from tests import ROOT
 from tests.cases import mostly_slow
 from tests.extras.serving.stand_in import StandIn, observation
 from tests.models.random_models import with_noise
+from tests.runs import CONFIG
 
 
 def refuse(capsys, *arguments):
@@ -46,6 +50,26 @@ def test_a_run_is_loaded(run):
     loaded = loading.load_run(str(run))
     assert (loaded.metadata, loaded.continues) == ({"robot": "piper", "control_dt": 0.1}, None)
     assert loaded.policy.processor.prompts.instructions[0] == "press the button"
+
+
+def test_flow_steps_are_those_of_the_run(run, dummy_base, tmp_path):
+    """Each run has its own; a published checkpoint, or a run that does not say, has ten."""
+
+    def steps(*words):
+        options = command.parser("serve").parse_args([*map(str, words), "--max-batch", "1"])
+        policies, _ = command._compiled(options, dict(options.policy))
+        return [policy.description.num_steps for policy in policies.values()]
+
+    runs = []
+    for number in (3, 5):
+        evaluation = dataclasses.replace(CONFIG.evaluation, denoise_steps=number)
+        runs.append(shutil.copytree(run, tmp_path / f"run{number}"))
+        config = dataclasses.replace(CONFIG, evaluation=evaluation)
+        write_json(runs[-1] / "config.json", to_json(config))
+    assert steps(*runs) == [3, 5]
+    assert steps(*runs, "--denoise-steps", 2) == [2, 2]
+    assert steps(run) == steps(dummy_base) == [10]
+    assert steps(dummy_base, "--denoise-steps", 2) == [2]
 
 
 def test_a_checkpoint_is_loaded_with_and_without_adapters(dummy_base, tmp_path):
@@ -162,10 +186,11 @@ def test_serving_a_run_until_an_interrupt(run, capsys, monkeypatch, policy):
     found = {}
     thread = threading.Thread(target=ask)
     thread.start()
-    words = ["--port", str(port), "--max-batch", "1", "--num-steps", "1"]
+    words = ["--port", str(port), "--max-batch", "1", "--denoise-steps", "1"]
     assert command.main([str(run), *words]) == 0
     thread.join()
     assert (found["adapters"], found["robot"]) == (["trained"], "piper")
+    assert found["denoise_steps"] == {"trained": 1 if policy == "compiled" else 10}
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines[-2:]] == ["listening", "closing"]
     if policy == "compiled":

@@ -42,7 +42,9 @@ def run(finished):
 def trained(run):
     """The run, as if it had been trained to continue chunks."""
     optim = dataclasses.replace(CONFIG.optim, rtc_max_delay=2)
-    write_json(run / "config.json", to_json(dataclasses.replace(CONFIG, optim=optim)))
+    evaluation = dataclasses.replace(CONFIG.evaluation, denoise_steps=5)
+    config = dataclasses.replace(CONFIG, optim=optim, evaluation=evaluation)
+    write_json(run / "config.json", to_json(config))
     yield run
     (run / "config.json").unlink()
 
@@ -50,7 +52,7 @@ def trained(run):
 @pytest.mark.slow
 def test_a_run_is_exported(trained, tmp_path, capsys):
     out = tmp_path / "new" / "policy"
-    code, printed = call(capsys, trained, "--out", out, "--max-batch", 1, "--num-steps", 2)
+    code, printed = call(capsys, trained, "--out", out, "--max-batch", 1, "--denoise-steps", 2)
     assert (code, printed.split(",")[0]) == (0, f"wrote {out}")
     programs = ["act-1.bin", "continue-1.bin"]
     data = ["instructions.json", "policy.json", "processor.json", "weights.safetensors"]
@@ -70,7 +72,9 @@ def test_the_command_exports_what_the_run_says(run, trained, tmp_path, capsys, m
     assert call(capsys, run, "--out", tmp_path / "policy", "--max-batch", 3)[0] == 0
     assert given.pop("instructions")[0] == "press the button"
     metadata = {"robot": "piper", "control_dt": 0.1}
-    assert given == {"continues": True, "num_steps": 10, "max_batch": 3, "metadata": metadata}
+    assert given == {"continues": True, "num_steps": 5, "max_batch": 3, "metadata": metadata}
+    assert call(capsys, run, "--out", tmp_path / "quick", "--denoise-steps", 2)[0] == 0
+    assert given["num_steps"] == 2
 
 
 def test_refusals(run, tmp_path, capsys):
@@ -81,7 +85,6 @@ def test_refusals(run, tmp_path, capsys):
         ((tmp_path / "unfinished", "--out", tmp_path / "new"), "no run has finished there"),
         ((tmp_path / "nowhere", "--out", tmp_path / "new"), f"is no folder {tmp_path / 'nowhere'}"),
         ((run, "--out", tmp_path / "new", "--max-batch", 0), "largest batch"),
-        ((run, "--out", tmp_path / "new", "--num-steps", 0), "flow steps"),
     ):
         code, printed = call(capsys, *words)
         assert (code, refusal in printed.replace("\n", " ")) == (2, True), printed

@@ -131,7 +131,7 @@ def test_a_server_of_exported_policies(other_folder):
 @pytest.mark.parametrize(
     ("words", "refusal"),
     [
-        (["--num-steps", "5"], "--num-steps"),
+        (["--denoise-steps", "5"], "--denoise-steps"),
         (["--max-batch", "2"], "--max-batch"),
         (["--base", "x"], "--base"),
         (["--joints", "6"], "--joints"),

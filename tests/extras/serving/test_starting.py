@@ -34,7 +34,7 @@ def test_a_server_does_not_import_what_only_training_needs():
 def test_a_second_start_compiles_nothing_that_takes_long(tmp_path):
     """Each start draws a seed of its own."""
     words = [sys.executable, "-m", "lorasp_jax.extras.serving", "assets/pi0_nano", "--joints", "7"]
-    words += ["--port", "0", "--max-batch", "1", "--num-steps", "1"]
+    words += ["--port", "0", "--max-batch", "1", "--denoise-steps", "1"]
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path)}
     kept = []
     for _ in range(2):

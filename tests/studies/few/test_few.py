@@ -93,7 +93,7 @@ def test_demonstrations_are_measured_as_a_dataset():
 
 def test_a_cropped_camera_shows_the_middle_of_its_pictures():
     (whole, _), (cropped, _) = (
-        judge._rollout("recorded", "press", "piper", 2, 40, crop) for crop in (False, True)
+        judge._rollout("recorded", "press", "piper", 2, 40, 10, crop) for crop in (False, True)
     )
     state = whole.reset(jax.random.key(0))
     given, shown = whole.observe(state)["image"], cropped.observe(state)["image"]
