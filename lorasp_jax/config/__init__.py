@@ -224,7 +224,7 @@ class EvaluationConfig:
     """Parallel worlds per task."""
     execute_steps: int = 5
     """Actions executed from each predicted chunk (execution horizon)."""
-    denoise_steps: int = 3
+    denoise_steps: int = 5
     """Euler steps of the flow-matching sampler; the finished run is served with as many."""
     before: bool = True
     """Evaluate the base before training."""
