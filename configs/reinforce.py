@@ -13,22 +13,32 @@ from lorasp_jax.reinforce.config import Learning, ReinforceConfig
 
 def get_config(scale: str) -> ReinforceConfig:
     """Return the config at `scale`: smoke, cpu or accelerator."""
-    worlds = {"smoke": 16, "cpu": 128, "accelerator": 512}[scale]
-    episodes = {"smoke": 16, "cpu": 64, "accelerator": 256}[scale]
+    learning, optim, episodes = {
+        "smoke": (
+            Learning(worlds=16, teacher_worlds=16, rounds=2, gradient_steps=4),
+            OptimConfig(steps=2, batch_size=16, learning_rate=3e-4),
+            16,
+        ),
+        "cpu": (
+            Learning(worlds=128, teacher_worlds=256, gradient_steps=100),
+            OptimConfig(steps=12, batch_size=64, learning_rate=3e-4),
+            64,
+        ),
+        "accelerator": (
+            Learning(worlds=256, teacher_worlds=1024, gradient_steps=300),
+            OptimConfig(steps=40, batch_size=128, learning_rate=3e-4),
+            256,
+        ),
+    }[scale]
     return ReinforceConfig(
         name="reinforce",
         scale=scale,
         peft=LoRASP(),
         tasks=("press",),
-        optim=OptimConfig(
-            steps={"smoke": 2, "cpu": 40, "accelerator": 100}[scale],
-            batch_size={"smoke": 64, "cpu": 512, "accelerator": 2048}[scale],
-            accumulate={"smoke": 1, "cpu": 2, "accelerator": 8}[scale],
-            learning_rate=1e-5 if scale == "accelerator" else 5e-5,
-        ),
+        optim=optim,
         evaluation=EvaluationConfig(
-            episodes=episodes, num_envs=episodes, denoise_steps=2, every={"smoke": 2}.get(scale, 5)
+            episodes=episodes, num_envs=episodes, every={"smoke": 2, "cpu": 2}.get(scale, 5)
         ),
-        online=Learning(worlds=worlds),
+        online=learning,
         checkpoint_every={"smoke": 1, "cpu": 1, "accelerator": 10}[scale],
     )

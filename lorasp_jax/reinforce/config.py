@@ -11,9 +11,10 @@ from lorasp_jax.peft import fields
 
 @dataclass(frozen=True)
 class Learning:
-    """How a flow policy learns from its own episodes, in which Gaussian noise explores.
+    """How a flow policy learns from success in simulation.
 
-    By proximal policy optimization (PPO, arXiv 1707.06347) with a critic.
+    By proximal policy optimization (PPO, arXiv 1707.06347) with a critic, exploring by Gaussian
+    noise: of the policy itself, or of a teacher for each task that the policy then imitates.
     """
 
     start: Annotated[str, tyro.conf.arg(name="from", prefix_name=False)] = ""
@@ -21,6 +22,8 @@ class Learning:
     base in model with new adapters, as `train.py` would start."""
     adapters: Literal["continue", "merge"] = "continue"
     """Train the adapters of the start run, or merge them into its base and train new ones."""
+    method: Literal["teacher", "ppo"] = "teacher"
+    """Who learns from success: a small policy on the simulator's state, or the adapters."""
     worlds: int = 64
     """Parallel worlds per task, one episode each in every iteration."""
     std: float = 0.1
@@ -37,7 +40,7 @@ class Learning:
     """Largest deviation of the probability ratio of an action from 1 that is rewarded."""
     epochs: int = 4
     """Passes over the chunks of an iteration."""
-    max_kl: float = 0.02
+    max_kl: float = 0.1
     """A step that brings the mean KL divergence per action from the policy that acted above this
     is the last of its iteration. The learning rate adapts to end iterations near it."""
     max_start_kl: float = 20.0
@@ -45,15 +48,24 @@ class Learning:
     this. An offset by 0.5 of the 7 slots of 5 actions is 21 with the default noise."""
     critic_learning_rate: float = 1e-3
     """Learning rate of the critic."""
+    teacher_worlds: int = 256
+    """Parallel worlds in which a teacher practises; they need no pictures."""
+    teacher_learning_rate: float = 1e-4
+    """Learning rate of a teacher; it adapts like that of the policy."""
+    rounds: int = 5
+    """Episodes per world in which a teacher practises before the policy imitates it again."""
+    gradient_steps: int = 100
+    """Gradient steps in which the policy imitates its teachers in an iteration."""
     minutes: float = 0.0
     """Start no iteration after this time [min]; 0: no limit."""
 
     def __post_init__(self) -> None:
         fields.check_fields(self)
-        for name in ("worlds", "epochs"):
+        for name in ("worlds", "epochs", "teacher_worlds", "rounds", "gradient_steps"):
             if getattr(self, name) < 1:
                 raise ValueError(f"online.{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("std", "clip", "max_kl", "max_start_kl", "critic_learning_rate"):
+        rates = "critic_learning_rate", "teacher_learning_rate"
+        for name in ("std", "clip", "max_kl", "max_start_kl", *rates):
             if getattr(self, name) <= 0:
                 raise ValueError(f"online.{name} must be above 0, got {getattr(self, name)}")
         for name in ("discount", "trace"):
@@ -78,8 +90,8 @@ _IGNORED = (
 class ReinforceConfig(Config):
     """One run of online reinforcement learning; a step is an iteration of rollout and update.
 
-    `optim.batch_size` are the chunks of a gradient step. The learning rate adapts to the KL
-    divergence of the iterations. The first iteration trains only the critic.
+    `optim.batch_size` are the chunks of a gradient step. With PPO, the learning rate of the
+    adapters adapts to the KL divergence of the iterations, and the first trains only the critic.
     """
 
     online: Learning = field(default_factory=Learning)
@@ -95,7 +107,7 @@ class ReinforceConfig(Config):
                 raise ValueError(f"{name} is not for reinforcement learning: drop it")
         if self.data.source and not self.online.start:
             raise ValueError("data.source is not for reinforcement learning: drop it")
-        if self.optim.steps == 1:
+        if self.online.method == "ppo" and self.optim.steps == 1:
             raise ValueError(
                 "optim.steps must be at least 2, got 1: the first iteration trains only the critic"
             )

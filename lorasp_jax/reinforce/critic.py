@@ -5,6 +5,7 @@ arXiv 1710.06542), and uses no adapters.
 """
 
 import dataclasses
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,11 +14,10 @@ import jax.numpy as jnp
 import optax
 
 from lorasp_jax.reinforce.config import Learning
+from lorasp_jax.reinforce.network import Network, moments
 from lorasp_jax.reinforce.rollout import Transitions
 
-_WIDTH, _BATCH, _EPOCHS = 128, 512, 4  # our choice
-_LIMIT = 5.0
-"""Normalized states are clipped to this magnitude."""
+_WIDTHS, _BATCH, _EPOCHS = (128, 128), 512, 4  # our choice
 _LEAST = 0.05
 """Advantages are divided by their standard deviation, but not by less: this would scale noise."""
 
@@ -25,40 +25,20 @@ _LEAST = 0.05
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Critic:
-    """Predicts the return of a state of one task.
+    """Predicts the return of a state of one task; the first states normalize its inputs."""
 
-    Attributes:
-        layers: weights and biases of an MLP.
-        mean, std: `[D]` of the first iteration's states, which normalize its inputs.
-    """
-
-    layers: list[tuple[jax.Array, jax.Array]]
+    network: Network
     opt_state: Any
-    mean: jax.Array
-    std: jax.Array
 
     @classmethod
     def init(cls, key: jax.Array, size: int, rate: float) -> "Critic":
         """Create a critic of states `[D]`, D = `size`, which predicts about 0."""
-        sizes, scales = (size, _WIDTH, _WIDTH, 1), (1.4, 1.4, 0.01)
-        layers = [
-            (jax.nn.initializers.orthogonal(scale)(k, (i, o)), jnp.zeros(o))
-            for k, scale, i, o in zip(
-                jax.random.split(key, 3), scales, sizes[:-1], sizes[1:], strict=True
-            )
-        ]
-        return cls(layers, optax.adam(rate).init(layers), jnp.zeros(size), jnp.zeros(size))
+        network = Network.init(key, (size, *_WIDTHS), ())
+        return cls(network, optax.adam(rate).init(network.layers))
 
     def __call__(self, state: jax.Array) -> jax.Array:
         """Predict the returns `[...]` of states `[..., D]`."""
-        x = jnp.clip((state - self.mean) / (self.std + 1e-3), -_LIMIT, _LIMIT)
-        return _apply(self.layers, x)
-
-
-def _apply(layers: list[tuple[jax.Array, jax.Array]], x: jax.Array) -> jax.Array:
-    for weight, bias in layers[:-1]:
-        x = jnp.tanh(x @ weight + bias)
-    return (x @ layers[-1][0] + layers[-1][1])[..., 0]
+        return self.network(state)
 
 
 def generalized_advantages(
@@ -107,19 +87,18 @@ def learn(
     Returns:
         `[T, W]` advantages, of mean 0 and variance at most 1 where an episode runs, else 0.
     """
-    running = ~steps.done
-    states, last = (jnp.nan_to_num(x, posinf=0.0, neginf=0.0) for x in (steps.state, last))
-    moment = lambda x: jnp.sum(x * running[..., None], (0, 1)) / jnp.sum(running)  # noqa: E731
-    mean = moment(states)
-    std = jnp.sqrt(moment(jnp.square(states - mean)))
-    new = jnp.all(critic.std == 0)
-    mean, std = jnp.where(new, mean, critic.mean), jnp.where(new, std, critic.std)
-    critic = dataclasses.replace(critic, mean=mean, std=std)
-    values = critic(states)
+    running, network = ~steps.done, critic.network
+    mean, std = moments(steps.state, running)
+    new = jnp.all(network.std == 0)
+    mean, std = jnp.where(new, mean, network.mean), jnp.where(new, std, network.std)
+    critic = Critic(dataclasses.replace(network, mean=mean, std=std), critic.opt_state)
+    values = critic(steps.state)
     outcome = steps.reward, steps.ended, learning.discount, learning.trace
     advantages = generalized_advantages(values, critic(last), *outcome)
     targets = advantages + values
-    fitted, errors = _fit(critic, (states, targets, running), key, learning.critic_learning_rate)
+    fitted, errors = _fit(
+        critic, (steps.state, targets, running), key, learning.critic_learning_rate
+    )
     variance = lambda x: jnp.var(x, where=running)  # noqa: E731
     metrics = {
         "critic_error": jnp.mean(errors),
@@ -142,13 +121,16 @@ def _fit(
         rows = jax.random.choice(key, len(states), (_BATCH,), p=running / jnp.sum(running))
 
         def loss(layers: Any) -> jax.Array:
-            predicted = Critic(layers, None, critic.mean, critic.std)(states[rows])
+            predicted = dataclasses.replace(critic.network, layers=layers)(states[rows])
             return jnp.mean(jnp.square(predicted - targets[rows]))
 
         error, gradient = jax.value_and_grad(loss)(layers)
         updates, opt_state = optimizer.update(gradient, opt_state)
         return (optax.apply_updates(layers, updates), opt_state), error
 
-    learned, count = (critic.layers, critic.opt_state), -(-_EPOCHS * len(states) // _BATCH)
+    learned, count = (critic.network.layers, critic.opt_state), -(-_EPOCHS * len(states) // _BATCH)
     (layers, opt_state), errors = jax.lax.scan(step, learned, jax.random.split(key, count))
-    return Critic(layers, opt_state, critic.mean, critic.std), errors
+    return Critic(dataclasses.replace(critic.network, layers=layers), opt_state), errors
+
+
+jitted_learn = functools.partial(jax.jit, static_argnums=4)(learn)

@@ -1,28 +1,21 @@
 """The loop of online learning: collect, update, log, save."""
 
 import contextlib
-import dataclasses
-import functools
 import time
 from collections.abc import Mapping, Sequence
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from lorasp_jax.base.bars import bars
 from lorasp_jax.base.intervals import wilson_interval
-from lorasp_jax.reinforce import critic, noise, rollout, update
+from lorasp_jax.reinforce import ppo, teaching
 from lorasp_jax.reinforce.config import ReinforceConfig
-from lorasp_jax.reinforce.rollout import Experience
+from lorasp_jax.reinforce.learner import Learner
 from lorasp_jax.reinforce.setting import Setting, prepare
-from lorasp_jax.reinforce.update import Learner, WeightedChunks
 from lorasp_jax.training import best, records
 from lorasp_jax.training.checkpoint import Checkpoints
-from lorasp_jax.training.guard import summarize
 from lorasp_jax.training.interrupt import deferred
 from lorasp_jax.training.loop import RunError, training
-from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import MetricsLog, read_json, read_metrics
 
@@ -72,7 +65,7 @@ def _loop(
         bar = progress.add_task("compiling ...", total=total, completed=saved)
         reason = clock.collapse(config, clock.last) if clock.last else ""
         while (done := int(state.step)) < total and not reason and not stop.requested:
-            state, values = iterate(setting, state)
+            state, values = _ITERATE[config.online.method](setting, state)
             done += 1
             if values.pop("in_a_row") >= config.optim.max_skipped:
                 raise RunError(_SKIPPED.format(config.optim.max_skipped, saved))
@@ -95,6 +88,7 @@ def _loop(
     return state
 
 
+_ITERATE = {"teacher": teaching.iterate, "ppo": ppo.iterate}
 _SKIPPED = (
     "{} consecutive updates were skipped because loss or gradient was non-finite; nothing after "
     "iteration {} was saved: try a lower --optim.learning-rate"
@@ -153,75 +147,3 @@ def _keep_best(run: Run, step: int, values: Mapping[str, float]) -> None:
     rates = [x for name, x in values.items() if name.startswith("success/")]
     if rates and (error := 1 - float(np.mean(rates))) < best.error(run.folder):
         best.save(run.folder, run.policy, step, error)
-
-
-def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]]:
-    """Collect and learn once; return the state and the metrics, with the environment `steps`."""
-    config, step = setting.config, int(state.step)
-    execute = config.evaluation.execute_steps
-    policy = setting.policy(state.adapters).with_sampler()
-    batches, critics, values = [], {}, {"steps": 0.0}
-    for task, env in setting.environments.items():
-        key = jax.random.fold_in(RandomStream.ROLLOUTS.key(config.seed, task), step)
-        found = rollout.collect(
-            env,
-            policy,
-            key,
-            noise.Spread.of(config.online),
-            execute_steps=execute,
-            denoise_steps=config.evaluation.denoise_steps,
-            ranges=config.ranges,
-        )
-        own = jax.random.fold_in(key, RandomStream.CRITIC)  # the rollout has split the key
-        inputs = state.critics[task], found.steps, found.last, own, config.online
-        advantages, critics[task], metrics = _learn(*inputs)
-        values |= {f"{name}/{task}": float(x) for name, x in metrics.items()}
-        batches.append(_batch(found, advantages, ~found.steps.done, execute))
-        values[f"rollout/{task}"] = float(jnp.mean(found.success))
-        values["steps"] += float(jnp.sum(~found.steps.done))
-    batch = jax.tree.map(lambda *x: jnp.concatenate(x), *batches)
-    key = jax.random.fold_in(RandomStream.TRAINING.key(config.seed), step)
-    rows = {}
-    if step:  # a critic that has learned nothing only adds noise
-        state, rows = update.improve(setting.programs, state, setting.frozen, batch, key)
-    values |= _summary(setting, state, batch, rows)
-    state = dataclasses.replace(state, step=state.step + 1, critics=critics)
-    return jax.device_put(state, setting.shardings), values
-
-
-def _batch(
-    found: Experience, advantages: jax.Array, valid: jax.Array, execute_steps: int
-) -> WeightedChunks:
-    """Arrange steps `[calls x S, W]` as chunks `[calls x W, C]`; the rest is invalid."""
-    worlds, rest = advantages.shape[1], found.chunks.actions.shape[1] - execute_steps
-
-    def arrange(x: jax.Array) -> jax.Array:
-        rows = jnp.moveaxis(x.reshape(-1, execute_steps, worlds), 1, 2).reshape(-1, execute_steps)
-        return jnp.pad(rows, ((0, 0), (0, rest)))
-
-    means = jnp.zeros_like(found.chunks.actions)
-    return WeightedChunks(found.chunks, arrange(advantages), arrange(valid), means)
-
-
-def _summary(
-    setting: Setting, state: Learner, batch: WeightedChunks, rows: dict[str, np.ndarray]
-) -> dict[str, float]:
-    """Return the means of the metrics of the gradient steps, and the divergence from the start."""
-    if not rows:
-        return {"updates": 0, "in_a_row": 0}
-    values = {n: float(x.mean()) for n, x in summarize(rows).items() if x.ndim == 0}
-    useful = np.flatnonzero(np.any(batch.valid, axis=1))  # of all calls, in their order
-    index = update.evenly(useful, setting.config.optim.batch_size)
-    now, start = (
-        setting.programs.means(x, setting.frozen, batch.chunks, index)
-        for x in (state.adapters, setting.start)
-    )
-    slots = noise.action_slots(setting.frozen.processor)
-    kl = noise.divergence(now, start, noise.Spread.of(setting.config.online), slots)
-    executed = kl[:, : setting.config.evaluation.execute_steps]
-    extra = {"start_kl": float(jnp.mean(executed)), "in_a_row": float(rows["in_a_row"][-1])}
-    rate = setting.config.optim.learning_rate * float(state.rate)
-    return values | extra | {"updates": len(rows["loss"]), "learning_rate": rate}
-
-
-_learn = functools.partial(jax.jit, static_argnums=4)(critic.learn)

@@ -1,4 +1,4 @@
-"""Episodes of the policy that explores, as chunks to learn from."""
+"""Episodes to learn from, in which the policy or another actor explores."""
 
 import functools
 from collections.abc import Callable
@@ -60,16 +60,25 @@ class Experience(NamedTuple):
     """W worlds until the time limit of their first episodes; finished ones restart meanwhile.
 
     Attributes:
-        chunks: N = calls x W, in this order.
+        chunks: what the actor says of its calls, N = calls x W, in this order.
         steps: T = calls x S. A world idles until the next call when its episode is over.
         last: `[W, D]` the last full state, as in `Transitions`.
         success: `[W]` bool, of the first episodes.
     """
 
-    chunks: Chunks
+    chunks: Any
     steps: Transitions
     last: jax.Array
     success: jax.Array
+
+    def at_calls(self, x: jax.Array) -> jax.Array:
+        """Return rows `[N, ...]` of the first step of each call, from `[T, W, ...]`."""
+        calls = len(jax.tree.leaves(self.chunks)[0]) // x.shape[1]
+        return x[:: len(x) // calls].reshape(-1, *x.shape[2:])
+
+
+Actor = Callable[[jax.Array, Worlds], tuple[jax.Array, Any]]
+"""(key, worlds) -> actions `[W, S, J+1]` [rad, m], and what it says of the call, rows `[W]`."""
 
 
 def collect(
@@ -82,28 +91,49 @@ def collect(
     denoise_steps: int,
     ranges: Randomization | None = None,
 ) -> Experience:
+    """Let a policy act, with noise; its calls are `Chunks`. For the arguments see `play`.
+
+    Args:
+        spread: distribution of the noise.
+        denoise_steps: Euler steps.
+    """
+    rows = jnp.asarray(policy.processor.prompts.rows(env.instructions))
+    spread = Spread(*map(jnp.float32, spread))
+
+    def act(key: jax.Array, worlds: Worlds) -> tuple[jax.Array, Chunks]:
+        prompts = rows[worlds.state.info["instruction"]]
+        inputs = key, worlds.observe(), prompts, spread, denoise_steps, execute_steps
+        return _explore()(worlds.policy, *inputs)
+
+    return play(env, policy, act, key, execute_steps=execute_steps, ranges=ranges)
+
+
+def play(
+    env: Env,
+    policy: Policy,
+    act: Actor,
+    key: jax.Array,
+    *,
+    execute_steps: int,
+    ranges: Randomization | None = None,
+) -> Experience:
     """Act in every world until the time limit.
 
     Args:
         env: W worlds.
         policy: on one device, or sharded over a mesh, which then shares the worlds, too.
+        act: who acts.
         key: determines layouts, start poses, instructions and noise.
-        spread: distribution of the noise.
-        execute_steps: S, actions executed from each chunk.
-        denoise_steps: Euler steps.
+        execute_steps: S, actions of a call.
         ranges: as in `env.reset`.
     """
-    worlds = Worlds(env, policy, key, ranges)
-    rows = jnp.asarray(policy.processor.prompts.rows(env.instructions))
+    worlds, chunks, steps = Worlds(env, policy, key, ranges), [], []
     worlds.state = _over_devices(worlds.state, policy)
-    spread, chunks, steps = Spread(*map(jnp.float32, spread)), [], []
     for call in range(-(-env.max_steps // execute_steps)):
         now = jax.random.fold_in(worlds.sample_key, call)
         if call:
             worlds.state = _restart(env, worlds.state, now, ranges)
-        prompts = rows[worlds.state.info["instruction"]]
-        inputs = now, worlds.observe(), prompts, spread, denoise_steps, execute_steps
-        actions, chunk = _explore()(worlds.policy, *inputs)
+        actions, chunk = act(now, worlds)
         worlds.state, step = _act(env, worlds.state, actions)
         chunks.append(chunk)
         steps.append(Transitions(**step))
@@ -111,7 +141,7 @@ def collect(
     joined = jax.tree.map(join, *steps)
     end = jnp.argmax(joined.ended, axis=0)
     success = jnp.take_along_axis(joined.success, end[None], axis=0)[0]
-    return Experience(jax.tree.map(join, *chunks), joined, _full_state(env, worlds.state), success)
+    return Experience(jax.tree.map(join, *chunks), joined, full_state(env, worlds.state), success)
 
 
 def _over_devices(tree: Any, policy: Policy) -> Any:
@@ -166,7 +196,7 @@ def _act(env: Env, state: State, actions: jax.Array) -> tuple[State, dict[str, j
     """Execute `[W, S, J+1]`; return the worlds and the fields of `Transitions`."""
 
     def step(state: State, action: jax.Array) -> tuple[State, dict[str, jax.Array]]:
-        before = {"state": _full_state(env, state), "done": state.done}
+        before = {"state": full_state(env, state), "done": state.done}
         state = env.step(state, action)
         after = {"ended": state.done, "success": state.info["success"], "reward": state.reward}
         return state, before | after
@@ -174,6 +204,8 @@ def _act(env: Env, state: State, actions: jax.Array) -> tuple[State, dict[str, j
     return jax.lax.scan(step, state, jnp.moveaxis(actions, 1, 0))
 
 
-def _full_state(env: Env, state: State) -> jax.Array:
+@functools.partial(jax.jit, static_argnums=0)
+def full_state(env: Env, state: State) -> jax.Array:
+    """Return `[W, D]`, as in `Transitions`."""
     elapsed = state.info["steps"] / env.max_steps
     return jnp.concatenate([env.full_state(state), elapsed[:, None]], axis=1)

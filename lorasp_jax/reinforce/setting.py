@@ -6,20 +6,24 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 
 import envs
 from envs.env import Env
 from lorasp_jax.adapters import adaptation
+from lorasp_jax.config import OptimConfig
 from lorasp_jax.peft import AdaLoRA
 from lorasp_jax.policies.policy import Policy
-from lorasp_jax.reinforce import update
+from lorasp_jax.reinforce import noise, student, update
 from lorasp_jax.reinforce.config import ReinforceConfig
 from lorasp_jax.reinforce.critic import Critic
-from lorasp_jax.reinforce.update import Learner
+from lorasp_jax.reinforce.learner import Learner
+from lorasp_jax.reinforce.rollout import Chunks
+from lorasp_jax.reinforce.teacher import Teacher
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.distributed import mesh as meshes
-from lorasp_jax.training.guard import Guard
+from lorasp_jax.training.guard import Guard, summarize
 from lorasp_jax.training.optim import make_optimizer
 from lorasp_jax.training.program import Frozen
 from lorasp_jax.training.random_streams import RandomStream
@@ -34,6 +38,8 @@ class Setting(NamedTuple):
         start: the adapters at the start, from which the KL divergence is measured.
         policy: from adapters to the policy.
         shardings: of the state.
+        imitate: the program of `student`, which needs teachers.
+        gyms: by task, the worlds in which teachers practise.
     """
 
     config: ReinforceConfig
@@ -43,6 +49,32 @@ class Setting(NamedTuple):
     start: Any
     policy: Callable[[Any], Policy]
     shardings: Learner
+    imitate: student.Imitate
+    gyms: Mapping[str, Env]
+
+    def summary(
+        self, state: Learner, chunks: Chunks, valid: np.ndarray, rows: dict[str, np.ndarray]
+    ) -> dict[str, float]:
+        """Return the means of the metrics of gradient steps, and the divergence from the start.
+
+        Args:
+            state: after these steps.
+            chunks: N that the policy has executed.
+            valid: `[N]` bool, which of them count; they are measured at equal distances.
+            rows: metrics of the steps; empty if there was none.
+        """
+        if not rows:
+            return {"updates": 0, "in_a_row": 0}
+        values = {n: float(x.mean()) for n, x in summarize(rows).items() if x.ndim == 0}
+        index = update.evenly(np.flatnonzero(valid), self.config.optim.batch_size)
+        now, start = (
+            self.programs.means(x, self.frozen, chunks, index) for x in (state.adapters, self.start)
+        )
+        slots = noise.action_slots(self.frozen.processor)
+        kl = noise.divergence(now, start, noise.Spread.of(self.config.online), slots)
+        executed = kl[:, : self.config.evaluation.execute_steps]
+        extra = {"start_kl": float(jnp.mean(executed)), "in_a_row": float(rows["in_a_row"][-1])}
+        return values | extra | {"updates": len(rows["loss"])}
 
 
 def prepare(run: Run) -> tuple[Setting, Learner, Any]:
@@ -50,23 +82,25 @@ def prepare(run: Run) -> tuple[Setting, Learner, Any]:
     config = run.config
     assert isinstance(config, ReinforceConfig)
     learning = config.online
-    environments = {task: environment(config, task) for task in config.tasks}
+    environments = {task: environment(config, task, learning.worlds) for task in config.tasks}
+    gyms = {}
+    if learning.method == "teacher":
+        gyms = {task: environment(config, task, learning.teacher_worlds) for task in config.tasks}
     check_memory(config, environments)
     mesh = meshes.make_mesh(config.fsdp, run.devices)
-    if learning.worlds % mesh.size:
-        devices = f"the number of devices ({mesh.size})"
-        raise ValueError(f"online.worlds must be a multiple of {devices}, got {learning.worlds}")
+    for name in ("worlds", "teacher_worlds"):
+        if (count := getattr(learning, name)) % mesh.size:
+            devices = f"the number of devices ({mesh.size})"
+            raise ValueError(f"online.{name} must be a multiple of {devices}, got {count}")
     graphdef, adapters, parameters = adaptation.split(run.policy.model)
     methods = adaptation.methods(run.policy.model).values()
     if any(isinstance(method, AdaLoRA) for method in methods):
         raise ValueError("ada_lora needs a number of steps, which reinforcement learning has not")
-    rate = config.optim.learning_rate
-    constant = dataclasses.replace(config.optim, final_learning_rate=rate, warmup_steps=0)
-    optimizer = make_optimizer(constant, methods)
+    optimizer = make_optimizer(_optim(config), methods)
     zero, one = jnp.zeros((), jnp.int32), jnp.ones(())
-    critics = _critics(config, environments)
-    adapters = jax.tree.map(jnp.copy, adapters)
-    state = Learner(zero, adapters, optimizer.init(adapters), Guard.initial(), critics, one)
+    critics, taught = _critics(config, environments), _teachers(config, gyms, run.policy)
+    adapters, guard = jax.tree.map(jnp.copy, adapters), Guard.initial()
+    state = Learner(zero, adapters, optimizer.init(adapters), guard, critics, one, taught)
     shardings = meshes.shardings(state, mesh)
     state = jax.device_put(state, shardings)
     processor = run.policy.processor
@@ -74,22 +108,31 @@ def prepare(run: Run) -> tuple[Setting, Learner, Any]:
     frozen = jax.device_put(frozen, meshes.shardings(frozen, mesh))
     start = jax.tree.map(jnp.copy, state.adapters)
     programs = update.Programs(config, graphdef, optimizer, shardings)
+    imitate = student.make_program(config, graphdef, optimizer, shardings)
 
     def policy(adapters: Any) -> Policy:
         return Policy(nnx.merge(graphdef, adapters, frozen.parameters), processor)
 
     run.policy = policy(start)
     shapes = jax.tree.map(meshes.with_sharding, jax.eval_shape(lambda: state), shardings)
-    setting = Setting(config, environments, programs, frozen, start, policy, shardings)
-    return setting, state, shapes
+    fixed = config, environments, programs, frozen, start, policy, shardings, imitate, gyms
+    return Setting(*fixed), state, shapes
 
 
-def environment(config: ReinforceConfig, task: str) -> Env:
-    """Make the worlds in which the policy explores a task."""
+def _optim(config: ReinforceConfig) -> OptimConfig:
+    """Return settings without a warm-up; imitation decays its rate, that of PPO follows the KL."""
+    optim, steps = config.optim, config.optim.steps * config.online.gradient_steps
+    if config.online.method == "ppo":
+        return dataclasses.replace(optim, final_learning_rate=optim.learning_rate, warmup_steps=0)
+    return dataclasses.replace(optim, steps=steps, warmup_steps=0)
+
+
+def environment(config: ReinforceConfig, task: str, worlds: int) -> Env:
+    """Make the worlds of a task."""
     return envs.make(
         task,
         robot=config.robot,
-        num_envs=config.online.worlds,
+        num_envs=worlds,
         image_size=config.image_size,
         control_dt=config.control_dt,
         reward=config.online.reward,
@@ -111,11 +154,23 @@ def check_memory(config: ReinforceConfig, environments: Mapping[str, Env]) -> No
 
 
 def _critics(config: ReinforceConfig, environments: Mapping[str, Env]) -> dict[str, Critic]:
+    rate = config.online.critic_learning_rate
     return {
-        task: Critic.init(
-            RandomStream.CRITIC.key(config.seed, task),
-            max(part.stop for part in env.full_state_layout.values()) + 1,
-            config.online.critic_learning_rate,
-        )
+        task: Critic.init(RandomStream.CRITIC.key(config.seed, task), _size(env), rate)
         for task, env in environments.items()
     }
+
+
+def _teachers(
+    config: ReinforceConfig, gyms: Mapping[str, Env], policy: Policy
+) -> dict[str, Teacher]:
+    shape = config.evaluation.execute_steps, policy.processor.statistics.dim
+    return {
+        task: Teacher.init(RandomStream.TEACHER.key(config.seed, task), _size(env), *shape)
+        for task, env in gyms.items()
+    }
+
+
+def _size(env: Env) -> int:
+    """Return the length of full states, with the elapsed time."""
+    return max(part.stop for part in env.full_state_layout.values()) + 1

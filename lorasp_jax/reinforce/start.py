@@ -24,6 +24,8 @@ from lorasp_jax.training.run import Callback, Run
 _KEPT = ("model", "robot", "image_size", "scene", "control_dt", "data")
 """Fields of the config that a start run decides."""
 _ADAPTERS = ("peft", "targets", "adapt")
+_ACTING = ("execute_steps", "denoise_steps")
+"""Fields of its evaluation that it decides unless they are given: how the policy acts."""
 MERGED = "merged"
 """Folder of a base with the adapters of the start run merged into it."""
 
@@ -63,7 +65,10 @@ def resolve(config: ReinforceConfig, given: Collection[str]) -> ReinforceConfig:
     known = described["tasks"]
     if unknown := [task for task in tasks if task not in known]:
         raise ValueError(f"{start} has learned {', '.join(known)}, not {unknown[0]}")
-    return dataclasses.replace(config, tasks=tasks, **taken)
+    acting = {name: getattr(recorded.evaluation, name) for name in _ACTING}
+    acting = {name: x for name, x in acting.items() if f"evaluation.{name}" not in given}
+    evaluation = dataclasses.replace(config.evaluation, **acting)
+    return dataclasses.replace(config, tasks=tasks, evaluation=evaluation, **taken)
 
 
 def _check_mergeable(start: Path, recorded: Config) -> None:

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -15,35 +14,14 @@ from flax import nnx
 from lorasp_jax.peft.auxiliary import AUXILIARY_WEIGHTS, auxiliary_losses
 from lorasp_jax.reinforce import noise
 from lorasp_jax.reinforce.config import ReinforceConfig
-from lorasp_jax.reinforce.critic import Critic
+from lorasp_jax.reinforce.learner import Learner
 from lorasp_jax.reinforce.rollout import Chunks
+from lorasp_jax.reinforce.surrogate import Samples, adapted, clipped_surrogate
 from lorasp_jax.training import compilation
 from lorasp_jax.training import guard as guards
 from lorasp_jax.training.distributed import mesh as meshes
-from lorasp_jax.training.guard import Guard
 from lorasp_jax.training.program import Frozen
 from lorasp_jax.training.step import Metrics, active_ranks
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Learner:
-    """What a run saves and resumes from.
-
-    Attributes:
-        step: `[]` int32, number of iterations.
-        adapters: trainable parameters, an `nnx.State`.
-        guard: statistics that decide which updates to skip.
-        critics: by task.
-        rate: `[]` factor of the learning rate, which follows the KL divergence of the iterations.
-    """
-
-    step: jax.Array
-    adapters: Any
-    opt_state: Any
-    guard: Guard
-    critics: dict[str, Critic]
-    rate: jax.Array
 
 
 class WeightedChunks(NamedTuple):
@@ -60,11 +38,6 @@ class WeightedChunks(NamedTuple):
     valid: jax.Array
     means: jax.Array
 
-
-_FACTOR = 1.5
-"""By how much an iteration changes the learning rate; our choice."""
-_LARGEST = 64.0
-"""Bound of the product of these factors, and of its inverse; our choice."""
 
 Loss = Callable[..., tuple[jax.Array, Metrics]]
 """(adapters, frozen, batch, *, num_valid=None) -> loss and metrics."""
@@ -94,29 +67,14 @@ def surrogate_loss(
     denoise_steps: int,
     num_valid: jax.Array | None = None,
 ) -> tuple[jax.Array, Metrics]:
-    """Return PPO's loss (arXiv 1707.06347, eq. 7), with one probability ratio per action.
-
-    It is the mean over valid actions; `num_valid` overrides their number.
-    """
+    """Return the loss of the adapters, `clipped_surrogate` plus weighted auxiliary losses."""
     mean, aux = means(adapters, frozen, batch.chunks, graphdef, denoise_steps)
     slots = noise.action_slots(frozen.processor)
-    new, old = (noise.log_prob(x, batch.chunks.actions, spread, slots) for x in (mean, batch.means))
-    ratio, advantages = jnp.exp(new - old), batch.advantages
-    num_valid = jnp.sum(batch.valid) if num_valid is None else num_valid
-    average = lambda x: jnp.sum(x * batch.valid) / jnp.maximum(num_valid, 1)  # noqa: E731
-    clipped = jnp.clip(ratio, 1 - clip, 1 + clip)
+    samples = Samples(batch.chunks.actions, batch.advantages, batch.valid, batch.means)
+    total, metrics = clipped_surrogate(mean, samples, spread, slots, clip, num_valid)
     losses = auxiliary_losses(aux)
-    total = -average(jnp.minimum(ratio * advantages, clipped * advantages))
     total += sum(weights[name] * value for name, value in losses.items())
-    metrics = {
-        "loss": total,
-        "kl": average(noise.divergence(mean, batch.means, spread, slots)),
-        "clipped": average(clipped != ratio),
-        "ratio": average(ratio),
-        **losses,
-        **active_ranks(aux),
-    }
-    return total, metrics
+    return total, metrics | {"loss": total, **losses, **active_ranks(aux)}
 
 
 def means(
@@ -238,7 +196,8 @@ def improve(
             break
     taken = rows[-1]["within"] and not rows[-1]["in_a_row"]
     kl = _change(programs, state, frozen, batch, evenly(useful, size)) if taken else np.inf
-    return _adapt(config, state, kl), _stack(rows)
+    rate = adapted(state.rate, kl, config.online.max_kl)
+    return dataclasses.replace(state, rate=rate), _stack(rows)
 
 
 def evenly(rows: np.ndarray, count: int) -> np.ndarray:
@@ -254,14 +213,6 @@ def _change(
     spread, slots = noise.Spread.of(programs.config.online), noise.action_slots(frozen.processor)
     kl = noise.divergence(mean, batch.means[index], spread, slots)
     return float(jnp.mean(kl, where=batch.valid[index]))
-
-
-def _adapt(config: ReinforceConfig, state: Learner, kl: float) -> Learner:
-    """Adapt the learning rate so that an iteration ends with about the KL divergence allowed."""
-    allowed = config.online.max_kl
-    factor = _FACTOR if kl < allowed / 2 else 1.0 if kl <= allowed else 1 / _FACTOR
-    rate = jnp.clip(state.rate * factor, 1 / _LARGEST, _LARGEST)
-    return dataclasses.replace(state, rate=rate)
 
 
 def _stack(rows: list[Metrics]) -> dict[str, np.ndarray]:

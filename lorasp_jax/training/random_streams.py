@@ -21,6 +21,7 @@ class RandomStream(enum.IntEnum):
     CRITIC = 7
     ROLLOUTS = 8
     """Episodes of online reinforcement learning."""
+    TEACHER = 14
     EVALUATION = 10
     """Evaluations before and during training."""
     FINAL_EVALUATION = 11

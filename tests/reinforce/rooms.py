@@ -68,7 +68,10 @@ class Room:
 def config(**changes) -> ReinforceConfig:
     fields = {field.name: getattr(CONFIG, field.name) for field in dataclasses.fields(CONFIG)}
     # Rarely does an episode succeed; a run with sparse reward would stop then.
-    learn = Learning(worlds=8, std=0.2, reward="dense", epochs=2, max_kl=1.0)
+    learn = Learning(
+        method="ppo", worlds=8, teacher_worlds=8, std=0.2, reward="dense", epochs=2, max_kl=1.0
+    )
+    learn = dataclasses.replace(learn, rounds=2, gradient_steps=4)
     optim = OptimConfig(steps=4, batch_size=8, learning_rate=1e-3)
     evaluation = EvaluationConfig(episodes=8, num_envs=8, execute_steps=2, denoise_steps=2)
     fields |= {"tasks": ("press",), "optim": optim, "evaluation": evaluation, "online": learn}

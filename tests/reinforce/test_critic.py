@@ -44,7 +44,7 @@ def test_a_critic_learns_the_returns():
     assert metrics["explained_variance"] > 0.8
     assert jnp.abs(model(jnp.array([[2.0, 0, 0], [-2.0, 0, 0]])) - jnp.array([1, 0])).max() < 0.1
     np.testing.assert_allclose([advantages.mean(), advantages.std()], [0, 1], atol=1e-3)
-    np.testing.assert_allclose(model.mean, state.mean((0, 1)), atol=1e-5)
+    np.testing.assert_allclose(model.network.mean, state.mean((0, 1)), atol=1e-5)
 
 
 def failures(state):

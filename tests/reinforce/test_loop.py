@@ -10,7 +10,7 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import OptimConfig
 from lorasp_jax.evaluation.callback import Evaluation
 from lorasp_jax.peft import AdaLoRA
-from lorasp_jax.reinforce import loop, setting, update
+from lorasp_jax.reinforce import loop, setting
 from lorasp_jax.reinforce.config import Learning
 from lorasp_jax.training import best
 from lorasp_jax.training.run import Callback
@@ -30,16 +30,22 @@ def train(folder, callbacks=(), *, resume=False, devices=1, **changes):
     return run
 
 
+def taught(**changes):
+    """Return settings of a run whose policy learns from teachers."""
+    return dataclasses.replace(rooms.config().online, method="teacher", **changes)
+
+
 def adapters(run):
     return leaves(adaptation.split(run.policy.model)[1])
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
+@pytest.fixture(scope="module", params=["ppo", "teacher"])
+def whole(request, tmp_path_factory):
     """An uninterrupted run."""
     patch = pytest.MonkeyPatch()
     patch.setattr(setting, "environment", lambda *_: rooms.Room())
-    yield train(tmp_path_factory.mktemp("whole"))
+    learn = dataclasses.replace(rooms.config().online, method=request.param)
+    yield train(tmp_path_factory.mktemp("whole"), online=learn)
     patch.undo()
 
 
@@ -48,17 +54,21 @@ def test_a_run_logs_what_the_report_shows(whole):
     assert [row["step"] for row in rows] == [1, 2, 3, 4]
     assert np.all(np.diff([row["environment_steps"] for row in rows]) > 0)
     assert np.all(np.diff([row["minutes"] for row in rows]) > 0)
-    names = {"rollout/press", "kl", "start_kl", "clipped", "explained_variance/press"}
+    names = {"rollout/press", "start_kl", "explained_variance/press"}
+    if whole.config.online.method == "ppo":
+        names |= {"kl", "clipped"}
+        assert rows[0]["updates"] == 0  # the critic learns first
+    else:
+        names |= {"teacher/press", "task"}
     assert names <= rows[1].keys()
-    assert rows[0]["updates"] == 0  # the critic learns first
     assert rows[1]["start_kl"] < rows[-1]["start_kl"]
 
 
 def test_a_stopped_run_resumes_to_the_bit(whole, tmp_path):
     with pytest.raises(KeyboardInterrupt):
-        train(tmp_path, [Terminate()])
+        train(tmp_path, [Terminate()], online=whole.config.online)
     assert len(read_metrics(tmp_path)) == 2
-    resumed = train(tmp_path, resume=True)
+    resumed = train(tmp_path, resume=True, online=whole.config.online)
     expected = adapters(whole)
     for name, leaf in adapters(resumed).items():
         np.testing.assert_array_equal(leaf, expected[name])
@@ -71,21 +81,24 @@ def test_a_stopped_run_resumes_to_the_bit(whole, tmp_path):
 
 
 def test_several_devices_learn_the_same(whole, tmp_path):
-    several = train(tmp_path, devices=4)
+    several = train(tmp_path, devices=4, online=whole.config.online)
     expected = adapters(whole)
     for name, leaf in adapters(several).items():
         np.testing.assert_allclose(leaf, expected[name], atol=2e-4, err_msg=name)
 
 
 @pytest.mark.slow
-def test_a_policy_learns_from_success_alone(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("method", "steps", "goal"), [("ppo", 20, 0.4), ("teacher", 10, 0.9)])
+def test_a_policy_learns_from_success_alone(tmp_path, monkeypatch, method, steps, goal):
     room = rooms.Room(num_envs=64, goal=0.15)
     monkeypatch.setattr(setting, "environment", lambda *_: room)
-    learn = Learning(worlds=64, std=0.3, max_kl=0.2, max_start_kl=1e9)
-    train(tmp_path, online=learn, optim=OptimConfig(steps=20, batch_size=32, learning_rate=3e-3))
+    learn = Learning(method=method, worlds=64, teacher_worlds=64, max_kl=0.2, max_start_kl=1e9)
+    learn = dataclasses.replace(learn, std=0.3, gradient_steps=50)
+    optim = OptimConfig(steps=steps, batch_size=32, learning_rate=3e-3)
+    train(tmp_path, online=learn, optim=optim)
     rates = [row["rollout/press"] for row in read_metrics(tmp_path)]
-    assert np.mean(rates[:4]) < 0.2
-    assert np.mean(rates[-4:]) > 0.4
+    assert np.mean(rates[:2]) < 0.2
+    assert np.mean(rates[-2:]) > goal
 
 
 class Judge(Callback):
@@ -176,24 +189,24 @@ def test_a_run_without_any_success_stops(tmp_path):
 
 
 def test_the_divergence_from_the_start_is_that_of_all_valid_chunks(tmp_path):
-    config, seen = rooms.config(), []
-    fixed, state, _ = setting.prepare(rooms.start(tmp_path, config))
+    fixed, state, _ = setting.prepare(rooms.start(tmp_path, rooms.config()))
+    seen = []
 
     def means(adapters, frozen, chunks, index):
         seen.append(index)
         return np.zeros((8, 4, 8))
 
-    valid = (np.arange(64) % 2 == 1)[:, None] & np.ones(4, bool)
-    batch = update.WeightedChunks(None, np.ones((64, 4)), valid, None)
     fixed = fixed._replace(programs=SimpleNamespace(means=means))
-    loop._summary(fixed, state, batch, {"loss": np.ones(1), "in_a_row": np.zeros(1, int)})
+    rows = {"loss": np.ones(1), "in_a_row": np.zeros(1, int)}
+    fixed.summary(state, None, np.arange(64) % 2 == 1, rows)
     assert seen[0].tolist() == [1, 9, 17, 27, 35, 45, 53, 63]
 
 
-def test_devices_must_divide_the_worlds(tmp_path):
-    learn = dataclasses.replace(rooms.config().online, worlds=6)
+@pytest.mark.parametrize("name", ["worlds", "teacher_worlds"])
+def test_devices_must_divide_the_worlds(tmp_path, name):
+    learn = dataclasses.replace(rooms.config().online, **{name: 6})
     run = rooms.start(tmp_path, rooms.config(online=learn), 4)
-    expected = r"online.worlds must be a multiple of the number of devices \(4\), got 6"
+    expected = rf"online.{name} must be a multiple of the number of devices \(4\), got 6"
     with pytest.raises(ValueError, match=expected):
         setting.prepare(run)
 

@@ -15,8 +15,9 @@ from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.reinforce import noise, update
 from lorasp_jax.reinforce.config import Learning
+from lorasp_jax.reinforce.learner import Learner
 from lorasp_jax.reinforce.rollout import Chunks
-from lorasp_jax.reinforce.update import Learner, WeightedChunks
+from lorasp_jax.reinforce.update import WeightedChunks
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.guard import Guard
 from lorasp_jax.training.program import Frozen

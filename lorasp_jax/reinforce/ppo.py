@@ -1,0 +1,65 @@
+"""The adapters learn from success themselves, by proximal policy optimization."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lorasp_jax.reinforce import critic, noise, rollout, update
+from lorasp_jax.reinforce.learner import Learner
+from lorasp_jax.reinforce.rollout import Experience
+from lorasp_jax.reinforce.setting import Setting
+from lorasp_jax.reinforce.update import WeightedChunks
+from lorasp_jax.training.random_streams import RandomStream
+
+
+def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]]:
+    """Collect and learn once; return the state and the metrics, with the environment `steps`."""
+    config, step = setting.config, int(state.step)
+    execute = config.evaluation.execute_steps
+    policy = setting.policy(state.adapters).with_sampler()
+    batches, critics, values = [], {}, {"steps": 0.0}
+    for task, env in setting.environments.items():
+        key = jax.random.fold_in(RandomStream.ROLLOUTS.key(config.seed, task), step)
+        found = rollout.collect(
+            env,
+            policy,
+            key,
+            noise.Spread.of(config.online),
+            execute_steps=execute,
+            denoise_steps=config.evaluation.denoise_steps,
+            ranges=config.ranges,
+        )
+        own = jax.random.fold_in(key, RandomStream.CRITIC)  # the rollout has split the key
+        inputs = state.critics[task], found.steps, found.last, own, config.online
+        advantages, critics[task], metrics = critic.jitted_learn(*inputs)
+        values |= {f"{name}/{task}": float(x) for name, x in metrics.items()}
+        batches.append(_batch(found, advantages, ~found.steps.done, execute))
+        values[f"rollout/{task}"] = float(jnp.mean(found.success))
+        values["steps"] += float(jnp.sum(~found.steps.done))
+    batch = jax.tree.map(lambda *x: jnp.concatenate(x), *batches)
+    key = jax.random.fold_in(RandomStream.TRAINING.key(config.seed), step)
+    rows = {}
+    if step:  # a critic that has learned nothing only adds noise
+        state, rows = update.improve(setting.programs, state, setting.frozen, batch, key)
+    valid = np.any(batch.valid, axis=1)
+    values |= setting.summary(state, batch.chunks, valid, rows)
+    if rows:
+        values["learning_rate"] = config.optim.learning_rate * float(state.rate)
+    state = dataclasses.replace(state, step=state.step + 1, critics=critics)
+    return jax.device_put(state, setting.shardings), values
+
+
+def _batch(
+    found: Experience, advantages: jax.Array, valid: jax.Array, execute_steps: int
+) -> WeightedChunks:
+    """Arrange steps `[calls x S, W]` as chunks `[calls x W, C]`; the rest is invalid."""
+    worlds, rest = advantages.shape[1], found.chunks.actions.shape[1] - execute_steps
+
+    def arrange(x: jax.Array) -> jax.Array:
+        rows = jnp.moveaxis(x.reshape(-1, execute_steps, worlds), 1, 2).reshape(-1, execute_steps)
+        return jnp.pad(rows, ((0, 0), (0, rest)))
+
+    means = jnp.zeros_like(found.chunks.actions)
+    return WeightedChunks(found.chunks, arrange(advantages), arrange(valid), means)

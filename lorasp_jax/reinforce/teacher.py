@@ -1,0 +1,220 @@
+"""A teacher: a small policy on the simulator's full state, which learns from success in minutes.
+
+It begins as a clone of the policy and improves by proximal policy optimization. Its episodes need
+neither pictures nor the policy, and its gradients no large model; what it has found, the policy
+learns by imitation. (A teacher that sees more than the student: arXiv 1912.12294.)
+"""
+
+import dataclasses
+import functools
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from envs.env import Env
+from envs.scene.ranges import Randomization
+from lorasp_jax.evaluation.programs import Worlds
+from lorasp_jax.policies.policy import Policy
+from lorasp_jax.policies.processor import Processor
+from lorasp_jax.reinforce import critic as critics
+from lorasp_jax.reinforce import noise, rollout
+from lorasp_jax.reinforce.config import Learning
+from lorasp_jax.reinforce.critic import Critic
+from lorasp_jax.reinforce.network import Network, moments
+from lorasp_jax.reinforce.rollout import Experience
+from lorasp_jax.reinforce.surrogate import Samples, adapted, clipped_surrogate
+
+_WIDTHS, _EPOCHS, _BATCH = (256, 256, 256), 8, 2048  # our choice, like the next ones
+_CLONE_STEPS, _CLONE_BATCH, _CLONE_RATE = 3000, 512, 1e-3
+_QUIET = 4
+"""One of so many worlds gets no noise: its success is the teacher's."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Teacher:
+    """Acts in one task.
+
+    Attributes:
+        network: from full states to normalized actions `[S, A]`.
+        rate: `[]` factor of the learning rate, which follows the KL divergence of the rounds.
+        success: `[]`, the latest rate without noise.
+    """
+
+    network: Network
+    opt_state: Any
+    rate: jax.Array
+    success: jax.Array
+
+    @classmethod
+    def init(cls, key: jax.Array, size: int, length: int, slots: int) -> "Teacher":
+        """Create a teacher of states `[D]`, D = `size`, that has learned nothing."""
+        network = Network.init(key, (size, *_WIDTHS), (length, slots))
+        return cls(network, _optimizer().init(network.layers), jnp.ones(()), jnp.zeros(()))
+
+
+class Calls(NamedTuple):
+    """N calls of a teacher.
+
+    Attributes:
+        state: `[N, D]` full state.
+        mean: `[N, S, A]` the network's actions.
+        actions: `[N, S, A]` the executed ones, with noise.
+        noisy: `[N]` bool, whether they have noise.
+    """
+
+    state: jax.Array
+    mean: jax.Array
+    actions: jax.Array
+    noisy: jax.Array
+
+
+def _optimizer() -> optax.GradientTransformation:
+    return optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam())
+
+
+@functools.partial(jax.jit, static_argnums=4)
+def clone(
+    teacher: Teacher, state: jax.Array, actions: jax.Array, valid: jax.Array, slots: Any
+) -> Teacher:
+    """Return a teacher that acts like the policy.
+
+    Args:
+        teacher: a new one.
+        state: `[N, D]` full states before the policy's calls.
+        actions: `[N, S, A]` its normalized actions, which may have noise.
+        valid: `[N]` bool, the calls to learn from.
+        slots: numbers of the executed slots.
+    """
+    mean, std = moments(state, valid)
+    network = dataclasses.replace(teacher.network, mean=mean, std=std)
+    optimizer = optax.adam(optax.cosine_decay_schedule(_CLONE_RATE, _CLONE_STEPS))
+
+    def step(carry: Any, key: jax.Array) -> tuple[Any, None]:
+        layers, opt_state = carry
+        rows = jax.random.choice(key, len(state), (_CLONE_BATCH,), p=valid / jnp.sum(valid))
+
+        def loss(layers: Any) -> jax.Array:
+            error = dataclasses.replace(network, layers=layers)(state[rows]) - actions[rows]
+            return jnp.mean(jnp.square(error[..., np.array(slots)]))
+
+        updates, opt_state = optimizer.update(jax.grad(loss)(layers), opt_state)
+        return (optax.apply_updates(layers, updates), opt_state), None
+
+    first = network.layers, optimizer.init(network.layers)
+    keys = jax.random.split(jax.random.key(0), _CLONE_STEPS)
+    layers = jax.lax.scan(step, first, keys)[0][0]
+    return dataclasses.replace(teacher, network=dataclasses.replace(network, layers=layers))
+
+
+def practise(
+    teacher: Teacher,
+    critic: Critic,
+    env: Env,
+    policy: Policy,
+    key: jax.Array,
+    learning: Learning,
+    ranges: Randomization | None = None,
+) -> tuple[Teacher, Critic, dict[str, jax.Array]]:
+    """Let a teacher act in worlds without pictures, and learn from its success.
+
+    Args:
+        teacher: of the task, not a new one.
+        critic: of the task; a new one learns alone.
+        env: W worlds of the task.
+        policy: whose robot and devices the teacher uses.
+        key: determines the episodes, and the order in which it learns from them.
+        learning: the settings.
+        ranges: as in `env.reset`.
+
+    Returns:
+        The teacher and the critic after learning, and metrics, with the environment `steps`.
+    """
+    spread, processor = noise.Spread.of(learning), policy.processor.shared()
+    length = teacher.network.layers[-1][1].shape[0]
+
+    def act(key: jax.Array, worlds: Worlds) -> tuple[jax.Array, Calls]:
+        seen = rollout.full_state(env, worlds.state), env.proprio(worlds.state)
+        return _act(teacher.network, key, *seen, spread, processor)
+
+    found = rollout.play(env, policy, act, key, execute_steps=length, ranges=ranges)
+    new = jnp.all(critic.network.std == 0)
+    own, other = jax.random.split(jax.random.fold_in(key, 1))
+    advantages, critic, metrics = critics.jitted_learn(
+        critic, found.steps, found.last, own, learning
+    )
+    slots = tuple(noise.action_slots(policy.processor).tolist())
+    improved = _improve(teacher, found, advantages, other, learning, slots)
+    teacher = jax.tree.map(lambda x, y: jnp.where(new, x, y), teacher, improved)
+    quiet = ~found.chunks.noisy[: len(found.success)]
+    success = jnp.mean(found.success, where=quiet)
+    metrics |= {"steps": jnp.sum(~found.steps.done)}
+    return dataclasses.replace(teacher, success=success), critic, metrics
+
+
+@jax.jit
+def _act(
+    network: Network,
+    key: jax.Array,
+    state: jax.Array,
+    robot: jax.Array,
+    spread: noise.Spread,
+    processor: Processor,
+) -> tuple[jax.Array, Calls]:
+    """Return actions `[W, S, J+1]` [rad, m], and the calls, for full states and the robot's."""
+    mean, slots = network(state), noise.action_slots(processor)
+    noisy = jnp.arange(len(state)) % _QUIET > 0
+    explored = noise.explore(key, mean, spread, slots)
+    calls = Calls(state, mean, jnp.where(noisy[:, None, None], explored, mean), noisy)
+    return processor.decode(calls.actions, robot), calls
+
+
+@functools.partial(jax.jit, static_argnums=(4, 5))
+def _improve(
+    teacher: Teacher,
+    found: Experience,
+    advantages: jax.Array,
+    key: jax.Array,
+    learning: Learning,
+    slots: tuple[bool, ...],
+) -> Teacher:
+    """Take gradient steps on minibatches of calls until the teacher has changed enough."""
+    calls, spread, network = found.chunks, noise.Spread.of(learning), teacher.network
+    by_call = lambda x: _by_call(x, calls.actions.shape[1])  # noqa: E731
+    valid = by_call(~found.steps.done) & calls.noisy[:, None]
+    samples = Samples(calls.actions, by_call(advantages), valid, calls.mean)
+    size = min(_BATCH, len(calls.state))
+
+    def step(carry: Any, index: jax.Array) -> tuple[Any, jax.Array]:
+        layers, opt_state, within, kl = carry
+        state, rows = jax.tree.map(lambda x: x[index], (calls.state, samples))
+
+        def loss(layers: Any) -> tuple[jax.Array, Any]:
+            mean = dataclasses.replace(network, layers=layers)(state)
+            return clipped_surrogate(mean, rows, spread, np.array(slots), learning.clip)
+
+        gradient, metrics = jax.grad(loss, has_aux=True)(layers)
+        kl = jnp.where(within, metrics["kl"], kl)
+        within &= metrics["kl"] <= learning.max_kl
+        updates, after = _optimizer().update(gradient, opt_state)
+        rate = -learning.teacher_learning_rate * teacher.rate
+        moved = optax.apply_updates(layers, jax.tree.map(lambda x: rate * x, updates))
+        new, old = (moved, after), (layers, opt_state)
+        return (*jax.tree.map(lambda x, y: jnp.where(within, x, y), new, old), within, kl), kl
+
+    orders = [jax.random.permutation(k, len(calls.state)) for k in jax.random.split(key, _EPOCHS)]
+    batches = jnp.concatenate([x[: len(x) // size * size].reshape(-1, size) for x in orders])
+    first = network.layers, teacher.opt_state, jnp.bool_(True), jnp.zeros(())
+    (layers, opt_state, _, kl), _ = jax.lax.scan(step, first, batches)
+    network = dataclasses.replace(network, layers=layers)
+    rate = adapted(teacher.rate, kl, learning.max_kl)
+    return Teacher(network, opt_state, rate, teacher.success)
+
+
+def _by_call(x: jax.Array, length: int) -> jax.Array:
+    """Arrange steps `[calls x S, W]` by call, `[calls x W, S]`."""
+    return jnp.moveaxis(x.reshape(-1, length, x.shape[1]), 1, 2).reshape(-1, length)

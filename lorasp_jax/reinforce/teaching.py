@@ -1,0 +1,104 @@
+"""Teachers learn from success, and the policy from them."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lorasp_jax.policies.policy import Policy
+from lorasp_jax.reinforce import noise, rollout, student
+from lorasp_jax.reinforce import teacher as teachers
+from lorasp_jax.reinforce.critic import Critic
+from lorasp_jax.reinforce.learner import Learner
+from lorasp_jax.reinforce.rollout import Experience
+from lorasp_jax.reinforce.setting import Setting
+from lorasp_jax.reinforce.teacher import Teacher
+from lorasp_jax.training.random_streams import RandomStream
+
+_ENOUGH = 0.98
+"""A teacher that succeeds as often practises no more; our choice."""
+
+
+def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]]:
+    """Practise and imitate once; return the state and the metrics, with the environment `steps`.
+
+    A teacher begins as a clone of the policy, and is imitated in its task while it is the better.
+    In other tasks the policy goes on as it does, so that it does not unlearn them.
+    """
+    config, step = setting.config, int(state.step)
+    policy = setting.policy(state.adapters).with_sampler()
+    given, better, values = [], False, {"steps": 0.0}
+    taught, critics = dict(state.teachers), dict(state.critics)
+    for task in setting.environments:
+        key = jax.random.fold_in(RandomStream.ROLLOUTS.key(config.seed, task), step)
+        seen = _collect(setting, task, policy, key, 0.0)
+        rate = float(jnp.mean(seen.success))
+        if not step:
+            taught[task] = _clone(setting, task, policy, key, seen, taught[task])
+        taught[task], critics[task], metrics = _practise(
+            setting, task, policy, key, taught[task], critics[task]
+        )
+        values["steps"] += metrics.pop("steps", 0.0) + float(jnp.sum(~seen.steps.done))
+        values |= {f"{name}/{task}": x for name, x in metrics.items()}
+        success = float(taught[task].success)
+        values |= {f"rollout/{task}": rate, f"teacher/{task}": success}
+        leads = success > rate
+        better |= leads
+        given.append(student.lessons(seen, taught[task] if leads else None, policy.processor))
+    lessons = jax.tree.map(lambda *x: jnp.concatenate(x), *given)
+    valid, rows = np.asarray(lessons.valid), {}
+    if better:
+        key = jax.random.fold_in(RandomStream.TRAINING.key(config.seed), step)
+        steps = config.online.gradient_steps
+        index = student.order(valid, steps, config.optim.batch_size, key)
+        state, metrics = setting.imitate(state, setting.frozen, lessons, index, key)
+        rows = jax.device_get(metrics)
+    values |= setting.summary(state, lessons.chunks, valid, rows)
+    state = dataclasses.replace(state, step=state.step + 1, critics=critics, teachers=taught)
+    return jax.device_put(state, setting.shardings), values
+
+
+def _collect(setting: Setting, task: str, policy: Policy, key: jax.Array, std: float) -> Experience:
+    config = setting.config
+    return rollout.collect(
+        setting.environments[task],
+        policy,
+        key,
+        noise.Spread(std, config.online.correlation),
+        execute_steps=config.evaluation.execute_steps,
+        denoise_steps=config.evaluation.denoise_steps,
+        ranges=config.ranges,
+    )
+
+
+def _clone(
+    setting: Setting, task: str, policy: Policy, key: jax.Array, seen: Experience, new: Teacher
+) -> Teacher:
+    """Clone the policy from what was seen, and from as many episodes with noise."""
+    noisy = _collect(setting, task, policy, jax.random.fold_in(key, 1), setting.config.online.std)
+    length = setting.config.evaluation.execute_steps
+    state, actions, valid = jax.tree.map(
+        lambda *x: jnp.concatenate(x),
+        *(
+            (x.at_calls(x.steps.state), x.chunks.actions[:, :length], x.at_calls(~x.steps.done))
+            for x in (seen, noisy)
+        ),
+    )
+    return teachers.clone(new, state, actions, valid, policy.processor.action_slots)
+
+
+def _practise(
+    setting: Setting, task: str, policy: Policy, key: jax.Array, teacher: Teacher, critic: Critic
+) -> tuple[Teacher, Critic, dict[str, float]]:
+    """Let a teacher practise for some rounds; return metrics of the last, with all `steps`."""
+    config, values, steps = setting.config, {}, 0.0
+    for number in range(config.online.rounds):
+        if teacher.success >= _ENOUGH:
+            break
+        own = jax.random.fold_in(key, 2 + number)
+        where = setting.gyms[task], policy, own, config.online, config.ranges
+        teacher, critic, metrics = teachers.practise(teacher, critic, *where)
+        values = {"explained_variance": float(metrics["explained_variance"])}
+        steps += float(metrics["steps"])
+    return teacher, critic, values | {"steps": steps}

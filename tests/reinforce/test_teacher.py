@@ -1,0 +1,136 @@
+"""The teacher, and what the policy learns from it."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lorasp_jax.reinforce import critic, noise, rollout, setting, student, teacher
+from lorasp_jax.reinforce.config import Learning
+from lorasp_jax.reinforce.teacher import Teacher
+from tests.reinforce import rooms
+
+LENGTH, SLOTS, SIZE = 2, 8, 8
+LEARNING = Learning(worlds=64, teacher_worlds=64, std=0.3, max_kl=0.2)
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory):
+    return rooms.start(tmp_path_factory.mktemp("run"), rooms.config()).policy
+
+
+def new(seed=0):
+    return Teacher.init(jax.random.key(seed), SIZE, LENGTH, SLOTS)
+
+
+def cloned(policy):
+    """Return a teacher that does nothing."""
+    state = jax.random.normal(jax.random.key(1), (256, SIZE))
+    zeros, slots = jnp.zeros((256, LENGTH, SLOTS)), policy.processor.action_slots
+    return teacher.clone(new(), state, zeros, jnp.ones(256, bool), slots)
+
+
+def practise(state, judge, policy, step=0, learning=LEARNING, goal=0.15):
+    room = rooms.Room(num_envs=64, goal=goal)
+    return teacher.practise(state, judge, room, policy, jax.random.key(step), learning)
+
+
+def judge():
+    return critic.Critic.init(jax.random.key(0), SIZE, 1e-3)
+
+
+def test_a_clone_acts_like_the_policy(policy):
+    state = 3 + 2 * jax.random.normal(jax.random.key(1), (2048, SIZE))
+    target = jnp.sin(state[:, :LENGTH, None] + jnp.arange(SLOTS))
+    valid = jnp.arange(2048) < 1024
+    wrong = jnp.where(valid[:, None, None], target, 100)  # what is not valid teaches nothing
+    found = teacher.clone(new(), state, wrong, valid, policy.processor.action_slots)
+    slots = np.array(policy.processor.action_slots)
+    error = (found.network(state) - target)[..., slots][:1024]
+    assert jnp.sqrt(jnp.mean(jnp.square(error))) < 0.1
+    np.testing.assert_allclose(found.network.mean, state[:1024].mean(0), rtol=1e-4)
+
+
+def test_a_teacher_learns_from_success(policy):
+    state, value = cloned(policy), judge()
+    rates = []
+    for step in range(12):
+        state, value, _ = practise(state, value, policy, step)
+        rates.append(float(state.success))
+    assert np.mean(rates[:2]) < 0.2
+    assert np.mean(rates[-2:]) > 0.9
+
+
+def test_a_new_critic_learns_alone(policy):
+    first = cloned(policy)
+    second, value, metrics = practise(first, judge(), policy)
+    assert metrics["steps"] > 0
+    for x, y in zip(jax.tree.leaves(first.network), jax.tree.leaves(second.network), strict=True):
+        np.testing.assert_array_equal(x, y)
+    third, _, _ = practise(second, value, policy, 1)
+    assert not np.array_equal(third.network.layers[0][0], second.network.layers[0][0])
+
+
+def test_success_is_measured_without_noise(policy):
+    """The clone never moves, so that it reaches no goal."""
+    wild = dataclasses.replace(LEARNING, std=5.0)
+    found, _, _ = practise(cloned(policy), judge(), policy, learning=wild, goal=0.3)
+    assert found.success < 0.1
+    room = rooms.Room(num_envs=64, goal=0.3)
+    spread = noise.Spread(5.0, 0.0)
+    options = {"execute_steps": LENGTH, "denoise_steps": 2}
+    noisy = rollout.collect(room, policy, jax.random.key(0), spread, **options)
+    assert jnp.mean(noisy.success) > 0.3
+
+
+@pytest.fixture(scope="module")
+def seen(policy):
+    """Episodes of the policy without noise."""
+    options = {"execute_steps": LENGTH, "denoise_steps": 2}
+    spread = noise.Spread(0.0, 0.9)
+    return rollout.collect(rooms.Room(), policy, jax.random.key(4), spread, **options)
+
+
+def test_lessons_are_the_actions_that_the_robot_would_execute(policy, seen):
+    wise = cloned(policy)
+    layers = [*wise.network.layers[:-1], (0 * wise.network.layers[-1][0], jnp.ones((LENGTH, 8)))]
+    wise = dataclasses.replace(wise, network=dataclasses.replace(wise.network, layers=layers))
+    given = student.lessons(seen, wise, policy.processor)
+    own, slots = seen.chunks.actions, noise.action_slots(policy.processor)
+    assert (given.chunks.actions[:, :LENGTH][..., slots] == 1).all()
+    np.testing.assert_array_equal(given.chunks.actions[:, LENGTH:], own[:, LENGTH:])
+    np.testing.assert_array_equal(given.chunks.actions[..., ~slots], own[..., ~slots])
+    np.testing.assert_array_equal(given.valid, ~np.asarray(seen.steps.done[::LENGTH]).reshape(-1))
+    same = student.lessons(seen, None, policy.processor)
+    np.testing.assert_array_equal(same.chunks.actions, own)
+
+
+def test_states_belong_to_their_calls(seen):
+    state = seen.at_calls(seen.steps.state)
+    np.testing.assert_array_equal(state[:, :7], seen.chunks.observation["state"])
+
+
+def test_all_lessons_are_learned_in_turn():
+    valid = np.arange(40) % 4 > 0
+    found = student.order(valid, 15, 4, jax.random.key(0))
+    assert np.bincount(found.ravel(), minlength=40).tolist() == [2 * x for x in valid]
+
+
+def test_only_judged_actions_are_imitated(tmp_path, policy, seen, monkeypatch):
+    monkeypatch.setattr(setting, "environment", lambda *_: rooms.Room())
+    learn = dataclasses.replace(rooms.config().online, method="teacher")
+    config = rooms.config(online=learn)
+    fixed, state, _ = setting.prepare(rooms.start(tmp_path, config))
+    index = np.arange(8).reshape(1, 8)
+
+    def loss(actions):
+        start = jax.tree.map(jnp.copy, state)
+        chunks = seen.chunks._replace(actions=actions)
+        given = student.Lessons(chunks, jnp.ones(len(actions), bool))
+        _, metrics = fixed.imitate(start, fixed.frozen, given, index, jax.random.key(0))
+        return metrics["task"][0]
+
+    actions = seen.chunks.actions
+    assert loss(actions.at[:, 0, 0].add(1.0)) > loss(actions)
