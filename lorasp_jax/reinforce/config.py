@@ -43,9 +43,9 @@ class Learning:
     max_kl: float = 0.1
     """A step that brings the mean KL divergence per action from the policy that acted above this
     is the last of its iteration. The learning rate adapts to end iterations near it."""
-    max_start_kl: float = 20.0
+    max_start_kl: float = 100.0
     """The run stops when the mean KL divergence per executed action from the start policy exceeds
-    this. An offset by 0.5 of the 7 slots of 5 actions is 21 with the default noise."""
+    this. An offset by 1.1 of the 7 slots of 5 actions is 102 with the default noise."""
     critic_learning_rate: float = 1e-3
     """Learning rate of the critic."""
     teacher_worlds: int = 256

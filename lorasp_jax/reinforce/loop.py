@@ -130,7 +130,7 @@ class _Clock:
         low, high = wilson_interval(first, episodes)[0], wilson_interval(now, episodes)[1]
         if now < first / 2 and high < low:  # not by chance
             return (
-                f"success with noise fell from {first} to {now} of {episodes} episodes: try a "
+                f"success of the rollouts fell from {first} to {now} of {episodes} episodes: try a "
                 "lower --optim.learning-rate"
             )
         return ""
@@ -139,7 +139,7 @@ class _Clock:
 def _text(values: Mapping[str, float]) -> str:
     """Return the text of the bar."""
     rates = [f"{100 * x:.0f} %" for name, x in values.items() if name.startswith("rollout/")]
-    return f"success with noise {', '.join(rates)}"
+    return f"success {', '.join(rates)}"
 
 
 def _keep_best(run: Run, step: int, values: Mapping[str, float]) -> None:

@@ -43,7 +43,7 @@ def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]
         values |= {f"{name}/{task}": x for name, x in metrics.items()}
         success = float(taught[task].success)
         values |= {f"rollout/{task}": rate, f"teacher/{task}": success}
-        leads = success > rate
+        leads = _leads(success, rate)
         better |= leads
         given.append(student.lessons(seen, taught[task] if leads else None, policy.processor))
     lessons = jax.tree.map(lambda *x: jnp.concatenate(x), *given)
@@ -57,6 +57,11 @@ def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]
     values |= setting.summary(state, lessons.chunks, valid, rows)
     state = dataclasses.replace(state, step=state.step + 1, critics=critics, teachers=taught)
     return jax.device_put(state, setting.shardings), values
+
+
+def _leads(teacher: float, policy: float) -> bool:
+    """Whether the policy has something to learn, given both rates of success."""
+    return teacher > policy
 
 
 def _collect(setting: Setting, task: str, policy: Policy, key: jax.Array, std: float) -> Experience:

@@ -76,7 +76,7 @@ def losses(rows: Rows) -> Figure:
 
 @mpl.rc_context(_STYLE)
 def reinforcement(rows: Rows, episodes: int) -> Figure:
-    """Plot success with noise, with 95 % intervals, and the divergence from the start policy.
+    """Plot success of rollouts, with 95 % intervals, and the divergence from the start policy.
 
     `episodes` is the number of episodes per task and iteration.
     """
@@ -89,11 +89,15 @@ def reinforcement(rows: Rows, episodes: int) -> Figure:
             bounds = [wilson_interval(round(row[name] * episodes), episodes) for row in rows]
             low, high = 100 * np.transpose(bounds)
             at = [row[x] for row in rows]
-            axes.plot(at, values, color=f"C{i}", label=name.removeprefix("rollout/"), lw=1.5)
+            task = name.removeprefix("rollout/")
+            axes.plot(at, values, color=f"C{i}", label=task, lw=1.5)
             axes.fill_between(at, low, high, color=f"C{i}", alpha=0.2, lw=0)
+            if (teacher := name.replace("rollout", "teacher")) in rows[0]:
+                values = [100 * row[teacher] for row in rows]
+                axes.plot(at, values, color=f"C{i}", ls=":", lw=1, label=f"{task}, teacher")
         axes.set_ylim(0, 103)
         axes.set_xlabel(x.replace("_", " "))
-    steps.set_title("success with noise [%]", loc="left")
+    steps.set_title("success of the rollouts [%]", loc="left")
     steps.legend(frameon=False, loc="lower right")
     _line(right, rows, "start_kl", COLORS["vision"], "from the start")
     _line(right, rows, "kl", COLORS["before"], "in an iteration")

@@ -34,6 +34,9 @@ class Room:
     def full_state(self, state):
         return state.data.qpos
 
+    def proprio(self, state):
+        return state.data.qpos
+
     def reset(self, key, ranges=None):
         zero = jnp.zeros(self.num_envs)
         count = zero.astype(jnp.int32)

@@ -91,7 +91,10 @@ def test_a_run_is_recorded_and_read_again(few, tmp_path):
         (["--tasks", "pour"], "few has learned press, not pour"),
         (["--online.std", 0], "online.std must be above 0, got 0.0"),
         (["--online.worlds", 0], "online.worlds must be at least 1, got 0"),
-        (["--optim.steps", 1], "optim.steps must be at least 2, got 1: the first iteration"),
+        (
+            ["--online.method", "ppo", "--optim.steps", 1],
+            "optim.steps must be at least 2, got 1: the first iteration",
+        ),
         (["--online.discount", 1.5], "online.discount must lie in \\(0, 1\\], got 1.5"),
         (["--method", "lora"], "--peft is that of .*few: drop it"),
         (["--optim.ema", 0.9], "optim.ema is not for reinforcement learning: drop it"),
