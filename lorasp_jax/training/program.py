@@ -68,9 +68,9 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
             batch = dataclasses.replace(batch, observation=images)
         batch = jax.lax.with_sharding_constraint(batch, meshes.batch_sharding(mesh))
         objective = None
-        if run.objective:
+        if learned := run.objective:
             start = nnx.merge(graphdef, frozen.start, frozen.parameters)
-            objective = lambda model, *drawn: run.objective(model, start, *drawn)  # noqa: E731
+            objective = lambda model, *drawn: learned(model, start, *drawn)  # noqa: E731
         return step(state, frozen.parameters, batch, keys.loss, objective=objective)
 
     # Keep the state's sharding: the compiled program accepts no other as its input.
@@ -83,15 +83,8 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
     def scan(frozen: Frozen, batches: RawBatch, state: TrainState, key: jax.Array) -> Any:
         return jax.lax.scan(lambda state, raw: body(state, raw, frozen, key), state, batches)
 
-    inputs = (
-        optim,
-        run.config.auxiliary,
-        run.augmentation,
-        run.objective,
-        graphdef,
-        *jax.tree.leaves(shardings),
-    )
-    return run.programs.setdefault(inputs, scan)
+    inputs = optim, run.config.auxiliary, run.augmentation, run.objective, graphdef
+    return run.programs.setdefault((*inputs, *jax.tree.leaves(shardings)), scan)
 
 
 class Program:
