@@ -1,22 +1,24 @@
 """`train.py` for a `DistillFlowConfig`."""
 
 import dataclasses
+import functools
 from collections.abc import Collection
 from pathlib import Path
 
 from rich.console import Console
 
 from lorasp_jax.adapters import adaptation
+from lorasp_jax.config import Config
 from lorasp_jax.distill_flow import objectives
 from lorasp_jax.distill_flow.config import DistillFlowConfig
 from lorasp_jax.evaluation.callback import Evaluation, NoEvaluation
 from lorasp_jax.evaluation.validation import Validation
 from lorasp_jax.models.sampling import NUM_STEPS
 from lorasp_jax.peft import AdaLoRA
-from lorasp_jax.policies.policy import Policy
 from lorasp_jax.report.callback import Report
 from lorasp_jax.training import loop, setup
 from lorasp_jax.training import start as starts
+from lorasp_jax.training.demonstrations import Demonstrations, Progress, demonstrations
 from lorasp_jax.training.export import load_policy
 from lorasp_jax.training.finished_run import recorded_config
 from lorasp_jax.training.run import Callback, Run
@@ -53,15 +55,17 @@ def resolve(config: DistillFlowConfig, given: Collection[str]) -> DistillFlowCon
     return dataclasses.replace(kept, optim=dataclasses.replace(config.optim, **chosen))
 
 
-def student(run: Run, policy: Policy, config: DistillFlowConfig) -> Run:
-    """Let a run train a policy that starts as `policy`, as the config says; return the run.
+def student(run: Run) -> Run:
+    """Let a run train its policy as its config says, with the policy as the teacher; return it.
 
     Raises:
         ValueError: the policy has no adapters in the layers of the flow steps, or AdaLoRA's.
     """
-    run.policy, run.objective = policy, objectives.of(config)
+    config, policy = run.config, run.policy
+    assert isinstance(config, DistillFlowConfig)
     if any(isinstance(method, AdaLoRA) for method in adaptation.methods(policy.model).values()):
         raise ValueError("ada_lora's rank budget spans all layers: distill another method's run")
+    run.objective = objectives.of(config)
     if not run.parameters[0]:
         raise ValueError(f"{config.distill.start} has no adapters in the action expert")
     run.console.print(
@@ -79,13 +83,18 @@ def prepare(config: DistillFlowConfig, folder: Path, console: Console, started: 
             instructions than those that the start run learned.
     """
     start = Path(config.distill.start)
-    run = setup.prepare(config, folder, console, started)
+    run = setup.prepare(config, folder, console, started, collect=functools.partial(_found, start))
     instructions = run.policy.processor.prompts.instructions
     del run.policy  # the device may not hold two
-    policy = load_policy(start)
-    if instructions != policy.processor.prompts.instructions:
+    run.policy = load_policy(start)
+    if instructions != run.policy.processor.prompts.instructions:
         raise ValueError(f"the instructions of the data are not those that {start} has learned")
-    return student(run, policy, config)
+    return student(run)
+
+
+def _found(start: Path, config: Config, folder: Path, progress: Progress) -> Demonstrations:
+    """Load the start run's demonstrations, or collect equal ones if its folder has none."""
+    return demonstrations(config, start if (start / "cache").is_dir() else folder, progress)
 
 
 class PolicyExport(Callback):

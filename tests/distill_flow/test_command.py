@@ -106,7 +106,7 @@ def distilling(folder, **changes):
     fields |= {"evaluation": EvaluationConfig(denoise_steps=1), "distill": Distillation()}
     run = make_run(folder, DistillFlowConfig(**fields | changes))
     run.console = Console(file=io.StringIO())
-    return command.student(run, run.policy, run.config)
+    return command.student(run)
 
 
 def test_it_trains_the_action_expert_alone_and_resumes_to_the_bit(tmp_path):
@@ -143,7 +143,7 @@ def test_the_distilled_policy_is_exported_with_its_steps(finished, tmp_path, mon
     config = dataclasses.replace(resolve("--from", finished), name="run")
     made = make_run(tmp_path / "run", config)
     made.base_hash = read_json(finished / "adapter.json")["base"]
-    monkeypatch.setattr(command.setup, "prepare", lambda *_: made)
+    monkeypatch.setattr(command.setup, "prepare", lambda *_, **__: made)
     run = command.prepare(config, made.folder, made.console, 0.0)
     old = leaves(adaptation.split(load_policy(finished).model)[1])
     assert all((x == old[name]).all() for name, x in leaves(run.split()[1]).items())

@@ -28,7 +28,7 @@ CONFIGS = {
     "pi05": dataclasses.replace(Pi0Config.dummy(), pi05=True),
     "smolvla": SmolVLAConfig.dummy(),
 }
-WEIGHTS = dict.fromkeys(("spectral", "balance", "z", "orthogonality"), jnp.zeros(()))
+WEIGHTS = {name: jnp.zeros(()) for name in ("spectral", "balance", "z", "orthogonality")}
 
 
 def make(name):
@@ -98,6 +98,9 @@ def test_snapflow_learns_the_two_step_sample():
     np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
+SEEN = Observation({}, {}, *(3 * [jnp.zeros(())]))
+
+
 class TwoWays(nnx.Module):
     """The optimal velocity where half of the demonstrated actions are 1 and half -1."""
 
@@ -144,7 +147,7 @@ def test_one_step_acts_in_either_way_and_not_in_between(objective, size):
     def step(carry, key):
         params, state = carry
         actions, noise, time = draw(key)
-        batch = Batch(Observation({}, {}, None, None, None), actions, jnp.ones(actions.shape, bool))
+        batch = Batch(SEEN, actions, jnp.ones(actions.shape, bool))
 
         def loss(params):
             student = nnx.merge(graphdef, params)
@@ -157,7 +160,7 @@ def test_one_step_acts_in_either_way_and_not_in_between(objective, size):
     train = jax.jit(lambda carry: jax.lax.scan(step, carry, keys)[0])
     params, _ = train((params, optimizer.init(params)))
     noise = draw(jax.random.key(1))[1]
-    chunk, _ = nnx.merge(graphdef, params).run_flow(None, None, noise, num_steps=1)
+    chunk, _ = nnx.merge(graphdef, params).run_flow(None, SEEN, noise, num_steps=1)
     clear = jnp.abs(noise) > 0.2
     assert jnp.abs(jnp.abs(chunk)[clear] - size).mean() < 0.15
     if size:
