@@ -157,3 +157,8 @@ def test_the_distilled_policy_is_exported_with_its_steps(finished, tmp_path, mon
     made.policy = dataclasses.replace(made.policy, processor=inputs)
     with pytest.raises(ValueError, match="the instructions of the data are not those that"):
         command.prepare(config, made.folder, made.console, 0.0)
+
+
+def test_configs_files_load():
+    for scale in ("smoke", "cpu", "accelerator"):
+        assert parse(["--config", FILE, "--scale", scale]).config.evaluation.denoise_steps == 2
