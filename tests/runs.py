@@ -1,5 +1,6 @@
 """Runs that need no simulation: random episodes and a tiny backbone."""
 
+import dataclasses
 import io
 import os
 import signal
@@ -15,22 +16,24 @@ from rich.console import Console
 
 from envs.datasets.episodes import Episodes
 from envs.rendering.video import write_video
+from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config, ModelConfig, OptimConfig
 from lorasp_jax.dense import Dense
 from lorasp_jax.models import flow_matching
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.peft import LoRASP
+from lorasp_jax.peft import LoRA, LoRASP
 from lorasp_jax.policies import tokenizer
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.prompt_table import PromptTable
+from lorasp_jax.training import export
 from lorasp_jax.training.base import TRAINING
 from lorasp_jax.training.export import BASE
 from lorasp_jax.training.rules import rules
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import MetricsLog, read_metrics, to_json, write_json
 from lorasp_jax.training.setup import processor
-from tests.models.random_models import random_backbone
+from tests.models.random_models import random_backbone, with_noise
 
 TIMED = ("speed/", "memory/")
 
@@ -167,4 +170,20 @@ def finish(folder: Path) -> Path:
     frames = np.random.default_rng(0).integers(0, 255, (4, 32, 64, 3), np.uint8)
     Image.fromarray(frames[0]).save(folder / "cameras_press.png")
     write_video(folder / "rollout_press.mp4", frames, fps=10)
+    return folder
+
+
+def finish_with_weights(folder: Path) -> Path:
+    """Write a finished run of one task with plain LoRA, whose base is saved beside it."""
+    base = folder.parent / "base"
+    model = ModelConfig(size="dummy", checkpoint=str(base))
+    config = dataclasses.replace(CONFIG, peft=LoRA(rank=4), model=model, tasks=("press",))
+    run = make_run(folder, config)
+    graphdef, adapters, frozen = adaptation.split(run.policy.model)
+    none, some = jax.tree.map(lambda x: 0 * x, adapters), with_noise(adapters, 0.03)
+    models.save(base, adaptation.merge(nnx.merge(graphdef, none, frozen)))
+    run.policy = dataclasses.replace(run.policy, model=nnx.merge(graphdef, some, frozen))
+    write_json(folder / "config.json", to_json(config))
+    write_json(folder / "results.json", RESULTS)
+    export.write(run)
     return folder

@@ -23,6 +23,7 @@ PACKAGES = [
     "lorasp_jax.evaluation",
     "lorasp_jax.report",
     "lorasp_jax.reinforce",
+    "lorasp_jax.distill_flow",
     "lorasp_jax.cli",
     # The core, which is everything above, imports none of these.
     "lorasp_jax.extras.serving",

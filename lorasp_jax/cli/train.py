@@ -15,6 +15,7 @@ from lorasp_jax.base import compilation_cache as cache
 from lorasp_jax.base.errors import run_command
 
 if TYPE_CHECKING:
+    from lorasp_jax.config import Config
     from lorasp_jax.training.overrides import Command
 
 RUNS = Path("runs")
@@ -60,21 +61,33 @@ def main(arguments: Sequence[str], program: str = "python train.py") -> int:
 
 
 def _resolved(command: "Command") -> "Command":
-    """Complete the config of reinforcement learning by what its start run decides."""
-    from lorasp_jax.reinforce.config import ReinforceConfig
-
-    if not isinstance(command.config, ReinforceConfig):
+    """Complete the config of a run that starts from another by what that decides."""
+    if not (kind := _kind(command.config)):
         return command
     import jax
-
-    from lorasp_jax.reinforce import start
 
     others = {"dry_run": command.dry_run, "fit": command.fit, "wandb": command.wandb}
     others["distributed"] = jax.distributed.is_initialized()
     for name in (name for name, value in others.items() if value):
-        raise ValueError(f"--{name.replace('_', '-')} is not for reinforcement learning: drop it")
-    config = start.resolve(command.config, command.given)
+        raise ValueError(f"--{name.replace('_', '-')} is not for {kind.KIND}: drop it")
+    config = kind.resolve(command.config, command.given)
     return dataclasses.replace(command, config=config)
+
+
+def _kind(config: "Config") -> Any:
+    """Return the command of a run that starts from another, None for other runs."""
+    from lorasp_jax.distill_flow.config import DistillFlowConfig
+    from lorasp_jax.reinforce.config import ReinforceConfig
+
+    if isinstance(config, ReinforceConfig):
+        from lorasp_jax.reinforce import command as reinforce
+
+        return reinforce
+    if isinstance(config, DistillFlowConfig):
+        from lorasp_jax.distill_flow import command as distill_flow
+
+        return distill_flow
+    return None
 
 
 def _execute(command: "Command", console: Console, started: float) -> None:
@@ -123,12 +136,8 @@ def run(
     """
     import jax
 
-    from lorasp_jax.reinforce.config import ReinforceConfig
-
-    if isinstance(command.config, ReinforceConfig):
-        from lorasp_jax.reinforce import command as reinforce
-
-        reinforce.run(command.config, folder, console, started, resume=bool(command.resume))
+    if kind := _kind(command.config):
+        kind.run(command.config, folder, console, started, resume=bool(command.resume))
         return
 
     from lorasp_jax.evaluation.callback import Evaluation, NoEvaluation

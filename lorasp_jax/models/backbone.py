@@ -2,7 +2,7 @@
 
 import importlib
 import pkgutil
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -61,6 +61,8 @@ class Backbone(nnx.Module):
     """The language model, with stacked `blocks`."""
     action: Any
     """The action expert, with stacked `blocks`."""
+    flow_layers: ClassVar[str] = "^(state_proj|action|time_mlp)"
+    """Pattern of the paths of all layers that `run_suffix` uses."""
 
     def _make_projections(self, state_width: int, rngs: nnx.Rngs) -> None:
         """Create the layers outside the towers; `state_width` is the width of the state token."""
@@ -187,6 +189,33 @@ class Backbone(nnx.Module):
             flow_time=flow_time,
         )
         return per_element, merge_action_aux(aux, action_aux)
+
+    def run_flow(
+        self,
+        prefix: Any,
+        obs: Observation,
+        noise: jax.Array,
+        *,
+        num_steps: int,
+        slots: jax.Array | None = None,
+        action_valid: jax.Array | None = None,
+    ) -> tuple[jax.Array, LayerAux]:
+        """Sample chunks as `sample_actions` does up to rounding, but differentiably.
+
+        Args:
+            prefix: result of `run_prefix` for `obs`.
+            obs: the observation.
+            noise: `[B, C, A]` initial noise of the flow.
+            num_steps: Euler steps.
+            slots: bool broadcastable to `[B, C, A]`; see `flow_matching.sample`.
+            action_valid: see `run_suffix`.
+
+        Returns:
+            `[B, C, A]` f32 normalized actions, and the adapters' aux of the last step.
+        """
+        velocity = lambda x_t, t: self.run_suffix(prefix, obs, x_t, t, action_valid)  # noqa: E731
+        chunk, aux = flow_matching.sample(velocity, noise, num_steps=num_steps, slots=slots)
+        return chunk, jax.tree.map(lambda x: x[-1], aux)
 
     def sample_actions(self, key: jax.Array, obs: Observation, **options: Any) -> Any:
         """Sample action chunks; see `Sampler.sample_actions` for the arguments."""

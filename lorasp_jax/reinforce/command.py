@@ -9,6 +9,9 @@ from lorasp_jax.reinforce import loop, start
 from lorasp_jax.reinforce.config import ReinforceConfig
 from lorasp_jax.report.callback import Report
 
+KIND = "reinforcement learning"
+resolve = start.resolve
+
 
 def run(
     config: ReinforceConfig, folder: Path, console: Console, started: float, *, resume: bool

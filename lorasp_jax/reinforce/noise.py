@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lorasp_jax.models import flow_matching
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.transformer.layers import ModelAux, merge_action_aux
 from lorasp_jax.policies.processor import Processor, RawObservation
@@ -109,10 +108,6 @@ def means(
     """
     obs = processor.encode(observation, prompts)
     prefix, aux = model.run_prefix(obs)
-    chunk, action_aux = flow_matching.sample(
-        lambda x_t, t: model.run_suffix(prefix, obs, x_t, t),
-        noise,
-        num_steps=num_steps,
-        slots=jnp.asarray(processor.flow_slots),
-    )
-    return chunk, merge_action_aux(aux, jax.tree.map(lambda x: x[-1], action_aux))
+    slots = jnp.asarray(processor.flow_slots)
+    chunk, action_aux = model.run_flow(prefix, obs, noise, num_steps=num_steps, slots=slots)
+    return chunk, merge_action_aux(aux, action_aux)

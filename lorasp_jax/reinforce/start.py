@@ -16,14 +16,13 @@ from lorasp_jax.peft import LoRAMoE, LoRASP, LoRASPRelease
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.reinforce.config import ReinforceConfig
 from lorasp_jax.training import export, rules, setup
-from lorasp_jax.training.export import BASE, describe, load_policy
+from lorasp_jax.training import start as starts
+from lorasp_jax.training.export import describe, load_policy
 from lorasp_jax.training.finished_run import recorded_config
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Callback, Run
+from lorasp_jax.training.start import ADAPTERS, KEPT, with_kept
 
-_KEPT = ("model", "robot", "image_size", "scene", "control_dt", "data")
-"""Fields of the config that a start run decides."""
-_ADAPTERS = ("peft", "targets", "adapt")
 _ACTING = ("execute_steps", "denoise_steps")
 """Fields of its evaluation that it decides unless they are given: how the policy acts."""
 MERGED = "merged"
@@ -39,36 +38,25 @@ def resolve(config: ReinforceConfig, given: Collection[str]) -> ReinforceConfig:
 
     Raises:
         ValueError: the start run is not finished, its tasks cannot be simulated, or a field that
-            it decides was given; several datasets have statistics or cameras of their own; or
-            its adapters cannot be merged into its base.
+            it decides was given; it trained its base; several datasets have statistics or
+            cameras of their own; or its adapters cannot be merged into its base.
     """
     if not config.online.start:
         return config
     start = Path(config.online.start)
     recorded = recorded_config(start)
-    kept = (*_KEPT, *(_ADAPTERS if config.online.adapters == "continue" else ()))
-    for name in kept:
-        values = getattr(config, name), getattr(recorded, name)
-        if name in {field.partition(".")[0] for field in given} and values[0] != values[1]:
-            what = f" ({values[1]})" if isinstance(values[1], str) else ""
-            raise ValueError(f"--{name.replace('_', '-')} is that of {start}{what}: drop it")
-    taken = {name: getattr(recorded, name) for name in kept}
+    kept = (*KEPT, *(ADAPTERS if config.online.adapters == "continue" else ()))
+    completed = with_kept(config, start, recorded, kept, given)
     tasks = config.tasks if "tasks" in given else recorded.tasks
-    described = describe(start)
-    if len(names := export.datasets(described)) > 1:
-        raise ValueError(
-            f"{start} has statistics or cameras for each of {', '.join(names)}: start from a run "
-            "with one dataset"
-        )
     if config.online.adapters == "merge":
         _check_mergeable(start, recorded)
-    known = described["tasks"]
+    known = describe(start)["tasks"]
     if unknown := [task for task in tasks if task not in known]:
         raise ValueError(f"{start} has learned {', '.join(known)}, not {unknown[0]}")
     acting = {name: getattr(recorded.evaluation, name) for name in _ACTING}
     acting = {name: x for name, x in acting.items() if f"evaluation.{name}" not in given}
     evaluation = dataclasses.replace(config.evaluation, **acting)
-    return dataclasses.replace(config, tasks=tasks, evaluation=evaluation, **taken)
+    return dataclasses.replace(completed, tasks=tasks, evaluation=evaluation)
 
 
 def _check_mergeable(start: Path, recorded: Config) -> None:
@@ -86,14 +74,11 @@ def load(config: ReinforceConfig, folder: Path, console: Console, started: float
     """Return a run with the policy that it starts with.
 
     Raises:
-        ValueError: see `load_policy`, `setup.build` and `setup.check_sizes`; or the start run
-            trained its base.
+        ValueError: see `load_policy`, `setup.build` and `setup.check_sizes`.
     """
     if not config.online.start:
         return setup.prepare(config, folder, console, started)
     start = Path(config.online.start)
-    if (start / BASE).is_dir():
-        raise ValueError(f"{start} has no adapters, it trained its base: start from another run")
     policy = load_policy(start)
     base_hash = native.read_description(start)["base"]
     if config.online.adapters == "merge":
@@ -119,8 +104,6 @@ class PolicyExport(Callback):
         if not config.online.start:
             export.write(run)
             return
-        metadata = describe(config.online.start)
-        if config.online.adapters == "merge":
-            metadata["base"] = hub.portable_path(str(run.folder / MERGED))
-        base = run.base_hash
-        native.save_adapters(run.folder, run.policy.model, base=base, metadata=metadata)
+        merged = config.online.adapters == "merge"
+        changes = {"base": hub.portable_path(str(run.folder / MERGED))} if merged else {}
+        starts.write(run, Path(config.online.start), **changes)

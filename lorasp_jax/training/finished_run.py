@@ -28,12 +28,12 @@ _GROUPS: dict[str, Any] = {
 }
 
 
-def recorded_config(run: Path) -> Config:
+def recorded_config(run: Path, *, simulated: bool = True) -> Config:
     """Return the config of a finished run, with the robot of its policy.
 
     Raises:
-        ValueError: the run is not finished, its tasks cannot be simulated, or its config has
-            settings that this version lacks.
+        ValueError: the run is not finished, its config has settings that this version lacks, or,
+            if they are to be `simulated`, its tasks cannot be.
     """
     from lorasp_jax.training import export  # heavy, and finished studies need no run
 
@@ -41,10 +41,10 @@ def recorded_config(run: Path) -> Config:
     finished = read_json(run / "results.json", records.RESULTS)
     if not recorded or not finished:
         raise ValueError(f"{run} is not a finished run: it needs {CONFIG_FILE} and results.json")
-    if not finished["tasks"]:
+    if simulated and not finished["tasks"]:
         raise ValueError(f"the tasks of {run} cannot be simulated")
     try:
-        config = _from_json(recorded, tuple(finished["tasks"]))
+        config = _from_json(recorded, tuple(finished["tasks"] or recorded["tasks"]))
     except TypeError as error:
         raise ValueError(f"{run / CONFIG_FILE} has settings of another version: {error}") from error
     # config.json is older than the dataset, which decides the robot.
@@ -52,8 +52,8 @@ def recorded_config(run: Path) -> Config:
 
 
 def _from_json(recorded: Mapping[str, Any], tasks: tuple[str, ...]) -> Config:
-    """Undo `run_folder.to_json`, but for what only reinforcement learning has."""
-    left_out = ("scene", "digest", "online")
+    """Undo `run_folder.to_json`, but for what only a kind of run has that has a start run."""
+    left_out = ("scene", "digest", "online", "distill")
     fields = {name: value for name, value in recorded.items() if name not in left_out}
     data = dict(fields["data"])
     augment, validation = ("none", "0") if data["source"] else ("auto", "auto")

@@ -90,7 +90,7 @@ def _split(
         adapters of `run.policy`; from a state to its policy; and from a step to the program that
         trains from there on.
     """
-    graphdef, adapters, parameters = adaptation.split(run.policy.model)
+    graphdef, adapters, parameters = run.split()
     methods = adaptation.methods(run.policy.model).values()
     optimizer = make_optimizer(run.config.optim, methods)
     init = functools.partial(init_state, optimizer=optimizer, ema=run.config.optim.ema > 0)
@@ -99,12 +99,11 @@ def _split(
     shardings = meshes.shardings(shapes, mesh)
     shapes = jax.tree.map(meshes.with_sharding, shapes, shardings)
     processor = run.policy.processor
-    frozen = Frozen(parameters, processor.shared())
+    frozen = Frozen(parameters, processor.shared(), adapters if run.objective else None)
     frozen = processes.device_put(frozen, meshes.shardings(frozen, mesh))
 
     def initial() -> TrainState:
-        adapters = adaptation.split(run.policy.model)[1]
-        return processes.device_put(init(adapters), shardings)
+        return processes.device_put(init(run.split()[1]), shardings)
 
     def policy(state: TrainState) -> Policy:
         return Policy(nnx.merge(graphdef, state.eval_adapters, frozen.parameters), processor)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from flax import nnx
 
 from lorasp_jax.base import messages
 from lorasp_jax.data.augmentation import augment
@@ -31,10 +32,12 @@ class Frozen(NamedTuple):
         parameters: frozen parameters of the model.
         processor: normalizes the batches; an input of the training program and not a part of it, so
             that runs on other demonstrations have the same program.
+        start: the adapters at the start, if the run has an `objective`.
     """
 
     parameters: Any
     processor: Processor
+    start: Any = None
 
 
 def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) -> Callable:
@@ -64,7 +67,11 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
             images = augment(keys.images, batch.observation, frozen.processor, recipe)
             batch = dataclasses.replace(batch, observation=images)
         batch = jax.lax.with_sharding_constraint(batch, meshes.batch_sharding(mesh))
-        return step(state, frozen.parameters, batch, keys.loss)
+        objective = None
+        if learned := run.objective:
+            start = nnx.merge(graphdef, frozen.start, frozen.parameters)
+            objective = lambda model, *drawn: learned(model, start, *drawn)  # noqa: E731
+        return step(state, frozen.parameters, batch, keys.loss, objective=objective)
 
     # Keep the state's sharding: the compiled program accepts no other as its input.
     @functools.partial(
@@ -76,8 +83,8 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
     def scan(frozen: Frozen, batches: RawBatch, state: TrainState, key: jax.Array) -> Any:
         return jax.lax.scan(lambda state, raw: body(state, raw, frozen, key), state, batches)
 
-    inputs = optim, run.config.auxiliary, run.augmentation, graphdef, *jax.tree.leaves(shardings)
-    return run.programs.setdefault(inputs, scan)
+    inputs = optim, run.config.auxiliary, run.augmentation, run.objective, graphdef
+    return run.programs.setdefault((*inputs, *jax.tree.leaves(shardings)), scan)
 
 
 class Program:

@@ -1,13 +1,16 @@
 """The state of a run, shared by all parts of training, and the callback interface."""
 
 import contextlib
+import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
+from flax import nnx
 from rich.console import Console
 
 from envs.datasets.episodes import Episodes
@@ -20,6 +23,7 @@ from lorasp_jax.training import records
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.offline import Chosen
 from lorasp_jax.training.run_folder import TIMES_FILE, read_json, write_json
+from lorasp_jax.training.step import Objective
 
 
 @dataclass
@@ -37,6 +41,8 @@ class Run:
         devices: devices to train on; None: all.
         simulated: whether the tasks can be evaluated in simulation.
         stops: whether training ends with this step, before the last of the config.
+        objective: what to learn in place of the demonstrated actions; only layers that run in each
+            flow step are then trained.
         programs: jitted training programs by their inputs; see `program.jit_steps`.
         policy: the current policy; read it in callbacks or after training, since each step donates
             its buffers.
@@ -58,6 +64,7 @@ class Run:
     devices: Sequence[Any] | None = None
     simulated: bool = True
     stops: bool = False
+    objective: Objective | None = None
     programs: dict[Any, Callable[..., Any]] = field(default_factory=dict)
     policy: Policy = field(init=False)
     seconds: dict[str, float] = field(init=False)
@@ -88,7 +95,18 @@ class Run:
     @property
     def parameters(self) -> tuple[int, int]:
         """Numbers of trainable parameters and of all parameters."""
-        return adaptation.count(self.policy.model)
+        trained = sum(x.size for x in jax.tree.leaves(self.split()[1]))
+        return trained, adaptation.count(self.policy.model).total
+
+    def split(self) -> tuple[Any, Any, Any]:
+        """Split the policy's model into (graphdef, adapters that the run trains, all others)."""
+        graphdef, adapters, frozen = adaptation.split(self.policy.model)
+        if not self.objective:
+            return graphdef, adapters, frozen
+        pattern = self.policy.model.flow_layers
+        in_flow = lambda path, _: bool(re.search(pattern, "/".join(map(str, path))))  # noqa: E731
+        adapters, others = nnx.split_state(adapters, in_flow, ...)
+        return graphdef, adapters, nnx.merge_state(frozen, others)
 
     @contextlib.contextmanager
     def timed(self, phase: str) -> Iterator[None]:

@@ -1,6 +1,8 @@
 """The training step: pure functions from state and batch to state and metrics."""
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +20,11 @@ from lorasp_jax.training import guard as guards
 from lorasp_jax.training.guard import Guard
 
 Metrics = dict[str, jax.Array]
+Objective = Callable[[Any, Any, Batch, jax.Array, jax.Array], tuple[jax.Array, Any]]
+"""What a run learns in place of the demonstrated actions, from the policy it starts with.
+
+(model, model at the start, batch, noise `[B, C, A]`, flow time `[B]` or `[B, C]`) -> errors
+`[B, C, A]` f32, and the adapters' aux. Equal ones must compare equal."""
 
 
 @jax.tree_util.register_dataclass
@@ -91,13 +98,15 @@ def loss_fn(
     noise: jax.Array | None = None,
     flow_time: jax.Array | None = None,
     times: Times = PI0_TIMES,
+    objective: Callable[..., Any] | None = None,
 ) -> tuple[jax.Array, Metrics]:
     """Return the flow-matching loss plus weighted auxiliary losses (arXiv 2603.07404, eq. 14).
 
     The task loss is the mean over the elements that `batch.action_mask` marks as valid, without
     given actions (see `flow_matching.draw`); `num_valid` overrides their number. `key` seeds the
     adapters' dropout and the sampling of noise and flow time; `noise` and `flow_time` override the
-    samples. The metrics include the unweighted auxiliary losses.
+    samples. The metrics include the unweighted auxiliary losses. `objective`, an `Objective` that
+    has its second model, replaces the flow-matching loss.
     """
     # with_dropout clones the model, so the merge needs no copy=True. Both uses of the key are safe:
     # with_dropout only folds layer paths into it, and flow_matching.draw splits it once.
@@ -107,14 +116,11 @@ def loss_fn(
         noise = drawn if noise is None else noise
     mask = _scored(batch, flow_time)
     num_valid = jnp.sum(mask) if num_valid is None else num_valid
-    per_element, aux = model.loss(
-        key,
-        batch.observation,
-        batch.actions,
-        action_mask=batch.action_mask,
-        noise=noise,
-        flow_time=flow_time,
-    )
+    if objective:
+        per_element, aux = objective(model, batch, noise, flow_time)
+    else:
+        options = {"action_mask": batch.action_mask, "noise": noise, "flow_time": flow_time}
+        per_element, aux = model.loss(key, batch.observation, batch.actions, **options)
     task = jnp.sum(per_element * mask) / jnp.maximum(num_valid, 1)
     losses = auxiliary_losses(aux) | adaptation.penalties(model)
     total = task + sum(weights[name] * value for name, value in losses.items())
@@ -137,13 +143,14 @@ def gradients(
     weights: dict[str, jax.Array],
     parts: int = 1,
     times: Times = PI0_TIMES,
+    objective: Callable[..., Any] | None = None,
 ) -> tuple[Any, Metrics]:
     """Return the gradient and the metrics of `loss_fn`, accumulated over `parts` micro-batches.
 
     Up to rounding, the task loss is that of the whole batch. Auxiliary losses and active ranks are
     means over the micro-batches. For `times` see `flow_matching.draw`.
     """
-    gradient = jax.grad(loss_fn, has_aux=True)
+    gradient = jax.grad(functools.partial(loss_fn, objective=objective), has_aux=True)
     if parts == 1:
         return gradient(adapters, frozen, graphdef, batch, key, weights, times=times)
     # Row i goes into micro-batch i % parts, so that no row moves to another device.
@@ -177,14 +184,17 @@ def train_step(
     ema: float = 0.0,
     spike: float = 0.0,
     times: Times = PI0_TIMES,
+    objective: Callable[..., Any] | None = None,
 ) -> tuple[TrainState, Metrics]:
     """Take one step on the global batch, split into `parts` micro-batches; do not reuse `key`.
 
     `ema` is the decay factor of the moving average, if one is kept. A step that `guard.check_step`
-    rejects changes only the step count and the guard. For `times` see `flow_matching.draw`.
+    rejects changes only the step count and the guard. For `times` see `flow_matching.draw`, for
+    `objective` see `loss_fn`.
     """
     now = {name: jnp.asarray(schedule(state.step)) for name, schedule in weights.items()}
-    grads, metrics = gradients(state.adapters, frozen, graphdef, batch, key, now, parts, times)
+    inputs = state.adapters, frozen, graphdef, batch, key, now
+    grads, metrics = gradients(*inputs, parts, times, objective)
     grad_norm = optax.tree.norm(grads)
     accept, guard = guards.check_step(state.guard, metrics["loss"], grad_norm, spike)
     updates, opt_state = optimizer.update(grads, state.opt_state, state.adapters)

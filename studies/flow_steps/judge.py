@@ -1,7 +1,8 @@
 """Success, jerk and spread of one policy with every number of flow steps."""
 
+import dataclasses
 import functools
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -9,18 +10,23 @@ import numpy as np
 
 from envs import Env
 from envs.physics import physics
+from lorasp_jax.distill_flow import command
+from lorasp_jax.distill_flow.config import Distillation, DistillFlowConfig
 from lorasp_jax.evaluation import held_out
 from lorasp_jax.evaluation.programs import compiled_rollout
 from lorasp_jax.extras.latency.curve import measure_point
 from lorasp_jax.extras.latency.execution import Execution, delayed_rollout
 from lorasp_jax.extras.study.held_out import AllTasks
 from lorasp_jax.policies.policy import Policy
+from lorasp_jax.training import loop
 from lorasp_jax.training.demonstrations import Demonstrations, map_threads
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Run
 from studies.flow_steps.page import STEPS
 
 _DRAWS, _WINDOWS, _EXECUTED = 16, 128, 5
+_TRAINED = 3000
+"""Steps of distillation."""
 
 
 def judge(run: Run, delay: int) -> dict[str, Any]:
@@ -38,11 +44,36 @@ def judge(run: Run, delay: int) -> dict[str, Any]:
         key = RandomStream.FINAL_EVALUATION.key(run.config.seed, task)
         return measure_point(policy, env, play, key, settings.episodes, delay)
 
-    cases = [(steps, task) for task in run.config.tasks for steps in STEPS]
+    cases = [(steps, task) for task in run.config.tasks for steps in _steps(run)]
     # Warp is not thread-safe.
     run_all = map if physics.default_backend() == "warp" else map_threads
     found = dict(zip([f"{n}/{task}" for n, task in cases], run_all(one, cases), strict=True))
     return {name: {k: v[name] for k, v in found.items()} for name in ("outcomes", "jerk")}
+
+
+def judge_distilled(run: Run, loss: Literal["endpoint", "snapflow"], steps: int) -> dict[str, Any]:
+    """Distill the policy of a run to a number of flow steps, then judge it with these."""
+    config, optim = run.config, run.config.optim
+    settings = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+    settings |= {
+        "evaluation": dataclasses.replace(config.evaluation, denoise_steps=steps),
+        "optim": dataclasses.replace(
+            optim, steps=min(_TRAINED, optim.steps), learning_rate=0.3 * optim.learning_rate
+        ),
+    }
+    made = DistillFlowConfig(**settings, distill=Distillation(loss=loss))
+    student = dataclasses.replace(run, config=made, folder=run.folder / "distilled")
+    student.policy = run.policy
+    student.folder.mkdir(exist_ok=True)
+    loop.train(command.student(student), resume=True)
+    run.policy, run.config = student.policy, made
+    return judge(run, 0)
+
+
+def _steps(run: Run) -> tuple[int, ...]:
+    """Return the numbers of flow steps with which a policy is judged."""
+    distilled = isinstance(run.config, DistillFlowConfig)
+    return (run.config.evaluation.denoise_steps,) if distilled else STEPS
 
 
 def measure(run: Run, episodes: Demonstrations, _: Policy | None) -> dict[str, Any]:
@@ -56,7 +87,7 @@ def measure(run: Run, episodes: Demonstrations, _: Policy | None) -> dict[str, A
         source: Any = AllTasks({task: group})
         raw = held_out.windows(source, range(len(source)), run.policy, limit=_WINDOWS).raw
         scale = np.asarray(raw.actions[:, :_EXECUTED]).std((0, 1))
-        for steps in STEPS:
+        for steps in _steps(run):
             over_noise = np.asarray(_spread(policy, raw, steps))
             found[f"{steps}/{task}"] = float((over_noise / np.maximum(scale, 1e-6)).mean())
     return {"spread": found}

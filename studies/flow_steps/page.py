@@ -21,6 +21,12 @@ POLICIES = {
     "noisy": "LoRA-SP, times near noise",
     "rtc": "LoRA-SP, 4 control steps late",
 }
+DISTILLED = {
+    "distilled_1": ("LoRA-SP, distilled to n = 1", 1),
+    "distilled_2": ("LoRA-SP, distilled to n = 2", 2),
+    "snapflow": ("LoRA-SP, SnapFlow", 1),
+}
+"""Policies made from those of LoRA-SP, each judged with one number of steps."""
 STEPS = (1, 2, 3, 5, 10)
 """Euler steps."""
 TWO_WAYS = "two_baskets"
@@ -81,10 +87,20 @@ def _mean(
 
 def _table(results: Results, backbone: str, show: Any) -> str:
     """Return a table with a row per policy and kind of task, and a column per number of steps."""
+    policies = {policy: (label, STEPS) for policy, label in POLICIES.items()}
+    policies |= {
+        policy: (label, (n,))
+        for policy, (label, n) in DISTILLED.items()
+        if all(f"{backbone}/{policy}/s{seed}" in results for seed in SEEDS)
+    }
     rows = [
-        [label, title, *(show(results, backbone, policy, n, tasks) for n in STEPS)]
+        [
+            label,
+            title,
+            *(show(results, backbone, name, n, tasks) if n in judged else page.NONE for n in STEPS),
+        ]
         for title, tasks in (("four tasks", TASKS[:4]), ("two baskets", TASKS[4:]))
-        for policy, label in POLICIES.items()
+        for name, (label, judged) in policies.items()
     ]
     return page.table([BACKBONES[backbone], "tasks", *(f"n = {n}" for n in STEPS)], rows)
 

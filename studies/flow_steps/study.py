@@ -5,6 +5,7 @@
 
 Every policy learns the paper's four tasks, whose demonstrations have one way to act, and one task
 with two. It is then judged with each number of steps on the same layouts, from the same noise.
+Policies of LoRA-SP are also distilled to one or two steps, and judged with as many.
 """
 
 import functools
@@ -15,7 +16,7 @@ from lorasp_jax.config import Config, DataConfig, EvaluationConfig, ModelConfig,
 from lorasp_jax.extras.study import Cell, Study
 from lorasp_jax.peft import LoRA, LoRASP, Method
 from studies.flow_steps import page
-from studies.flow_steps.judge import judge, measure
+from studies.flow_steps.judge import judge, judge_distilled, measure
 
 POLICIES: dict[str, tuple[Method, dict[str, Any]]] = {
     "lora": (LoRA(rank=64), {}),
@@ -54,7 +55,7 @@ def get_study(scale: str) -> Study:
     cells = []
     for seed in seeds:
         for backbone in page.BACKBONES:
-            for name, (method, changes) in POLICIES.items():
+            for name, (method, changes, evaluate) in _policies().items():
                 made = replace(
                     config,
                     peft=method,
@@ -62,9 +63,20 @@ def get_study(scale: str) -> Study:
                     optim=replace(config.optim, **changes),
                     seed=seed,
                 )
-                delay = changes.get("rtc_max_delay", 0)
-                evaluate = functools.partial(judge, delay=delay)
                 group = f"{backbone}/{name}"
                 cells.append(Cell(f"{group}/s{seed}", made, (), group, evaluate=evaluate))
     made = {"measure": measure, "page": page.blocks, "partial": True}
     return Study("flow_steps", tuple(cells), **made)
+
+
+def _policies() -> dict[str, tuple[Method, dict[str, Any], Any]]:
+    """Return method, changed settings and judge by policy; all distilled ones begin as LoRA-SP."""
+    found = {
+        name: (*made, functools.partial(judge, delay=made[1].get("rtc_max_delay", 0)))
+        for name, made in POLICIES.items()
+    }
+    for name, (_, steps) in page.DISTILLED.items():
+        loss = "snapflow" if name == "snapflow" else "endpoint"
+        evaluate = functools.partial(judge_distilled, loss=loss, steps=steps)
+        found[name] = (*POLICIES["lora_sp"], evaluate)
+    return found

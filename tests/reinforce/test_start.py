@@ -8,24 +8,21 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from flax import nnx
 from rich.console import Console
 
-from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.cli.train import _resolved
 from lorasp_jax.config import ModelConfig
-from lorasp_jax.peft import LoRA, LoRASP
+from lorasp_jax.peft import LoRASP
 from lorasp_jax.reinforce import setting, start
 from lorasp_jax.reinforce.config import Learning, ReinforceConfig
-from lorasp_jax.training import export
 from lorasp_jax.training.export import load_policy
 from lorasp_jax.training.finished_run import recorded_config
 from lorasp_jax.training.overrides import parse
 from lorasp_jax.training.run_folder import read_json, to_json, write_json
 from tests import ROOT
 from tests.reinforce import rooms
-from tests.runs import CONFIG, RESULTS, leaves, make_run, write_description
+from tests.runs import CONFIG, RESULTS, finish_with_weights, leaves, write_description
 
 FILE = str(ROOT / "configs/reinforce.py")
 
@@ -33,26 +30,7 @@ FILE = str(ROOT / "configs/reinforce.py")
 @pytest.fixture(scope="module")
 def few(tmp_path_factory):
     """A finished run with plain LoRA, whose base is saved beside it."""
-    folder = tmp_path_factory.mktemp("runs")
-    base = folder / "base"
-    model = ModelConfig(size="dummy", checkpoint=str(base))
-    config = dataclasses.replace(CONFIG, peft=LoRA(rank=4), model=model, tasks=("press",))
-    run = make_run(folder / "few", config)
-    graphdef, adapters, frozen = adaptation.split(run.policy.model)
-    rng = np.random.default_rng(0)
-    adapters = jax.tree.map(lambda x: x + 0.03 * rng.normal(size=x.shape).astype("f"), adapters)
-    run.policy = dataclasses.replace(run.policy, model=nnx.merge(graphdef, adapters, frozen))
-    models.save(base, adaptation.merge(_without(run.policy.model)))
-    write_json(run.folder / "config.json", to_json(config))
-    write_json(run.folder / "results.json", RESULTS)
-    export.write(run)
-    return run.folder
-
-
-def _without(model):
-    """Return the base of an adapted model: adapters that add nothing merge to it."""
-    graphdef, adapters, frozen = adaptation.split(model)
-    return nnx.merge(graphdef, jax.tree.map(lambda x: 0 * x, adapters), frozen)
+    return finish_with_weights(tmp_path_factory.mktemp("runs") / "few")
 
 
 def resolve(*arguments) -> ReinforceConfig:

@@ -125,6 +125,7 @@ class SmolVLA(Backbone):
     """SmolVLA of any size."""
 
     config: SmolVLAConfig
+    flow_layers = "^action(_|/(?!.*cross_layer/[kv]_proj))"
 
     def __init__(self, config: SmolVLAConfig, *, rngs: nnx.Rngs) -> None:
         self.config = config

@@ -1,0 +1,58 @@
+"""Start from a finished run: what it decides, and the export of the later one."""
+
+import dataclasses
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from lorasp_jax.adapters.io import native
+from lorasp_jax.config import Config
+from lorasp_jax.training import export
+from lorasp_jax.training.export import BASE, describe
+from lorasp_jax.training.run import Run
+
+C = TypeVar("C", bound=Config)
+KEPT = ("model", "robot", "image_size", "scene", "control_dt", "data")
+"""Fields of the config that a start run decides."""
+ADAPTERS = ("peft", "targets", "adapt")
+"""Fields that it decides if its adapters are trained further."""
+
+
+def with_kept(
+    config: C, start: Path, recorded: Config, names: Sequence[str], given: Collection[str]
+) -> C:
+    """Return the config with the named fields of the start run's.
+
+    Args:
+        config: as parsed.
+        start: folder of the start run.
+        recorded: its config.
+        names: of the fields that it decides.
+        given: names of the fields that the user set.
+
+    Raises:
+        ValueError: a field that the start run decides was given, it trained its base, or it was
+            trained on several datasets that have statistics or cameras of their own.
+    """
+    for name in names:
+        values = getattr(config, name), getattr(recorded, name)
+        if name in {field.partition(".")[0] for field in given} and values[0] != values[1]:
+            what = f" ({values[1]})" if isinstance(values[1], str) else ""
+            raise ValueError(f"--{name.replace('_', '-')} is that of {start}{what}: drop it")
+    if (start / BASE).is_dir():
+        raise ValueError(f"{start} has no adapters, it trained its base: start from another run")
+    if len(found := export.datasets(describe(start))) > 1:
+        raise ValueError(
+            f"{start} has statistics or cameras for each of {', '.join(found)}: start from a run "
+            "with one dataset"
+        )
+    return dataclasses.replace(config, **{name: getattr(recorded, name) for name in names})
+
+
+def write(run: Run, start: Path, **changes: Any) -> None:
+    """Export a policy that started from a run's, as `export.write` does.
+
+    `changes` are entries that differ from those of the start run's adapter.json.
+    """
+    metadata = describe(start) | changes
+    native.save_adapters(run.folder, run.policy.model, base=run.base_hash, metadata=metadata)

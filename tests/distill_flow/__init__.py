@@ -1,0 +1,1 @@
+"""Tests of lorasp_jax.distill_flow."""
