@@ -97,7 +97,7 @@ def _found(start: Path, config: Config, folder: Path, progress: Progress) -> Dem
     return demonstrations(config, start if (start / "cache").is_dir() else folder, progress)
 
 
-class PolicyExport(Callback):
+class DistilledExport(Callback):
     """Exports the policy, as `train.py` does: `load_policy` loads it."""
 
     def on_end(self, run: Run) -> None:
@@ -112,7 +112,7 @@ def run(
     """Distill a start run, evaluate before and after, export the policy, write the report."""
     distilled = prepare(config, folder, console, started)
     judge = Evaluation() if distilled.simulated else NoEvaluation()
-    callbacks = [Validation(), PolicyExport(), judge, Report()]
+    callbacks = [Validation(), DistilledExport(), judge, Report()]
     loop.train(distilled, callbacks, resume=resume)
     report = folder / "report.html"
     console.print(f"finished in {distilled.seconds['total']:.0f} s: {report}", markup=False)

@@ -57,8 +57,8 @@ class Teacher:
         return cls(network, _optimizer().init(network.layers), jnp.ones(()), jnp.zeros(()))
 
 
-class Calls(NamedTuple):
-    """N calls of a teacher.
+class Practice(NamedTuple):
+    """N calls of a teacher that practises.
 
     Attributes:
         state: `[N, D]` full state.
@@ -137,7 +137,7 @@ def practise(
     spread, processor = noise.Spread.of(learning), policy.processor.shared()
     length = teacher.network.layers[-1][1].shape[0]
 
-    def act(key: jax.Array, worlds: Worlds) -> tuple[jax.Array, Calls]:
+    def act(key: jax.Array, worlds: Worlds) -> tuple[jax.Array, Practice]:
         seen = rollout.full_state(env, worlds.state), env.proprio(worlds.state)
         return _act(teacher.network, key, *seen, spread, processor)
 
@@ -164,12 +164,12 @@ def _act(
     robot: jax.Array,
     spread: noise.Spread,
     processor: Processor,
-) -> tuple[jax.Array, Calls]:
+) -> tuple[jax.Array, Practice]:
     """Return actions `[W, S, J+1]` [rad, m], and the calls, for full states and the robot's."""
     mean, slots = network(state), noise.action_slots(processor)
     noisy = jnp.arange(len(state)) % _QUIET > 0
     explored = noise.explore(key, mean, spread, slots)
-    calls = Calls(state, mean, jnp.where(noisy[:, None, None], explored, mean), noisy)
+    calls = Practice(state, mean, jnp.where(noisy[:, None, None], explored, mean), noisy)
     return processor.decode(calls.actions, robot), calls
 
 

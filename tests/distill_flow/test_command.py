@@ -147,7 +147,7 @@ def test_the_distilled_policy_is_exported_with_its_steps(finished, tmp_path, mon
     run = command.prepare(config, made.folder, made.console, 0.0)
     old = leaves(adaptation.split(load_policy(finished).model)[1])
     assert all((x == old[name]).all() for name, x in leaves(run.split()[1]).items())
-    command.PolicyExport().on_end(run)
+    command.DistilledExport().on_end(run)
     write_json(made.folder / "config.json", to_json(config))
     assert export.denoise_steps(made.folder) == 2
     again = leaves(adaptation.split(load_policy(made.folder).model)[1])
