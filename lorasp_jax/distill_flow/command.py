@@ -8,6 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.io import native
 from lorasp_jax.config import Config
 from lorasp_jax.distill_flow import objectives
 from lorasp_jax.distill_flow.config import DistillFlowConfig
@@ -87,6 +88,7 @@ def prepare(config: DistillFlowConfig, folder: Path, console: Console, started: 
     instructions = run.policy.processor.prompts.instructions
     del run.policy  # the device may not hold two
     run.policy = load_policy(start)
+    run.base_hash = native.read_description(start)["base"]
     if instructions != run.policy.processor.prompts.instructions:
         raise ValueError(f"the instructions of the data are not those that {start} has learned")
     return student(run)

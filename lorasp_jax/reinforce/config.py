@@ -25,7 +25,7 @@ class Learning:
     method: Literal["teacher", "ppo"] = "teacher"
     """Who learns from success: a small policy on the simulator's state, or the adapters."""
     worlds: int = 64
-    """Parallel worlds per task, one episode each in every iteration."""
+    """Parallel worlds per task, each for one time limit in every iteration."""
     std: float = 0.1
     """Standard deviation of exploration [normalized action units]."""
     correlation: float = 0.9
@@ -42,7 +42,8 @@ class Learning:
     """Passes over the chunks of an iteration."""
     max_kl: float = 0.1
     """A step that brings the mean KL divergence per action from the policy that acted above this
-    is the last of its iteration. The learning rate adapts to end iterations near it."""
+    is the last of its iteration, or of a teacher's round. The learning rate adapts to end near
+    it."""
     max_start_kl: float = 100.0
     """The run stops when the mean KL divergence per executed action from the start policy exceeds
     this. An offset by 1.1 of the 7 slots of 5 actions is 102 with the default noise."""
@@ -51,9 +52,9 @@ class Learning:
     teacher_worlds: int = 256
     """Parallel worlds in which a teacher practises; they need no pictures."""
     teacher_learning_rate: float = 1e-4
-    """Learning rate of a teacher; it adapts like that of the policy."""
+    """Learning rate of a teacher; it adapts to max_kl."""
     rounds: int = 5
-    """Episodes per world in which a teacher practises before the policy imitates it again."""
+    """Time limits in which a teacher practises before the policy imitates it again."""
     gradient_steps: int = 100
     """Gradient steps in which the policy imitates its teachers in an iteration."""
     minutes: float = 0.0
@@ -61,7 +62,7 @@ class Learning:
 
     def __post_init__(self) -> None:
         fields.check_fields(self)
-        for name in ("worlds", "epochs", "teacher_worlds", "rounds", "gradient_steps"):
+        for name in ("worlds", "epochs", "rounds", "gradient_steps"):
             if getattr(self, name) < 1:
                 raise ValueError(f"online.{name} must be at least 1, got {getattr(self, name)}")
         rates = "critic_learning_rate", "teacher_learning_rate"
@@ -71,6 +72,8 @@ class Learning:
         for name in ("discount", "trace"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"online.{name} must lie in (0, 1], got {getattr(self, name)}")
+        if self.teacher_worlds < 8:  # a quarter of them measures success
+            raise ValueError(f"online.teacher_worlds must be at least 8, got {self.teacher_worlds}")
         if not 0 <= self.correlation < 1:
             raise ValueError(f"online.correlation must lie in [0, 1), got {self.correlation}")
         if self.minutes < 0:

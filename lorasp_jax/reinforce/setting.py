@@ -38,7 +38,7 @@ class Setting(NamedTuple):
         start: the adapters at the start, from which the KL divergence is measured.
         policy: from adapters to the policy.
         shardings: of the state.
-        imitate: the program of `student`, which needs teachers.
+        imitate: the program of `student`, for the method teacher.
         gyms: by task, the worlds in which teachers practise.
     """
 
@@ -88,7 +88,7 @@ def prepare(run: Run) -> tuple[Setting, Learner, Any]:
         gyms = {task: environment(config, task, learning.teacher_worlds) for task in config.tasks}
     check_memory(config, environments)
     mesh = meshes.make_mesh(config.fsdp, run.devices)
-    for name in ("worlds", "teacher_worlds"):
+    for name in ("worlds", "teacher_worlds") if gyms else ("worlds",):
         if (count := getattr(learning, name)) % mesh.size:
             devices = f"the number of devices ({mesh.size})"
             raise ValueError(f"online.{name} must be a multiple of {devices}, got {count}")
@@ -120,7 +120,11 @@ def prepare(run: Run) -> tuple[Setting, Learner, Any]:
 
 
 def _optim(config: ReinforceConfig) -> OptimConfig:
-    """Return settings without a warm-up; imitation decays its rate, that of PPO follows the KL."""
+    """Return settings without a warm-up.
+
+    The rate of PPO follows the KL divergence, that of imitation decays over as many gradient steps
+    as the run may take.
+    """
     optim, steps = config.optim, config.optim.steps * config.online.gradient_steps
     if config.online.method == "ppo":
         return dataclasses.replace(optim, final_learning_rate=optim.learning_rate, warmup_steps=0)
@@ -142,10 +146,12 @@ def environment(config: ReinforceConfig, task: str, worlds: int) -> Env:
 
 def check_memory(config: ReinforceConfig, environments: Mapping[str, Env]) -> None:
     """Raise ValueError if the pictures of an iteration exceed the memory of the devices."""
-    calls = sum(-(-x.max_steps // config.evaluation.execute_steps) for x in environments.values())
+    calls = [-(-x.max_steps // config.evaluation.execute_steps) for x in environments.values()]
+    held = 2 * sum(calls)  # those of the calls, and joined
+    if config.online.method == "teacher":  # which clones one task after another
+        held = max(held, sum(calls) + 2 * max(calls))
     pictures = len(Env.cameras) * config.image_size**2 * 3
-    copies = 2  # those of the calls, and joined
-    needed = copies * calls * config.online.worlds * pictures / jax.local_device_count()
+    needed = held * config.online.worlds * pictures / jax.local_device_count()
     if needed > (available := preflight.available_bytes()):
         raise ValueError(
             f"the pictures of {config.online.worlds} worlds (online.worlds) take "

@@ -21,10 +21,16 @@ from lorasp_jax.training.export import describe, load_policy
 from lorasp_jax.training.finished_run import recorded_config
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Callback, Run
+from lorasp_jax.training.run_folder import CONFIG_FILE, read_json
 from lorasp_jax.training.start import ADAPTERS, KEPT, with_kept
 
 _ACTING = ("execute_steps", "denoise_steps")
 """Fields of its evaluation that it decides unless they are given: how the policy acts."""
+_OTHERS = {
+    "teacher": ("epochs",),
+    "ppo": ("teacher_worlds", "teacher_learning_rate", "rounds", "gradient_steps"),
+}
+"""Method -> settings of another one."""
 MERGED = "merged"
 """Folder of a base with the adapters of the start run merged into it."""
 
@@ -41,10 +47,15 @@ def resolve(config: ReinforceConfig, given: Collection[str]) -> ReinforceConfig:
             it decides was given; it trained its base; several datasets have statistics or
             cameras of their own; or its adapters cannot be merged into its base.
     """
+    unused = _OTHERS[config.online.method]
+    if wrong := [name for name in unused if f"online.{name}" in given]:
+        raise ValueError(f"online.{wrong[0]} is not for {config.online.method}: drop it")
     if not config.online.start:
         return config
     start = Path(config.online.start)
     recorded = recorded_config(start)
+    if "distill" in read_json(start / CONFIG_FILE):
+        raise ValueError(f"{start} is distilled, which learning would undo: learn, then distill")
     kept = (*KEPT, *(ADAPTERS if config.online.adapters == "continue" else ()))
     completed = with_kept(config, start, recorded, kept, given)
     tasks = config.tasks if "tasks" in given else recorded.tasks

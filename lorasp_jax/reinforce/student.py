@@ -1,12 +1,12 @@
 """The policy imitates its teachers on the states that it reaches itself (DAgger, arXiv 1011.0686).
 
-Its loss is that of imitation, flow matching, on the actions that it would execute. The rest of a
-chunk, which nobody has judged, stays as it is.
+Its loss is that of imitation, flow matching, on the actions that it executes. The rest of a chunk,
+which nobody has judged, does not count.
 """
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,27 +30,19 @@ Imitate = Callable[..., tuple[Learner, Metrics]]
 """(state, frozen, lessons, index `[steps, B]`, key) -> state and metrics of all steps."""
 
 
-class Lessons(NamedTuple):
-    """N policy calls, whose actions are those that the policy should have chosen.
+def lessons(found: Experience, teacher: Teacher | None, processor: Processor) -> Chunks:
+    """Return what a policy should have done in episodes without noise.
 
-    Attributes:
-        valid: `[N]` bool, whether the episode ran.
+    Without a teacher, that is what it did.
     """
-
-    chunks: Chunks
-    valid: jax.Array
-
-
-def lessons(found: Experience, teacher: Teacher | None, processor: Processor) -> Lessons:
-    """Say what a policy should have done in episodes without noise; without a teacher, the same."""
-    chunks, valid = found.chunks, found.at_calls(~found.steps.done)
-    if teacher is not None:
-        better = teacher.network(found.at_calls(found.steps.state))
-        length, slots = better.shape[1], noise.action_slots(processor)
-        own = chunks.actions[:, :length]
-        actions = chunks.actions.at[:, :length].set(jnp.where(slots, better, own))
-        chunks = chunks._replace(actions=actions)
-    return Lessons(chunks, valid)
+    chunks = found.chunks
+    if teacher is None:
+        return chunks
+    better = teacher.network(found.at_calls(found.steps.state))
+    length, slots = better.shape[1], noise.action_slots(processor)
+    own = chunks.actions[:, :length]
+    actions = chunks.actions.at[:, :length].set(jnp.where(slots, better, own))
+    return chunks._replace(actions=actions)
 
 
 def make_program(
@@ -60,7 +52,7 @@ def make_program(
     shardings: Learner,
 ) -> Imitate:
     """Return the jitted scan over gradient steps; `shardings` are those of the state."""
-    mesh, executed = shardings.step.mesh, config.evaluation.execute_steps
+    mesh = shardings.step.mesh
     weights = {name: getattr(config.auxiliary, name) for name in AUXILIARY_WEIGHTS}
     options = {
         "graphdef": graphdef,
@@ -70,21 +62,20 @@ def make_program(
     }
 
     def body(
-        state: TrainState, rows: tuple[jax.Array, jax.Array], frozen: Frozen, given: Lessons
+        state: TrainState, rows: tuple[jax.Array, jax.Array], frozen: Frozen, given: Chunks
     ) -> tuple[TrainState, Metrics]:
         index, key = rows
-        rows = jax.tree.map(lambda x: x[index], given)
-        rows = jax.lax.with_sharding_constraint(rows, meshes.batch_sharding(mesh))
-        chunks, slots = rows.chunks, noise.action_slots(frozen.processor)
-        judged = (np.arange(chunks.actions.shape[1]) < executed)[:, None] & slots
-        mask = jnp.broadcast_to(judged, chunks.actions.shape)
-        batch = Batch(
-            frozen.processor.encode(chunks.observation, chunks.prompts), chunks.actions, mask
-        )
+        chunks = jax.tree.map(lambda x: x[index], given)
+        chunks = jax.lax.with_sharding_constraint(chunks, meshes.batch_sharding(mesh))
+        executed = np.arange(chunks.actions.shape[1]) < config.evaluation.execute_steps
+        mask = executed[:, None] & frozen.processor.flow_slots
+        mask = jnp.broadcast_to(mask, chunks.actions.shape)
+        observation = frozen.processor.encode(chunks.observation, chunks.prompts)
+        batch = Batch(observation, chunks.actions, mask)
         return train_step(state, frozen.parameters, batch, key, **options)
 
     def imitate(
-        state: Learner, frozen: Frozen, given: Lessons, index: jax.Array, key: jax.Array
+        state: Learner, frozen: Frozen, given: Chunks, index: jax.Array, key: jax.Array
     ) -> tuple[Learner, Metrics]:
         first = TrainState(state.step, state.adapters, state.opt_state, state.guard)
         rows = index, jax.random.split(key, len(index))
@@ -100,9 +91,8 @@ def make_program(
     )
 
 
-def order(valid: np.ndarray, steps: int, size: int, key: jax.Array) -> np.ndarray:
-    """Return the rows of minibatches `[steps, size]`: all valid ones in turn, in random orders."""
-    rng, rows = np.random.default_rng(np.asarray(jax.random.key_data(key))), np.flatnonzero(valid)
-    passes = -(-steps * size // len(rows))
-    orders = np.concatenate([rng.permutation(rows) for _ in range(passes)])
-    return orders[: steps * size].reshape(steps, size)
+def order(count: int, steps: int, size: int, key: jax.Array) -> np.ndarray:
+    """Return the rows of minibatches `[steps, size]`: all rows in turn, in random orders."""
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    orders = [rng.permutation(count) for _ in range(-(-steps * size // count))]
+    return np.concatenate(orders)[: steps * size].reshape(steps, size)

@@ -27,9 +27,12 @@ from lorasp_jax.reinforce.critic import Critic
 from lorasp_jax.reinforce.network import Network, moments
 from lorasp_jax.reinforce.rollout import Experience
 from lorasp_jax.reinforce.surrogate import Samples, adapted, clipped_surrogate
+from lorasp_jax.training.random_streams import RandomStream
 
 _WIDTHS, _EPOCHS, _BATCH = (256, 256, 256), 8, 2048  # our choice, like the next ones
 _CLONE_STEPS, _CLONE_BATCH, _CLONE_RATE = 3000, 512, 1e-3
+ENOUGH = 0.98
+"""A teacher that succeeds as often does not change any more."""
 _QUIET = 4
 """One of so many worlds gets no noise: its success is the teacher's."""
 
@@ -42,7 +45,7 @@ class Teacher:
     Attributes:
         network: from full states to normalized actions `[S, A]`.
         rate: `[]` factor of the learning rate, which follows the KL divergence of the rounds.
-        success: `[]`, the latest rate without noise.
+        success: `[]` rate without noise in its latest round, before it learned from it.
     """
 
     network: Network
@@ -79,7 +82,7 @@ def _optimizer() -> optax.GradientTransformation:
 
 @functools.partial(jax.jit, static_argnums=4)
 def clone(
-    teacher: Teacher, state: jax.Array, actions: jax.Array, valid: jax.Array, slots: Any
+    teacher: Teacher, state: jax.Array, actions: jax.Array, key: jax.Array, slots: Any
 ) -> Teacher:
     """Return a teacher that acts like the policy.
 
@@ -87,16 +90,16 @@ def clone(
         teacher: a new one.
         state: `[N, D]` full states before the policy's calls.
         actions: `[N, S, A]` its normalized actions, which may have noise.
-        valid: `[N]` bool, the calls to learn from.
+        key: orders the calls.
         slots: numbers of the executed slots.
     """
-    mean, std = moments(state, valid)
+    mean, std = moments(state, jnp.ones(len(state), bool))
     network = dataclasses.replace(teacher.network, mean=mean, std=std)
     optimizer = optax.adam(optax.cosine_decay_schedule(_CLONE_RATE, _CLONE_STEPS))
 
     def step(carry: Any, key: jax.Array) -> tuple[Any, None]:
         layers, opt_state = carry
-        rows = jax.random.choice(key, len(state), (_CLONE_BATCH,), p=valid / jnp.sum(valid))
+        rows = jax.random.randint(key, (_CLONE_BATCH,), 0, len(state))
 
         def loss(layers: Any) -> jax.Array:
             error = dataclasses.replace(network, layers=layers)(state[rows]) - actions[rows]
@@ -106,7 +109,7 @@ def clone(
         return (optax.apply_updates(layers, updates), opt_state), None
 
     first = network.layers, optimizer.init(network.layers)
-    keys = jax.random.split(jax.random.key(0), _CLONE_STEPS)
+    keys = jax.random.split(key, _CLONE_STEPS)
     layers = jax.lax.scan(step, first, keys)[0][0]
     return dataclasses.replace(teacher, network=dataclasses.replace(network, layers=layers))
 
@@ -139,19 +142,21 @@ def practise(
 
     def act(key: jax.Array, worlds: Worlds) -> tuple[jax.Array, Practice]:
         seen = rollout.full_state(env, worlds.state), env.proprio(worlds.state)
-        return _act(teacher.network, key, *seen, spread, processor)
+        own = jax.random.split(key, 3)[1]  # restarts have the last one
+        return _act(teacher.network, own, *seen, spread, processor)
 
     found = rollout.play(env, policy, act, key, execute_steps=length, ranges=ranges)
     new = jnp.all(critic.network.std == 0)
-    own, other = jax.random.split(jax.random.fold_in(key, 1))
+    own, other = jax.random.split(jax.random.fold_in(key, RandomStream.CRITIC))
     advantages, critic, metrics = critics.jitted_learn(
         critic, found.steps, found.last, own, learning
     )
     slots = tuple(noise.action_slots(policy.processor).tolist())
-    improved = _improve(teacher, found, advantages, other, learning, slots)
-    teacher = jax.tree.map(lambda x, y: jnp.where(new, x, y), teacher, improved)
     quiet = ~found.chunks.noisy[: len(found.success)]
     success = jnp.mean(found.success, where=quiet)
+    improved = _improve(teacher, found, advantages, other, learning, slots)
+    keep = new | (success >= ENOUGH)  # then what was measured does not change
+    teacher = jax.tree.map(lambda x, y: jnp.where(keep, x, y), teacher, improved)
     metrics |= {"steps": jnp.sum(~found.steps.done)}
     return dataclasses.replace(teacher, success=success), critic, metrics
 

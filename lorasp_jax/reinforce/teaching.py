@@ -16,9 +16,6 @@ from lorasp_jax.reinforce.setting import Setting
 from lorasp_jax.reinforce.teacher import Teacher
 from lorasp_jax.training.random_streams import RandomStream
 
-_ENOUGH = 0.98
-"""A teacher that succeeds as often practises no more; our choice."""
-
 
 def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]]:
     """Practise and imitate once; return the state and the metrics, with the environment `steps`.
@@ -34,12 +31,14 @@ def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]
         key = jax.random.fold_in(RandomStream.ROLLOUTS.key(config.seed, task), step)
         seen = _collect(setting, task, policy, key, 0.0)
         rate = float(jnp.mean(seen.success))
+        values["steps"] += _steps(seen)
         if not step:
-            taught[task] = _clone(setting, task, policy, key, seen, taught[task])
+            taught[task], steps = _clone(setting, task, policy, key, seen, taught[task])
+            values["steps"] += steps
         taught[task], critics[task], metrics = _practise(
             setting, task, policy, key, taught[task], critics[task]
         )
-        values["steps"] += metrics.pop("steps", 0.0) + float(jnp.sum(~seen.steps.done))
+        values["steps"] += metrics.pop("steps")
         values |= {f"{name}/{task}": x for name, x in metrics.items()}
         success = float(taught[task].success)
         values |= {f"rollout/{task}": rate, f"teacher/{task}": success}
@@ -47,15 +46,16 @@ def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]
         better |= leads
         given.append(student.lessons(seen, taught[task] if leads else None, policy.processor))
     lessons = jax.tree.map(lambda *x: jnp.concatenate(x), *given)
-    valid, rows = np.asarray(lessons.valid), {}
+    state = dataclasses.replace(state, critics=critics, teachers=taught)
+    state, rows = jax.device_put(state, setting.shardings), {}
     if better:
         key = jax.random.fold_in(RandomStream.TRAINING.key(config.seed), step)
-        steps = config.online.gradient_steps
-        index = student.order(valid, steps, config.optim.batch_size, key)
+        size, count = config.optim.batch_size, len(lessons.prompts)
+        index = student.order(count, config.online.gradient_steps, size, key)
         state, metrics = setting.imitate(state, setting.frozen, lessons, index, key)
         rows = jax.device_get(metrics)
-    values |= setting.summary(state, lessons.chunks, valid, rows)
-    state = dataclasses.replace(state, step=state.step + 1, critics=critics, teachers=taught)
+    values |= setting.summary(state, lessons, np.ones(len(lessons.prompts), bool), rows)
+    state = dataclasses.replace(state, step=state.step + 1)
     return jax.device_put(state, setting.shardings), values
 
 
@@ -79,18 +79,25 @@ def _collect(setting: Setting, task: str, policy: Policy, key: jax.Array, std: f
 
 def _clone(
     setting: Setting, task: str, policy: Policy, key: jax.Array, seen: Experience, new: Teacher
-) -> Teacher:
-    """Clone the policy from what was seen, and from as many episodes with noise."""
-    noisy = _collect(setting, task, policy, jax.random.fold_in(key, 1), setting.config.online.std)
+) -> tuple[Teacher, float]:
+    """Clone the policy from what was seen, and from as many episodes with noise; count these."""
+    key = jax.random.fold_in(key, RandomStream.TEACHER)
+    noisy = _collect(setting, task, policy, key, setting.config.online.std)
     length = setting.config.evaluation.execute_steps
-    state, actions, valid = jax.tree.map(
-        lambda *x: jnp.concatenate(x),
-        *(
-            (x.at_calls(x.steps.state), x.chunks.actions[:, :length], x.at_calls(~x.steps.done))
-            for x in (seen, noisy)
-        ),
+    state, actions = (
+        jnp.concatenate(x)
+        for x in zip(
+            *((x.at_calls(x.steps.state), x.chunks.actions[:, :length]) for x in (seen, noisy)),
+            strict=True,
+        )
     )
-    return teachers.clone(new, state, actions, valid, policy.processor.action_slots)
+    own, slots = jax.random.fold_in(key, RandomStream.TRAINING), policy.processor.action_slots
+    return teachers.clone(new, state, actions, own, slots), _steps(noisy)
+
+
+def _steps(found: Experience) -> float:
+    """Return the number of environment steps."""
+    return float(jnp.sum(~found.steps.done))
 
 
 def _practise(
@@ -99,9 +106,9 @@ def _practise(
     """Let a teacher practise for some rounds; return metrics of the last, with all `steps`."""
     config, values, steps = setting.config, {}, 0.0
     for number in range(config.online.rounds):
-        if teacher.success >= _ENOUGH:
+        if number and teacher.success >= teachers.ENOUGH:
             break
-        own = jax.random.fold_in(key, 2 + number)
+        own = jax.random.fold_in(jax.random.fold_in(key, RandomStream.RECORDING), number)
         where = setting.gyms[task], policy, own, config.online, config.ranges
         teacher, critic, metrics = teachers.practise(teacher, critic, *where)
         values = {"explained_variance": float(metrics["explained_variance"])}

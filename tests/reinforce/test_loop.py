@@ -107,6 +107,20 @@ def test_a_policy_learns_from_success_alone(tmp_path, monkeypatch, method, steps
     assert np.mean(rates[-2:]) > goal
 
 
+def test_teachers_that_are_good_enough_go_on_teaching(tmp_path, leading, monkeypatch):
+    monkeypatch.setattr(teacher, "ENOUGH", 0.0)
+    learn = dataclasses.replace(rooms.config().online, method="teacher")
+    run = train(tmp_path, online=learn)
+    assert [row["updates"] for row in read_metrics(run.folder)] == [4] * 4
+
+
+def test_success_of_a_teacher_is_enough_to_go_on():
+    config, clock = rooms.config(online=Learning(worlds=64)), loop._Clock.__new__(loop._Clock)
+    clock._first = {"rollout/press": 0.0}
+    assert not clock.collapse(config, {"rollout/press": 0.0, "teacher/press": 0.1})
+    assert "no episode succeeded" in clock.collapse(config, {"rollout/press": 0.0})
+
+
 class Judge(Callback):
     """Evaluates as told."""
 

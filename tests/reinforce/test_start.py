@@ -69,6 +69,9 @@ def test_a_run_is_recorded_and_read_again(few, tmp_path):
         (["--tasks", "pour"], "few has learned press, not pour"),
         (["--online.std", 0], "online.std must be above 0, got 0.0"),
         (["--online.worlds", 0], "online.worlds must be at least 1, got 0"),
+        (["--online.teacher-worlds", 4], "online.teacher_worlds must be at least 8, got 4"),
+        (["--online.epochs", 2], "online.epochs is not for teacher: drop it"),
+        (["--online.method", "ppo", "--online.rounds", 2], "online.rounds is not for ppo: drop it"),
         (
             ["--online.method", "ppo", "--optim.steps", 1],
             "optim.steps must be at least 2, got 1: the first iteration",
