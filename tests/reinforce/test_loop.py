@@ -224,9 +224,9 @@ def test_the_divergence_from_the_start_is_that_of_all_valid_chunks(tmp_path):
 
 @pytest.mark.parametrize("name", ["worlds", "teacher_worlds"])
 def test_devices_must_divide_the_worlds(tmp_path, name):
-    learn = dataclasses.replace(rooms.config().online, **{name: 6})
+    learn = dataclasses.replace(rooms.config().online, method="teacher", **{name: 10})
     run = rooms.start(tmp_path, rooms.config(online=learn), 4)
-    expected = rf"online.{name} must be a multiple of the number of devices \(4\), got 6"
+    expected = rf"online.{name} must be a multiple of the number of devices \(4\), got 10"
     with pytest.raises(ValueError, match=expected):
         setting.prepare(run)
 
