@@ -12,6 +12,7 @@ from flax import nnx
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import AuxiliaryConfig
 from lorasp_jax.dense import AdapterParam
+from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.reinforce import noise, update
 from lorasp_jax.reinforce.config import Learning
@@ -39,6 +40,8 @@ def settings(size=32, epochs=4, **changes):
 class Bandit(nnx.Module):
     """A flow whose chunk is a parameter, whatever it sees."""
 
+    run_flow = Backbone.run_flow
+
     def __init__(self):
         self.config = Pi0Config.dummy()
         self.chunk = AdapterParam(jnp.zeros((self.config.chunk, self.config.action_dim)))
@@ -46,7 +49,7 @@ class Bandit(nnx.Module):
     def run_prefix(self, obs):
         return None, {}
 
-    def run_suffix(self, prefix, obs, x_t, flow_time):
+    def run_suffix(self, prefix, obs, x_t, flow_time, action_valid=None):
         return (x_t - self.chunk) / flow_time[:, None, None], {}
 
 
