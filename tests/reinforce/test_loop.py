@@ -94,17 +94,14 @@ def test_several_devices_learn_the_same(whole, leading, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("method", "steps", "goal"), [("ppo", 20, 0.4), ("teacher", 10, 0.9)])
-def test_a_policy_learns_from_success_alone(tmp_path, monkeypatch, method, steps, goal):
+def test_a_policy_learns_from_success_alone(tmp_path, monkeypatch):
     room = rooms.Room(num_envs=64, goal=0.15)
     monkeypatch.setattr(setting, "environment", lambda *_: room)
-    learn = Learning(method=method, worlds=64, teacher_worlds=64, max_kl=0.2, max_start_kl=1e9)
-    learn = dataclasses.replace(learn, std=0.3, gradient_steps=50)
-    optim = OptimConfig(steps=steps, batch_size=32, learning_rate=3e-3)
-    train(tmp_path, online=learn, optim=optim)
+    learn = Learning(method="ppo", worlds=64, std=0.3, max_kl=0.2, max_start_kl=1e9)
+    train(tmp_path, online=learn, optim=OptimConfig(steps=20, batch_size=32, learning_rate=3e-3))
     rates = [row["rollout/press"] for row in read_metrics(tmp_path)]
     assert np.mean(rates[:2]) < 0.2
-    assert np.mean(rates[-2:]) > goal
+    assert np.mean(rates[-2:]) > 0.4
 
 
 def test_teachers_that_are_good_enough_go_on_teaching(tmp_path, leading, monkeypatch):
