@@ -194,7 +194,7 @@ def _improve(
     samples = Samples(calls.actions, by_call(advantages), valid, calls.mean)
     size = min(_BATCH, len(calls.state))
 
-    def step(carry: Any, index: jax.Array) -> tuple[Any, jax.Array]:
+    def step(carry: Any, index: jax.Array) -> tuple[Any, None]:
         layers, opt_state, within, kl = carry
         state, rows = jax.tree.map(lambda x: x[index], (calls.state, samples))
 
@@ -209,7 +209,7 @@ def _improve(
         rate = -learning.teacher_learning_rate * teacher.rate
         moved = optax.apply_updates(layers, jax.tree.map(lambda x: rate * x, updates))
         new, old = (moved, after), (layers, opt_state)
-        return (*jax.tree.map(lambda x, y: jnp.where(within, x, y), new, old), within, kl), kl
+        return (*jax.tree.map(lambda x, y: jnp.where(within, x, y), new, old), within, kl), None
 
     orders = [jax.random.permutation(k, len(calls.state)) for k in jax.random.split(key, _EPOCHS)]
     batches = jnp.concatenate([x[: len(x) // size * size].reshape(-1, size) for x in orders])
