@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lorasp_jax.reinforce import critic, noise, rollout, update
+from lorasp_jax.reinforce import critic, rollout, update
 from lorasp_jax.reinforce.learner import Learner
 from lorasp_jax.reinforce.rollout import Experience
 from lorasp_jax.reinforce.setting import Setting
@@ -20,17 +20,9 @@ def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]
     execute = config.evaluation.execute_steps
     policy = setting.policy(state.adapters).with_sampler()
     batches, critics, values = [], {}, {"steps": 0.0}
-    for task, env in setting.environments.items():
+    for task in setting.environments:
         key = jax.random.fold_in(RandomStream.ROLLOUTS.key(config.seed, task), step)
-        found = rollout.collect(
-            env,
-            policy,
-            key,
-            noise.Spread.of(config.online),
-            execute_steps=execute,
-            denoise_steps=config.evaluation.denoise_steps,
-            ranges=config.ranges,
-        )
+        found = setting.collect(task, policy, key)
         own = jax.random.fold_in(key, RandomStream.CRITIC)  # the rollout has split the key
         inputs = state.critics[task], found.steps, found.last, own, config.online
         advantages, critics[task], metrics = critic.jitted_learn(*inputs)
@@ -55,11 +47,10 @@ def _batch(
     found: Experience, advantages: jax.Array, valid: jax.Array, execute_steps: int
 ) -> WeightedChunks:
     """Arrange steps `[calls x S, W]` as chunks `[calls x W, C]`; the rest is invalid."""
-    worlds, rest = advantages.shape[1], found.chunks.actions.shape[1] - execute_steps
+    rest = found.chunks.actions.shape[1] - execute_steps
 
     def arrange(x: jax.Array) -> jax.Array:
-        rows = jnp.moveaxis(x.reshape(-1, execute_steps, worlds), 1, 2).reshape(-1, execute_steps)
-        return jnp.pad(rows, ((0, 0), (0, rest)))
+        return jnp.pad(rollout.by_call(x, execute_steps), ((0, 0), (0, rest)))
 
     means = jnp.zeros_like(found.chunks.actions)
     return WeightedChunks(found.chunks, arrange(advantages), arrange(valid), means)

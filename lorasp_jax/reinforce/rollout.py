@@ -209,3 +209,8 @@ def full_state(env: Env, state: State) -> jax.Array:
     """Return `[W, D]`, as in `Transitions`."""
     elapsed = state.info["steps"] / env.max_steps
     return jnp.concatenate([env.full_state(state), elapsed[:, None]], axis=1)
+
+
+def by_call(x: jax.Array, length: int) -> jax.Array:
+    """Arrange steps `[calls x S, W]` by call, `[calls x W, S]`."""
+    return jnp.moveaxis(x.reshape(-1, length, x.shape[1]), 1, 2).reshape(-1, length)

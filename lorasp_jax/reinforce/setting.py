@@ -15,11 +15,11 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import OptimConfig
 from lorasp_jax.peft import AdaLoRA
 from lorasp_jax.policies.policy import Policy
-from lorasp_jax.reinforce import noise, student, update
+from lorasp_jax.reinforce import noise, rollout, student, update
 from lorasp_jax.reinforce.config import ReinforceConfig
 from lorasp_jax.reinforce.critic import Critic
 from lorasp_jax.reinforce.learner import Learner
-from lorasp_jax.reinforce.rollout import Chunks
+from lorasp_jax.reinforce.rollout import Chunks, Experience
 from lorasp_jax.reinforce.teacher import Teacher
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.distributed import mesh as meshes
@@ -51,6 +51,21 @@ class Setting(NamedTuple):
     shardings: Learner
     imitate: student.Imitate
     gyms: Mapping[str, Env]
+
+    def collect(
+        self, task: str, policy: Policy, key: jax.Array, std: float | None = None
+    ) -> Experience:
+        """Let the policy act in a task; `std` overrides the standard deviation of its noise."""
+        spread = noise.Spread.of(self.config.online)
+        return rollout.collect(
+            self.environments[task],
+            policy,
+            key,
+            spread if std is None else spread._replace(std=std),
+            execute_steps=self.config.evaluation.execute_steps,
+            denoise_steps=self.config.evaluation.denoise_steps,
+            ranges=self.config.ranges,
+        )
 
     def summary(
         self, state: Learner, chunks: Chunks, valid: np.ndarray, rows: dict[str, np.ndarray]

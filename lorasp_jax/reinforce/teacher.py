@@ -189,7 +189,7 @@ def _improve(
 ) -> Teacher:
     """Take gradient steps on minibatches of calls until the teacher has changed enough."""
     calls, spread, network = found.chunks, noise.Spread.of(learning), teacher.network
-    by_call = lambda x: _by_call(x, calls.actions.shape[1])  # noqa: E731
+    by_call = lambda x: rollout.by_call(x, calls.actions.shape[1])  # noqa: E731
     valid = by_call(~found.steps.done) & calls.noisy[:, None]
     samples = Samples(calls.actions, by_call(advantages), valid, calls.mean)
     size = min(_BATCH, len(calls.state))
@@ -218,8 +218,3 @@ def _improve(
     network = dataclasses.replace(network, layers=layers)
     rate = adapted(teacher.rate, kl, learning.max_kl)
     return Teacher(network, opt_state, rate, teacher.success)
-
-
-def _by_call(x: jax.Array, length: int) -> jax.Array:
-    """Arrange steps `[calls x S, W]` by call, `[calls x W, S]`."""
-    return jnp.moveaxis(x.reshape(-1, length, x.shape[1]), 1, 2).reshape(-1, length)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lorasp_jax.policies.policy import Policy
-from lorasp_jax.reinforce import noise, rollout, student
+from lorasp_jax.reinforce import student
 from lorasp_jax.reinforce import teacher as teachers
 from lorasp_jax.reinforce.critic import Critic
 from lorasp_jax.reinforce.learner import Learner
@@ -29,7 +29,7 @@ def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]
     taught, critics = dict(state.teachers), dict(state.critics)
     for task in setting.environments:
         key = jax.random.fold_in(RandomStream.ROLLOUTS.key(config.seed, task), step)
-        seen = _collect(setting, task, policy, key, 0.0)
+        seen = setting.collect(task, policy, key, std=0.0)
         rate = float(jnp.mean(seen.success))
         values["steps"] += _steps(seen)
         if not step:
@@ -64,25 +64,12 @@ def _leads(teacher: float, policy: float) -> bool:
     return teacher > policy
 
 
-def _collect(setting: Setting, task: str, policy: Policy, key: jax.Array, std: float) -> Experience:
-    config = setting.config
-    return rollout.collect(
-        setting.environments[task],
-        policy,
-        key,
-        noise.Spread(std, config.online.correlation),
-        execute_steps=config.evaluation.execute_steps,
-        denoise_steps=config.evaluation.denoise_steps,
-        ranges=config.ranges,
-    )
-
-
 def _clone(
     setting: Setting, task: str, policy: Policy, key: jax.Array, seen: Experience, new: Teacher
 ) -> tuple[Teacher, float]:
     """Clone the policy from what was seen, and from as many episodes with noise; count these."""
     key = jax.random.fold_in(key, RandomStream.TEACHER)
-    noisy = _collect(setting, task, policy, key, setting.config.online.std)
+    noisy = setting.collect(task, policy, key)
     length = setting.config.evaluation.execute_steps
     state, actions = (
         jnp.concatenate(x)
