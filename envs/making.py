@@ -57,7 +57,7 @@ def make(
         reward: sparse (1 on success) or dense (shaped by progress), see `envs.rewards`.
         discount: the learner's discount in (0, 1], for the dense reward.
         distractors: number of unrelated objects on the table, up to 4.
-        backend: physics engine, jax or warp; None: the fastest available.
+        backend: physics engine, jax, warp or mujoco (on CPU); None: warp or jax, by device.
         renderer: rays (runs everywhere) or warp (MuJoCo Warp's, draws meshes and textures, too).
 
     Raises:

@@ -1,9 +1,10 @@
-"""Simulate physics with MJX in JAX or with MuJoCo Warp.
+"""Simulate physics with MJX in JAX, with MuJoCo Warp or with MuJoCo's C engine.
 
-Worlds are batched by `jax.vmap`. Between steps, both engines describe a world by the same `Data`.
+Worlds are batched by `jax.vmap`. Between steps, all engines describe a world by the same `Data`.
 """
 
 import contextlib
+import copy
 import dataclasses
 import functools
 import importlib.util
@@ -22,9 +23,10 @@ from envs.physics.kinematics import Kinematics
 from envs.scene.ranges import MAX_GROWTH
 from envs.state import MOVING, Changes, Data
 
-Backend = Literal["jax", "warp"]
+Backend = Literal["jax", "warp", "mujoco"]
 BACKENDS: tuple[str, ...] = get_args(Backend)
-"""jax runs everywhere; warp is much faster on NVIDIA GPUs, and runs on CPU, slowly, for tests."""
+"""jax runs everywhere; warp is much faster on NVIDIA GPUs, and runs on CPU, slowly, for tests;
+mujoco, the C engine, is much faster on CPU."""
 
 
 @functools.cache
@@ -69,11 +71,13 @@ class Physics:
         """Put a model on the device.
 
         Raises:
-            ValueError: the backend is unknown or not installed.
+            ValueError: the backend is unknown, not installed, or not for JAX's devices.
         """
         checks.choice("backend", backend, BACKENDS)
         if backend == "warp":
             require_warp("backend")
+        if backend == "mujoco" and jax.default_backend() != "cpu":
+            raise ValueError(f"backend 'mujoco' needs JAX on a CPU, not a {jax.default_backend()}")
         self.model: mujoco.MjModel = model
         self.backend: str = backend
         mjx = _mjx()
@@ -89,7 +93,11 @@ class Physics:
 
             # MJX-JAX sizes its arrays for the most contacts and constraints a world can have.
             most = {"contacts": max(data._impl.ncon, 1), "rows": data._impl.nefc}
-            self._simulate = WarpSteps(model, growth=MAX_GROWTH, **most)
+            self._simulate = WarpSteps(_with_larger_bounds(model), **most)
+        elif backend == "mujoco":
+            from envs.physics.c_engine import MujocoSteps
+
+            self._simulate = MujocoSteps(_with_larger_bounds(model))
 
     def start(self, changes: Changes, qpos: jax.Array) -> Data:
         """Return a world at rest at these joint positions."""
@@ -138,6 +146,15 @@ class Physics:
         with _full_precision():
             data = mjx.camlight(model, mjx.com_pos(model, self._kinematics(model, data)))
         return Data(**{field.name: getattr(data, field.name) for field in dataclasses.fields(Data)})
+
+
+def _with_larger_bounds(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Copy the model with bounding volumes for the largest geoms that a world may have."""
+    model = copy.copy(model)
+    bounded = model.geom_rbound > 0  # planes have none
+    model.geom_rbound[bounded] *= MAX_GROWTH
+    model.geom_aabb[bounded, 3:] *= MAX_GROWTH
+    return model
 
 
 def require_warp(option: str) -> None:

@@ -31,15 +31,14 @@ class WarpSteps:
     would become part of it.
     """
 
-    def __init__(self, model: mujoco.MjModel, *, contacts: int, rows: int, growth: float) -> None:
+    def __init__(self, model: mujoco.MjModel, *, contacts: int, rows: int) -> None:
         """Prepare a model.
 
         Args:
-            model: the scene, shared by all worlds.
+            model: the scene, shared by all worlds, whose bounding volumes suffice for each.
             contacts, rows: maximum number of contacts and of constraint rows per world.
-            growth: maximum factor by which a world may enlarge its geoms.
         """
-        self._mujoco = _with_larger_bounds(model, growth)
+        self._mujoco = model
         self._sizes = {"nconmax": int(contacts), "njmax": int(rows)}
         with wp.ScopedDevice(warp_call.device()):
             self._model = mujoco_warp.put_model(self._mujoco)
@@ -102,12 +101,3 @@ class WarpSteps:
             data = mujoco_warp.make_data(self._mujoco, nworld=num_worlds, **self._sizes)
             self._data[num_worlds] = data
         return self._data[num_worlds]
-
-
-def _with_larger_bounds(model: mujoco.MjModel, growth: float) -> mujoco.MjModel:
-    """Copy the model with bounding volumes scaled by `growth`."""
-    model = copy.copy(model)
-    bounded = model.geom_rbound > 0  # planes have none
-    model.geom_rbound[bounded] *= growth
-    model.geom_aabb[bounded, 3:] *= growth
-    return model

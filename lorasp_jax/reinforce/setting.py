@@ -11,6 +11,7 @@ from flax import nnx
 
 import envs
 from envs.env import Env
+from envs.physics.physics import Backend
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import OptimConfig
 from lorasp_jax.peft import AdaLoRA
@@ -99,10 +100,13 @@ def prepare(run: Run) -> tuple[Setting, Learner, Any]:
     learning = config.online
     environments = {task: environment(config, task, learning.worlds) for task in config.tasks}
     gyms = {}
-    if learning.method == "teacher":
-        gyms = {task: environment(config, task, learning.teacher_worlds) for task in config.tasks}
-    check_memory(config, environments)
     mesh = meshes.make_mesh(config.fsdp, run.devices)
+    if learning.method == "teacher":
+        # The engine would simulate all worlds once for each of several devices.
+        backend = "mujoco" if jax.default_backend() == "cpu" and mesh.size == 1 else None
+        sizes = learning.teacher_worlds, backend
+        gyms = {task: environment(config, task, *sizes) for task in config.tasks}
+    check_memory(config, environments)
     for name in ("worlds", "teacher_worlds") if gyms else ("worlds",):
         if (count := getattr(learning, name)) % mesh.size:
             devices = f"the number of devices ({mesh.size})"
@@ -146,7 +150,9 @@ def _optim(config: ReinforceConfig) -> OptimConfig:
     return dataclasses.replace(optim, steps=steps, warmup_steps=0)
 
 
-def environment(config: ReinforceConfig, task: str, worlds: int) -> Env:
+def environment(
+    config: ReinforceConfig, task: str, worlds: int, backend: Backend | None = None
+) -> Env:
     """Make the worlds of a task."""
     return envs.make(
         task,
@@ -156,6 +162,7 @@ def environment(config: ReinforceConfig, task: str, worlds: int) -> Env:
         control_dt=config.control_dt,
         reward=config.online.reward,
         discount=config.online.discount,
+        backend=backend,
     )
 
 
