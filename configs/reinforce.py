@@ -20,7 +20,7 @@ def get_config(scale: str) -> ReinforceConfig:
             16,
         ),
         "cpu": (
-            Learning(worlds=128, teacher_worlds=256, gradient_steps=100),
+            Learning(worlds=64, teacher_worlds=128, rounds=15, std=0.2, gradient_steps=100),
             OptimConfig(steps=12, batch_size=64, learning_rate=3e-4),
             64,
         ),

@@ -30,6 +30,7 @@ from lorasp_jax.reinforce.surrogate import Samples, adapted, clipped_surrogate
 from lorasp_jax.training.random_streams import RandomStream
 
 _WIDTHS, _EPOCHS, _BATCH = (256, 256, 256), 8, 2048  # our choice, like the next ones
+_MINIBATCHES = 8  # or more; fewer steps than these learn slowly
 _CLONE_STEPS, _CLONE_BATCH, _CLONE_RATE = 3000, 512, 1e-3
 ENOUGH = 0.98
 """A teacher that succeeds as often does not change any more."""
@@ -192,7 +193,7 @@ def _improve(
     by_call = lambda x: rollout.by_call(x, calls.actions.shape[1])  # noqa: E731
     valid = by_call(~found.steps.done) & calls.noisy[:, None]
     samples = Samples(calls.actions, by_call(advantages), valid, calls.mean)
-    size = min(_BATCH, len(calls.state))
+    size = min(_BATCH, len(calls.state) // _MINIBATCHES)
 
     def step(carry: Any, index: jax.Array) -> tuple[Any, None]:
         layers, opt_state, within, kl = carry

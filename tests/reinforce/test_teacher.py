@@ -140,3 +140,12 @@ def test_only_judged_actions_are_imitated(tmp_path, policy, seen, monkeypatch):
 
     actions = seen.chunks.actions
     assert loss(actions.at[:, 0, 0].add(1.0)) > loss(actions)
+
+
+@pytest.mark.parametrize(("devices", "backend"), [(1, "mujoco"), (2, "jax")])
+def test_teachers_practise_in_the_c_engine_on_one_cpu(tmp_path, devices, backend):
+    learn = dataclasses.replace(rooms.config().online, method="teacher")
+    run = rooms.start(tmp_path, rooms.config(online=learn), devices)
+    fixed, _, _ = setting.prepare(run)
+    assert {env.physics.backend for env in fixed.gyms.values()} == {backend}
+    assert {env.physics.backend for env in fixed.environments.values()} == {"jax"}
