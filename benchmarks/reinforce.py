@@ -36,7 +36,9 @@ def main() -> None:
     parser.add_argument("--scale", default="accelerator")
     parser.add_argument("--backbone", default="pi0")
     parser.add_argument("--size", default="small")
-    parser.add_argument("--checkpoint", default=ModelConfig.checkpoint, help="empty: random weights")
+    parser.add_argument(
+        "--checkpoint", default=ModelConfig.checkpoint, help="empty: random weights"
+    )
     parser.add_argument("--task", default="pick_place")
     parser.add_argument("--worlds", type=int, default=256)
     parser.add_argument("--batch", type=int, default=128)

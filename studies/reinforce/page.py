@@ -18,6 +18,14 @@ COUNTS = (16, 32, 64)
 CEILING = 512
 """Demonstrations of imitation alone."""
 SEEDS = (0, 1, 2)
+PILOTS = {
+    "start": "before",
+    "short": "30 iterations: 5 rounds of teachers, 256 worlds, 300 gradient steps",
+    "long": "12 iterations: 15, 256, 1,000",
+    "wide": "12 iterations: 15, 512, 1,000",
+}
+PILOT_SEED = 1000
+"""In no table but that of pilots."""
 TASKS = ("open_pot", "pour", "press", "pick_place")
 HARD = ("pour", "pick_place")
 RANKS = {
@@ -40,12 +48,12 @@ def cell(backbone: str, count: int, policy: str, seed: int) -> str:
 def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
     """Write the figure into `folder`; return the tables, with the seeds that have run."""
     seeds = {(b, n): _seeds(results, b, n, "start", "teacher") for b in BACKBONES for n in COUNTS}
-    cases = [case for case in seeds if seeds[case]]
-    _figure(results, {case: seeds[case] for case in cases}, folder / "progress.svg")
+    _figure(results, folder / "progress.svg")
     return {
         "success": _success_table(results, seeds),
         "tasks": _task_table(results, seeds),
         "ranks": _rank_table(results),
+        "pilots": _pilot_table(results),
     }
 
 
@@ -142,28 +150,54 @@ def _rank_table(results: Results) -> str:
     heads = [
         f"{label}, {what}"
         for label in BACKBONES.values()
-        for what in ("seeds", "four tasks", "pour and pick_place")
+        for what in ("seeds", "four tasks", " and ".join(HARD))
     ]
     return page.table([f"new adapters, N = {COUNTS[0]}", *heads], rows)
 
 
+def _pilot_table(results: Results) -> str:
+    """Return success of the pilots that have run."""
+    rows = []
+    for name, label in PILOTS.items():
+        row = [label]
+        for backbone in BACKBONES:
+            where = backbone, COUNTS[0]
+            there = cell(*where, name, PILOT_SEED) in results
+            row += [
+                f"{100 * _outcomes(results, where, name, [PILOT_SEED], tasks).mean():.1f}"
+                if there
+                else page.NONE
+                for tasks in (TASKS, HARD)
+            ]
+        rows.append(row)
+    heads = [
+        f"{label}, {what}"
+        for label in BACKBONES.values()
+        for what in ("four tasks", " and ".join(HARD))
+    ]
+    return page.table(["pilots", *heads], rows)
+
+
 @mpl.rc_context(STYLE)
-def _figure(results: Results, seeds: dict[tuple[str, int], list[int]], path: Path) -> None:
+def _figure(results: Results, path: Path) -> None:
     """Draw success on fixed layouts over minutes: a panel per backbone, a line per run."""
     figure = Figure(figsize=(8, 3), layout="constrained")
     axes = figure.subplots(1, len(BACKBONES), sharey=True)
+    pilot = (COUNTS[0], "wide", PILOT_SEED)
     for axis, backbone in zip(axes, BACKBONES, strict=True):
-        for (name, count), own in seeds.items():
-            for seed in own if name == backbone else ():
-                minutes, rates = _progress(results[cell(name, count, "teacher", seed)])
-                label = f"N = {count}" if seed == own[0] else None
-                axis.plot(minutes, 100 * rates, color=COLORS[count], label=label, marker=".")
+        for case in [pilot, *((n, "teacher", s) for n in COUNTS for s in SEEDS)]:
+            if (name := cell(backbone, *case)) not in results:
+                continue
+            label = "N = 16, pilot" if case == pilot else f"N = {case[0]}, seed {case[2]}"
+            style = {"linestyle": "dashed" if case == pilot else "solid", "marker": "."}
+            minutes, rates = _progress(results[name])
+            axis.plot(minutes, 100 * rates, color=COLORS[case[0]], label=label, **style)
         axis.set_title(BACKBONES[backbone], loc="left")
         axis.set_xlabel("minutes")
         axis.set_ylim(0, 100)
+        if axis.lines:
+            axis.legend(fontsize="x-small")
     axes[0].set_ylabel("success [%]")
-    if seeds:
-        axes[0].legend()
     figures.write(figure, path, "reinforce")
 
 

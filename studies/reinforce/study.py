@@ -27,12 +27,11 @@ METHODS: dict[str, Method] = {
 }
 """Adapters that learn from success after those of the start are merged."""
 PILOTS: dict[str, tuple[int, dict[str, int]]] = {
-    "short": (30, {"rounds": 5, "gradient_steps": 300}),
-    "long": (12, {}),
-    "wide": (12, {"worlds": 512}),
+    "short": (30, {"rounds": 5, "gradient_steps": 300, "worlds": 256}),
+    "long": (12, {"worlds": 256}),
+    "wide": (12, {}),
 }
 """Pilot -> iterations, and settings of learning that differ from the tables'."""
-PILOT_SEED = 1000
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,7 @@ _ACCELERATOR = Scale(
         checkpoint_every=10_000,
     ),
     Trial(
-        Learning(worlds=256, teacher_worlds=1024, rounds=15, gradient_steps=1000, minutes=20),
+        Learning(worlds=512, teacher_worlds=1024, rounds=15, gradient_steps=1000, minutes=20),
         OptimConfig(steps=12, batch_size=128, learning_rate=3e-4),
         every=3,
     ),
@@ -132,13 +131,13 @@ def _pilots(scale: Scale) -> Iterator[Cell | Derived]:
     """Yield policies of a seed that no table uses, which decided how the others learn."""
     count, trial = scale.counts[0], scale.trial
     for backbone in BACKBONES:
-        config = _config(scale.start, backbone, count, PILOT_SEED)
-        yield Cell(page.cell(backbone, count, "start", PILOT_SEED), config, (), backbone)
+        config = _config(scale.start, backbone, count, page.PILOT_SEED)
+        yield Cell(page.cell(backbone, count, "start", page.PILOT_SEED), config, (), backbone)
         for name, (steps, changes) in PILOTS.items():
             learning = replace(trial.learning, **changes)
             optim = replace(trial.optim, steps=steps)
             made = replace(trial, learning=learning, optim=optim)
-            yield _learned(made, backbone, count, name, PILOT_SEED)
+            yield _learned(made, backbone, count, name, page.PILOT_SEED)
 
 
 def _config(start: Config, backbone: str, count: int, seed: int) -> Config:
