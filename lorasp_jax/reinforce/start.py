@@ -57,6 +57,8 @@ def resolve(config: ReinforceConfig, given: Collection[str]) -> ReinforceConfig:
     if "distill" in read_json(start / CONFIG_FILE):
         raise ValueError(f"{start} is distilled, which learning would undo: learn, then distill")
     kept = (*KEPT, *(ADAPTERS if config.online.adapters == "continue" else ()))
+    if any(name.startswith("scene.") for name in given):  # the other scene is to be learned
+        kept = tuple(name for name in kept if name != "scene")
     completed = with_kept(config, start, recorded, kept, given)
     tasks = config.tasks if "tasks" in given else recorded.tasks
     if config.online.adapters == "merge":

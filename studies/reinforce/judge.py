@@ -5,6 +5,7 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
+from envs import Randomization
 from lorasp_jax.config import OptimConfig
 from lorasp_jax.evaluation.callback import Evaluation
 from lorasp_jax.extras.study.run_cell import simulated
@@ -13,6 +14,7 @@ from lorasp_jax.reinforce import loop, start
 from lorasp_jax.reinforce.config import Learning, ReinforceConfig
 from lorasp_jax.training.run import Run
 from lorasp_jax.training.run_folder import read_metrics
+from studies.few import judge as scenes
 
 _RECORDED = ("step", "minutes", "environment_steps")
 
@@ -24,17 +26,22 @@ class Trial:
     Attributes:
         every: iterations between evaluations.
         method: of new adapters, after those of the start are merged; None: those learn further.
+        scene: what the episodes of learning draw; None: nothing.
     """
 
     learning: Learning
     optim: OptimConfig
     every: int
     method: Method | None = None
+    scene: Randomization | None = None
 
     def describe(self) -> dict[str, Any]:
         """Return all settings as JSON values."""
         name = {"name": self.method.name} if self.method else {}
-        return {"trial": json.loads(json.dumps(dataclasses.asdict(self))) | name}
+        found = json.loads(json.dumps(dataclasses.asdict(self)))
+        if not self.scene:
+            del found["scene"]  # as in results from before there was one
+        return {"trial": found | name}
 
     def config(self, run: Run) -> ReinforceConfig:
         """Return the config for a derived cell, whose source is the start of the same seed."""
@@ -50,14 +57,17 @@ class Trial:
             "checkpoint_every": self.optim.steps,
             "online": dataclasses.replace(self.learning, start=str(source), adapters=adapters),
         }
-        return start.resolve(ReinforceConfig(**fields), ())
+        if self.scene:
+            fields["scene"] = self.scene
+        return start.resolve(ReinforceConfig(**fields), ("scene.light_turn",) if self.scene else ())
 
 
 def judge(run: Run, trial: Trial) -> dict[str, Any]:
     """Return what simulation says of the policy that has learned, and its progress.
 
     That is a row per iteration: minutes, environment steps, and success by task of the policy's and
-    the teachers' own episodes and, if evaluated, on fixed layouts.
+    the teachers' own episodes and, if evaluated, on fixed layouts. `shifted` has the outcomes in a
+    shifted scene, such as "after/pour".
     """
     folder = run.folder / "learned"
     folder.mkdir(exist_ok=True)
@@ -68,4 +78,18 @@ def judge(run: Run, trial: Trial) -> dict[str, Any]:
         {k: round(x, 4) for k, x in row.items() if k in _RECORDED or k.startswith(kinds)}
         for row in read_metrics(folder)
     ]
-    return {**simulated(learned), "progress": progress}
+    found = simulated(learned)
+    if trial.scene:  # its evaluation drew scenes, too
+        found["outcomes"] = _outcomes(learned, "recorded")
+    shifted = {
+        f"{when}/{task}": outcomes
+        for when, policy in (("before", run), ("after", learned))
+        for task, outcomes in _outcomes(policy, "shifted").items()
+    }
+    return {**found, "progress": progress, "shifted": shifted}
+
+
+def _outcomes(run: Run, scene: str) -> dict[str, str]:
+    """Return the outcomes of a run's policy in a scene by task."""
+    found = scenes.judge(run, (scene,))["outcomes"]
+    return {name.partition("/")[2]: outcomes for name, outcomes in found.items()}

@@ -53,6 +53,7 @@ def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
         "success": _success_table(results, seeds),
         "tasks": _task_table(results, seeds),
         "ranks": _rank_table(results),
+        "scenes": _scene_table(results),
         "pilots": _pilot_table(results),
     }
 
@@ -153,6 +154,39 @@ def _rank_table(results: Results) -> str:
         for what in ("seeds", "four tasks", " and ".join(HARD))
     ]
     return page.table([f"new adapters, N = {COUNTS[0]}", *heads], rows)
+
+
+def _scene_table(results: Results) -> str:
+    """Return success as recorded and in a shifted scene."""
+    rows = []
+    for backbone in BACKBONES:
+        where = backbone, COUNTS[0]
+        for label, name, when in (
+            ("before", "teacher", "before"),
+            ("learned as recorded", "teacher", "after"),
+            ("learned in shifted scenes", "randomized", "after"),
+        ):
+            own = _seeds(results, *where, "start", name)
+            row = [BACKBONES[backbone], label, str(len(own))]
+            if own:
+                policy = "start" if when == "before" else name
+                stacked = [
+                    _outcomes(results, where, policy, own),
+                    _shifted(results, where, name, own, when),
+                ]
+                row += [page.percent(statistics.success(x)) for x in stacked]
+            rows.append(row + [page.NONE] * (5 - len(row)))
+    return page.table([f"N = {COUNTS[0]}", "", "seeds", "as recorded", "shifted"], rows)
+
+
+def _shifted(
+    results: Results, where: tuple[str, int], name: str, seeds: Sequence[int], when: str
+) -> np.ndarray:
+    """Stack the episodes of a policy's seeds in a shifted scene."""
+    found = [results[cell(*where, name, seed)]["shifted"] for seed in seeds]
+    return statistics.outcomes(
+        [[{"outcomes": {t: x[f"{when}/{t}"] for t in TASKS}}] for x in found]
+    )
 
 
 def _pilot_table(results: Results) -> str:

@@ -4,8 +4,8 @@
         --results studies/reinforce/results.json --jobs 4
 
 A policy learns four tasks from N demonstrations of each, then from success alone. `imitation`
-trains for as many gradient steps on many demonstrations instead. The policies of `page.RANKS` merge
-the adapters of a start into its base and learn new ones.
+trains on many demonstrations instead, `randomized` learns in scenes that change. The policies of
+`page.RANKS` merge the adapters of a start into its base and learn new ones.
 """
 
 import functools
@@ -17,6 +17,7 @@ from lorasp_jax.extras.study import Cell, Derived, Study
 from lorasp_jax.extras.study.page import BACKBONES
 from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP, Method
 from lorasp_jax.reinforce.config import Learning
+from studies.few.judge import SHIFT
 from studies.reinforce import page
 from studies.reinforce.judge import Trial, judge
 
@@ -120,6 +121,8 @@ def _cells(scale: Scale, backbone: str, seed: int) -> Iterator[Cell | Derived]:
         config = _config(scale.start, backbone, count, seed)
         yield Cell(page.cell(backbone, count, "start", seed), config, (), backbone)
         yield _learned(scale.trial, backbone, count, "teacher", seed)
+    shifted = replace(scale.trial, scene=SHIFT)
+    yield _learned(shifted, backbone, scale.counts[0], "randomized", seed)
     count, steps = scale.imitation
     config = _config(scale.start, backbone, count, seed)
     optim = replace(config.optim, steps=steps, batch_size=scale.trial.optim.batch_size)

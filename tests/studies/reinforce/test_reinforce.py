@@ -7,6 +7,7 @@ import pytest
 
 from lorasp_jax.extras.study import Derived, statistics
 from lorasp_jax.reinforce import start
+from studies.few.judge import SHIFT
 from studies.reinforce import page, study
 
 STUDY = study.get_study("accelerator")
@@ -26,7 +27,9 @@ def result(cell):
         | {f"success/{task}": 0.5 for task in page.TASKS}
         for i in (1, 2)
     ]
-    return {"outcomes": outcomes(0.8), "before": outcomes(0.4), "progress": rows}
+    shifted = {f"{when}/{task}": "0111" * 10 for when in ("before", "after") for task in page.TASKS}
+    found = {"outcomes": outcomes(0.8), "before": outcomes(0.4), "progress": rows}
+    return {**found, "shifted": shifted}
 
 
 @pytest.fixture(autouse=True)
@@ -52,6 +55,7 @@ def test_policies_learn_as_their_names_say(monkeypatch):
         config = trial.config(run)
         assert config.online.start == f"runs/{cell.source}"
         assert (config.online.adapters == "merge") == (name in page.RANKS)
+        assert config.scene.changed() == (SHIFT.changed() if name == "randomized" else {})
         assert config.peft == study.METHODS.get(name, run.config.peft)
         assert cell.settings["trial"].get("name") == (
             study.METHODS[name].name if name in study.METHODS else None
@@ -78,6 +82,9 @@ def test_page(tmp_path):
     assert shown == ["40.0", "80.0", "40.0", "80.0", "2.0", "4"]
     gains = made["tasks"].splitlines()[2].split(" | ")
     assert [cell.split()[0] for cell in gains[2:]] == 4 * ["+40.0"]
+    scenes = [line.split(" | ")[3:] for line in made["scenes"].splitlines()[2:5]]
+    rates = [[cell.split()[0] for cell in row] for row in scenes]
+    assert rates == [["40.0", "75.0"], ["80.0", "75.0"], ["80.0", "75.0"]]
     assert made["ranks"].count("80.0") == 2 * 2 * len(page.RANKS)
     assert (tmp_path / "progress.svg").stat().st_size
 
