@@ -78,7 +78,9 @@ def write_variant(
         ValueError: the policy has learned its initial noise, which is that of its weights.
     """
     if policy.model.noise_actor is not None:
-        raise ValueError(f"the policy of {source} has learned its initial noise: it has no variants")
+        raise ValueError(
+            f"the policy of {source} has learned its initial noise: it has no variants"
+        )
     metadata = describe(source)
     fields = metadata["policy"] | {"config": dataclasses.asdict(policy.model.config)}
     metadata |= {"policy": fields, QUANTIZED: quantized, STEPS: denoise_steps(source)}

@@ -72,9 +72,9 @@ class Bases:
             load: whether to load a base that no earlier run has.
 
         Raises:
-            ValueError: the run trained its base, an actor of its noise, or splits kernels, its files
-                are damaged, or it has another base than it records, or than those loaded if `load`
-                is false.
+            ValueError: the run trained its base or an actor of its noise, or splits kernels, its
+                files are damaged, or it has another base than it records, or than those loaded if
+                `load` is false.
         """
         folder = recorded.folder
         if recorded.is_full:
