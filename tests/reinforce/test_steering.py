@@ -11,6 +11,7 @@ import pytest
 from rich.console import Console
 
 import lorasp_jax
+from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.cli.train import _resolved
 from lorasp_jax.extras.deployment import variants
@@ -190,6 +191,10 @@ def test_what_would_lose_the_actor_is_refused(run, few, capsys):
         export.write_variant(folder / "variant", run.policy, folder)
     with pytest.raises(ValueError, match=f"rule '\\^{PATH}\\$' applies to nothing"):
         lorasp_jax.load_adapters(folder, RecordedPolicy.read(few).load_base())
+    with pytest.raises(ValueError, match=f"{PATH} is fully trained, but PEFT cannot store it"):
+        lorasp_jax.save_peft(folder / "peft", run.policy.model, names=lambda *x: str(x))
+    with pytest.raises(ValueError, match="a model that has not learned its initial noise"):
+        models.save(folder / "merged", adaptation.merge(run.policy.model))
     with pytest.raises(ValueError, match="the policy has learned its initial noise"):
         setting.prepare(run)
 
