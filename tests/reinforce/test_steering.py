@@ -14,19 +14,21 @@ import lorasp_jax
 from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.cli.train import _resolved
+from lorasp_jax.config import OptimConfig
 from lorasp_jax.extras.deployment import variants
-from lorasp_jax.extras.serving import loading
+from lorasp_jax.extras.serving import exported, exporting, loading
 from lorasp_jax.extras.serving.adapters import Bases
 from lorasp_jax.extras.serving.policies import CompiledPolicy
 from lorasp_jax.models.noise_actor import PATH, NoiseActor
 from lorasp_jax.models.perceptron import moments
 from lorasp_jax.reinforce import descent, loop, setting, start, steering
+from lorasp_jax.reinforce.config import Learning
 from lorasp_jax.reinforce.descent import Descent, Learned
 from lorasp_jax.reinforce.surrogate import Samples
 from lorasp_jax.training import export
 from lorasp_jax.training.export import RecordedPolicy, load_policy
 from lorasp_jax.training.overrides import parse
-from lorasp_jax.training.run_folder import read_json, to_json, write_json
+from lorasp_jax.training.run_folder import read_json, read_metrics, to_json, write_json
 from tests import ROOT
 from tests.extras.serving.test_policies import STEPS, noise_of, reference, request
 from tests.reinforce import rooms
@@ -103,6 +105,17 @@ def test_a_gradient_that_is_not_finite_is_not_followed():
     assert jax.tree.all(jax.tree.map(jnp.array_equal, after.network, actor.network))
 
 
+@pytest.mark.slow
+def test_a_frozen_policy_succeeds_with_learned_noise(tmp_path, monkeypatch):
+    monkeypatch.setattr(setting, "environment", lambda *_: rooms.Room(num_envs=64, goal=0.1))
+    online = Learning(method="noise", worlds=64, std=STD, epochs=8, max_kl=0.04)
+    optim = OptimConfig(steps=25, batch_size=64, learning_rate=1e-3)
+    loop.train(rooms.start(tmp_path, rooms.config(online=online, optim=optim)))
+    rates = [row["rollout/press"] for row in read_metrics(tmp_path)]
+    assert np.mean(rates[:4]) < 0.3
+    assert np.mean(rates[-4:]) > 0.7
+
+
 @pytest.fixture(scope="module")
 def few(tmp_path_factory):
     """A finished run with plain LoRA, whose base is saved beside it."""
@@ -173,6 +186,15 @@ def test_a_served_policy_has_its_actor(run):
     row |= {"present": {name: np.True_ for name in sent.images}, "noise": np.asarray(noise[0])}
     found = served.run(jax.tree.map(lambda x: np.asarray(x)[None], row))[0]
     np.testing.assert_allclose(found, reference(run.policy, [sent], noise), atol=1e-5)
+
+
+def test_an_exported_policy_has_its_actor(run, tmp_path):
+    exporting.write(run.policy, tmp_path / "out", num_steps=STEPS, max_batch=1)
+    loaded = exported.load(tmp_path / "out")
+    sent = request(loaded.description, prompt=loaded.instructions[0])
+    noise = noise_of(loaded.description)
+    found = loaded.act(sent.images, sent.state, sent.prompt, noise=np.asarray(noise[0]))
+    np.testing.assert_allclose(found, reference(run.policy, [sent], noise)[0], atol=1e-5)
 
 
 def test_what_would_lose_the_actor_is_refused(run, few, capsys):
