@@ -38,11 +38,13 @@ class Shifts(NamedTuple):
         seen: `[N, D]` x.
         mean: `[N, A]` m(x).
         chosen: `[N, A]` w.
+        effect: `[N]` mean square of what the noise changes in the executed actions [normalized].
     """
 
     seen: jax.Array
     mean: jax.Array
     chosen: jax.Array
+    effect: jax.Array
 
 
 def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]]:
@@ -52,6 +54,8 @@ def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]
     """
     found, critics, values = ppo.experience(setting, state, functools.partial(_collect, setting))
     seen, samples = jax.tree.map(lambda *x: jnp.concatenate(x), *(_samples(*x) for x in found))
+    effects = jnp.concatenate([each.chunks.effect for each, _ in found])
+    values["noise_effect"] = float(jnp.sqrt(jnp.mean(effects)))
     actor, guard = state.adapters[PATH].get_value(), state.guard
     learned, more = Learned(actor.network, state.opt_state, state.rate), {"updates": 0}
     if int(state.step):
@@ -164,4 +168,7 @@ def explore(
     rest = jax.random.normal(flow_key, (len(mean), actor.chunk, mean.shape[1]))
     chunk, _ = flow_matching.sample(velocity, actor.mixed(chosen, rest), **flow)
     actions = processor.decode(chunk[:, :execute_steps], observation["state"])
-    return actions, Shifts(seen, mean, chosen)
+    change = chunk - seen.reshape(len(mean), -1, mean.shape[1])[:, 1:]
+    executed = change[:, :execute_steps, np.array(processor.action_slots)]
+    effect = jnp.mean(jnp.square(executed), axis=(1, 2))
+    return actions, Shifts(seen, mean, chosen, effect)

@@ -63,6 +63,7 @@ def test_a_run_logs_what_the_report_shows(whole):
     if whole.config.online.method != "teacher":
         names |= {"kl", "clipped"}
         assert rows[0]["updates"] == 0  # the critic learns first
+        assert ("noise_effect" in rows[0]) == (whole.config.online.method == "noise")
     else:
         names |= {"teacher/press", "task"}
     assert names <= set().union(*rows)

@@ -21,6 +21,7 @@ from lorasp_jax.extras.serving.adapters import Bases
 from lorasp_jax.extras.serving.policies import CompiledPolicy
 from lorasp_jax.models.noise_actor import PATH, NoiseActor
 from lorasp_jax.models.perceptron import moments
+from lorasp_jax.models.smolvla import SmolVLAConfig
 from lorasp_jax.reinforce import descent, loop, setting, start, steering
 from lorasp_jax.reinforce.config import Learning
 from lorasp_jax.reinforce.descent import Descent, Learned
@@ -31,8 +32,9 @@ from lorasp_jax.training.overrides import parse
 from lorasp_jax.training.run_folder import read_json, read_metrics, to_json, write_json
 from tests import ROOT
 from tests.extras.serving.test_policies import STEPS, noise_of, reference, request
+from tests.models.random_models import random_backbone
 from tests.reinforce import rooms
-from tests.runs import RESULTS, finish_with_weights, leaves
+from tests.runs import RESULTS, finish_with_weights, leaves, make_run
 
 CALLS, STD, SLOTS = 512, 0.5, (True, True, False)
 SETTINGS = Descent(learning_rate=3e-3, epochs=4, size=256, clip=0.2, max_kl=0.04)
@@ -114,6 +116,18 @@ def test_a_frozen_policy_succeeds_with_learned_noise(tmp_path, monkeypatch):
     rates = [row["rollout/press"] for row in read_metrics(tmp_path)]
     assert np.mean(rates[:4]) < 0.3
     assert np.mean(rates[-4:]) > 0.7
+
+
+def test_smolvla_learns_noise_too(tmp_path, monkeypatch):
+    monkeypatch.setattr(setting, "environment", lambda *_: rooms.Room())
+    changes = {"online": Learning(method="noise", worlds=8, std=STD, reward="dense")}
+    model = dataclasses.replace(rooms.config().model, backbone="smolvla")
+    config = rooms.config(**changes, model=model, targets=("q_proj",))
+    run = make_run(tmp_path, config, random_backbone(SmolVLAConfig.dummy()))
+    loop.train(run)
+    rows = read_metrics(tmp_path)
+    assert rows[-1]["updates"] > 0
+    assert rows[1]["start_kl"] < rows[-1]["start_kl"]
 
 
 @pytest.fixture(scope="module")
