@@ -27,6 +27,7 @@ class Trial:
         every: iterations between evaluations.
         method: of new adapters, after those of the start are merged; None: those learn further.
         scene: what the episodes of learning draw; None: nothing.
+        tasks: that are learned; empty: all of the start.
     """
 
     learning: Learning
@@ -34,13 +35,15 @@ class Trial:
     every: int
     method: Method | None = None
     scene: Randomization | None = None
+    tasks: tuple[str, ...] = ()
 
     def describe(self) -> dict[str, Any]:
         """Return all settings as JSON values."""
         name = {"name": self.method.name} if self.method else {}
         found = json.loads(json.dumps(dataclasses.asdict(self)))
-        if not self.scene:
-            del found["scene"]  # as in results from before there was one
+        for setting in ("scene", "tasks"):
+            if not getattr(self, setting):
+                del found[setting]  # as in results from before there was one
         return {"trial": found | name}
 
     def config(self, run: Run) -> ReinforceConfig:
@@ -51,6 +54,7 @@ class Trial:
         fields = {x.name: getattr(run.config, x.name) for x in dataclasses.fields(run.config)}
         fields |= {
             "peft": self.method or run.config.peft,
+            "tasks": self.tasks or run.config.tasks,
             "optim": self.optim,
             "evaluation": evaluation,
             "log_every": 1,
@@ -59,7 +63,11 @@ class Trial:
         }
         if self.scene:
             fields["scene"] = self.scene
-        return start.resolve(ReinforceConfig(**fields), ("scene.light_turn",) if self.scene else ())
+        given = [
+            *(("scene.light_turn",) if self.scene else ()),
+            *(("tasks",) if self.tasks else ()),
+        ]
+        return start.resolve(ReinforceConfig(**fields), given)
 
 
 def judge(run: Run, trial: Trial) -> dict[str, Any]:
@@ -67,7 +75,7 @@ def judge(run: Run, trial: Trial) -> dict[str, Any]:
 
     That is a row per iteration: minutes, environment steps, and success by task of the policy's and
     the teachers' own episodes and, if evaluated, on fixed layouts. `shifted` has the outcomes in a
-    shifted scene, such as "after/pour".
+    shifted scene, such as "after/pour", if all tasks were learned.
     """
     folder = run.folder / "learned"
     folder.mkdir(exist_ok=True)
@@ -81,12 +89,16 @@ def judge(run: Run, trial: Trial) -> dict[str, Any]:
     found = simulated(learned)
     if trial.scene:  # its evaluation drew scenes, too
         found["outcomes"] = _outcomes(learned, "recorded")
-    shifted = {
+    found |= {"progress": progress}
+    return found if trial.tasks else {**found, "shifted": _shifted(run, learned)}
+
+
+def _shifted(run: Run, learned: Run) -> dict[str, str]:
+    return {
         f"{when}/{task}": outcomes
         for when, policy in (("before", run), ("after", learned))
         for task, outcomes in _outcomes(policy, "shifted").items()
     }
-    return {**found, "progress": progress, "shifted": shifted}
 
 
 def _outcomes(run: Run, scene: str) -> dict[str, str]:

@@ -28,6 +28,10 @@ PILOT_SEED = 1000
 """In no table but that of pilots."""
 TASKS = ("open_pot", "pour", "press", "pick_place")
 HARD = ("pour", "pick_place")
+OWNED = "pick_place"
+"""The task of few own episodes."""
+EPISODES = (50, 200, 1000)
+OWNERS = {"filtered": "`--learn filtered`", "recap": "`--learn recap`", "noise": "noise space"}
 RANKS = {
     "r1": "LoRA, r = 1",
     "r4": "LoRA, r = 4",
@@ -54,6 +58,7 @@ def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
         "tasks": _task_table(results, seeds),
         "ranks": _rank_table(results),
         "scenes": _scene_table(results),
+        "owner": _owner_table(results),
         "pilots": _pilot_table(results),
     }
 
@@ -187,6 +192,25 @@ def _shifted(
     return statistics.outcomes(
         [[{"outcomes": {t: x[f"{when}/{t}"] for t in TASKS}}] for x in found]
     )
+
+
+def _owner_table(results: Results) -> str:
+    """Return success in one task by the number of own episodes."""
+    rows = []
+    for backbone in BACKBONES:
+        cases = {"before": ("start",), "its 16 demonstrations alone": ("imitation_0",)}
+        cases |= {label: tuple(f"{x}_{n}" for n in EPISODES) for x, label in OWNERS.items()}
+        for label, names in cases.items():
+            row = [BACKBONES[backbone], label]
+            for name in names:
+                own = _seeds(results, backbone, COUNTS[0], name)
+                where = results, (backbone, COUNTS[0]), name, own, [OWNED]
+                row.append(
+                    page.percent(statistics.success(_outcomes(*where))) if own else page.NONE
+                )
+            at = 3 - len(names)
+            rows.append([*row, *[""] * at])
+    return page.table([OWNED, "", *(f"{n} episodes" for n in EPISODES)], rows)
 
 
 def _pilot_table(results: Results) -> str:

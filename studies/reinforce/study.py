@@ -9,7 +9,7 @@ trains on many demonstrations instead, `randomized` learns in scenes that change
 """
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from lorasp_jax.config import Config, DataConfig, EvaluationConfig, ModelConfig, OptimConfig
@@ -18,7 +18,7 @@ from lorasp_jax.extras.study.page import BACKBONES
 from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP, Method
 from lorasp_jax.reinforce.config import Learning
 from studies.few.judge import SHIFT
-from studies.reinforce import page
+from studies.reinforce import owner, page
 from studies.reinforce.judge import Trial, judge
 
 METHODS: dict[str, Method] = {
@@ -43,6 +43,7 @@ class Scale:
         start: config of the starts, but for backbone, seed and number of demonstrations.
         trial: how they learn from success.
         imitation: demonstrations and gradient steps of `imitation`.
+        episodes: as `owner.EPISODES`.
         counts: numbers of demonstrations.
         seeds: those of the tables.
     """
@@ -50,6 +51,7 @@ class Scale:
     start: Config
     trial: Trial
     imitation: tuple[int, int]
+    episodes: Mapping[int, tuple[int, int]]
     counts: tuple[int, ...] = page.COUNTS
     seeds: tuple[int, ...] = page.SEEDS
 
@@ -73,6 +75,7 @@ _ACCELERATOR = Scale(
         every=3,
     ),
     imitation=(512, 20_000),
+    episodes=owner.EPISODES,
 )
 _SMOKE = Scale(
     replace(
@@ -90,6 +93,7 @@ _SMOKE = Scale(
         every=1,
     ),
     imitation=(4, 2),
+    episodes={4: (4, 2)},
     counts=(2,),
     seeds=(0,),
 )
@@ -123,6 +127,7 @@ def _cells(scale: Scale, backbone: str, seed: int) -> Iterator[Cell | Derived]:
         yield _learned(scale.trial, backbone, count, "teacher", seed)
     shifted = replace(scale.trial, scene=SHIFT)
     yield _learned(shifted, backbone, scale.counts[0], "randomized", seed)
+    yield from owner.cells(backbone, scale.counts[0], seed, scale.episodes)
     count, steps = scale.imitation
     config = _config(scale.start, backbone, count, seed)
     optim = replace(config.optim, steps=steps, batch_size=scale.trial.optim.batch_size)
