@@ -25,8 +25,8 @@ def get_config(scale: str) -> ReinforceConfig:
             64,
         ),
         "accelerator": (
-            Learning(worlds=256, teacher_worlds=1024, gradient_steps=300),
-            OptimConfig(steps=40, batch_size=128, learning_rate=3e-4),
+            Learning(worlds=512, teacher_worlds=1024, rounds=15, gradient_steps=1000),
+            OptimConfig(steps=12, batch_size=128, learning_rate=3e-4),
             256,
         ),
     }[scale]
@@ -37,8 +37,8 @@ def get_config(scale: str) -> ReinforceConfig:
         tasks=("press",),
         optim=optim,
         evaluation=EvaluationConfig(
-            episodes=episodes, num_envs=episodes, every={"smoke": 2, "cpu": 2}.get(scale, 5)
+            episodes=episodes, num_envs=episodes, every={"smoke": 2, "cpu": 2}.get(scale, 3)
         ),
         online=learning,
-        checkpoint_every={"smoke": 1, "cpu": 1, "accelerator": 10}[scale],
+        checkpoint_every={"smoke": 1, "cpu": 1, "accelerator": 3}[scale],
     )

@@ -272,7 +272,8 @@ def _unfreeze(root: nnx.List[Any], rules: paths.Rules) -> set[int]:
                 layer.method = method
             elif layer and location.name == layer.kernel_name:
                 raise ValueError(f"{location.path} has an adapter and cannot be fully fine-tuned")
-            if jnp.issubdtype(location.child.get_value().dtype, jnp.floating):
+            values = jax.tree.leaves(location.child.get_value())
+            if all(jnp.issubdtype(value.dtype, jnp.floating) for value in values):
                 unfrozen.append(location)
     _convert_variables(unfrozen, AdapterParam)
     return used
@@ -284,7 +285,7 @@ def _convert_variables(locations: Sequence[paths.Location], kind: type[nnx.Param
     def convert(location: paths.Location) -> nnx.Param:
         value = location.child.get_value()
         if kind is AdapterParam:  # a copy, since the train step may donate trainable arrays
-            value = jnp.array(value, jnp.float32, copy=True)
+            value = jax.tree.map(lambda x: jnp.array(x, jnp.float32, copy=True), value)
         return kind(value, **location.child.get_metadata())
 
     paths.replace(locations, convert)

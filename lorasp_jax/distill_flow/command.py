@@ -66,7 +66,7 @@ def student(run: Run) -> Run:
     assert isinstance(config, DistillFlowConfig)
     if any(isinstance(method, AdaLoRA) for method in adaptation.methods(policy.model).values()):
         raise ValueError("ada_lora's rank budget spans all layers: distill another method's run")
-    run.objective = objectives.of(config)
+    run.objective, run.trained = objectives.of(config), policy.model.flow_layers
     if not run.parameters[0]:
         raise ValueError(f"{config.distill.start} has no adapters in the action expert")
     run.console.print(

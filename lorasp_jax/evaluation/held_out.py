@@ -299,8 +299,9 @@ def _program(
 
     losses = jax.lax.map(loss, jax.random.split(keys[0], _NOISES))
     noise = jax.random.normal(keys[1], batch.actions.shape)
-    slots = jnp.asarray(policy.processor.flow_slots)
-    chunk, _ = flow_matching.sample(velocity, noise, num_steps=num_steps, slots=slots)
+    flow: Any = {"num_steps": num_steps, "slots": jnp.asarray(policy.processor.flow_slots)}
+    noise = sampler.initial_noise(velocity, batch.observation, noise, **flow)
+    chunk, _ = flow_matching.sample(velocity, noise, **flow)
     dataset: Any = raw.dataset
     actions = policy.processor.of_rows(dataset).decode(chunk, jnp.asarray(raw.state))
     return actions, losses.sum(), _NOISES * mask.sum()

@@ -61,6 +61,8 @@ class Backbone(nnx.Module):
     """The language model, with stacked `blocks`."""
     action: Any
     """The action expert, with stacked `blocks`."""
+    noise_actor: nnx.Param | None = None
+    """The `NoiseActor` that chooses the initial noise of the flow; None: it is standard normal."""
     flow_layers: ClassVar[str] = "^(state_proj|action|time_mlp)"
     """Pattern of the paths of all layers that `run_suffix` uses."""
 

@@ -14,6 +14,7 @@ from lorasp_jax.adapters.compress import quantization
 from lorasp_jax.adapters.layers import prepared
 from lorasp_jax.models import flow_matching, real_time_chunking
 from lorasp_jax.models.config import BackboneConfig
+from lorasp_jax.models.noise_actor import NoiseActor
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.transformer.depth import unstack
 from lorasp_jax.models.transformer.layers import LayerAux, ModelAux, merge_action_aux
@@ -45,6 +46,8 @@ class Sampler:
     config: BackboneConfig = dataclasses.field(metadata={"static": True})
     methods: tuple[Method, ...] = dataclasses.field(metadata={"static": True})
     """Distinct adapter methods of the backbone."""
+    noise_actor: NoiseActor | None = None
+    """What chooses the initial noise; None: it is standard normal."""
 
     @classmethod
     def from_model(cls, model: "Backbone", *, once: bool = False) -> Self:
@@ -59,7 +62,8 @@ class Sampler:
         graphdefs, states = zip(*map(nnx.split, models), strict=True)
         weights, tree = jax.tree.flatten(states)
         methods = dict.fromkeys(adaptation.methods(model).values())
-        return cls(weights, (graphdefs, tree), model.config, tuple(methods))
+        actor = None if model.noise_actor is None else model.noise_actor.get_value()
+        return cls(weights, (graphdefs, tree), model.config, tuple(methods), actor)
 
     def sampler(self) -> Self:
         """Return self, for callers that accept a backbone or a sampler."""
@@ -86,7 +90,7 @@ class Sampler:
             key: typed PRNG key; used only if `noise` is None.
             obs: the observation.
             num_steps: Euler steps.
-            noise: `[B, C, A]` initial noise of the flow.
+            noise: `[B, C, A]` initial noise of the flow; see `initial_noise`.
             slots: `[A]` bool, slots to sample; the others stay zero. None samples all slots.
             return_aux: also return the adapters' aux. `aux["action"]` has a step axis before the
                 layer axis. The aux of action layers that run only once is broadcast over steps.
@@ -109,6 +113,7 @@ class Sampler:
             shape = (obs.state.shape[0], self.config.chunk, self.config.action_dim)
             noise = jax.random.normal(key, shape)
         velocity, aux = self.encode(obs)
+        noise = self.initial_noise(velocity, obs, noise, num_steps=num_steps, slots=slots)
         if summarize:
             velocity = _summarizing(velocity, summarize)
         sample = flow_matching.sample
@@ -125,6 +130,22 @@ class Sampler:
         prefix_model, suffix_model = self._models()
         prefix, aux = prefix_model.run_prefix(obs)
         return functools.partial(suffix_model.run_suffix, prefix.by_layer(), obs), aux
+
+    def initial_noise(
+        self,
+        velocity: flow_matching.Velocity,
+        obs: Observation,
+        noise: jax.Array,
+        *,
+        num_steps: int,
+        slots: jax.Array | None = None,
+    ) -> jax.Array:
+        """Return standard normal noise `[B, C, A]` as the actor shifts it, if there is an actor."""
+        if self.noise_actor is None:
+            return noise
+        actor = self.noise_actor
+        seen = actor.observe(velocity, obs, num_steps=num_steps, slots=slots)
+        return actor.mixed(actor(seen), noise)
 
     def _models(self) -> Iterator["Backbone"]:
         """Rebuild the modules of the prefix and of the flow steps."""
@@ -154,6 +175,7 @@ def _with_steps(aux: ModelAux, action_aux: LayerAux, num_steps: int) -> ModelAux
 def _prefix_model(model: "Backbone", once: bool) -> "Backbone":
     """Copy a model for the prefix, blocks unstacked so that an outer loop slices no weights."""
     model = nnx.merge(*nnx.split(model))
+    model.noise_actor = None  # the sampler has it
     for tower in (model.vision, model.language):
         if isinstance(tower.blocks, nnx.List):  # a `SharedSampler`'s
             for block in tower.blocks:
@@ -173,6 +195,7 @@ def suffix_model(model: "Backbone") -> "Backbone":
     """Copy a model for the flow steps, with input-independent results precomputed."""
     model = nnx.merge(*nnx.split(model))
     del model.vision, model.language
+    model.noise_actor = None
     if not isinstance(model.action.blocks, nnx.List):
         model.action.blocks = unstack(model.action.blocks)
     quantization.dequantize(model)

@@ -14,7 +14,8 @@ class Learning:
     """How a flow policy learns from success in simulation.
 
     By proximal policy optimization (PPO, arXiv 1707.06347) with a critic, exploring by Gaussian
-    noise: of the policy itself, or of a teacher for each task that the policy then imitates.
+    noise: of the policy itself, of a teacher for each task that the policy then imitates, or of the
+    initial noise of the flow.
     """
 
     start: Annotated[str, tyro.conf.arg(name="from", prefix_name=False)] = ""
@@ -22,12 +23,14 @@ class Learning:
     base in model with new adapters, as `train.py` would start."""
     adapters: Literal["continue", "merge"] = "continue"
     """Train the adapters of the start run, or merge them into its base and train new ones."""
-    method: Literal["teacher", "ppo"] = "teacher"
-    """Who learns from success: a small policy on the simulator's state, or the adapters."""
+    method: Literal["teacher", "ppo", "noise"] = "teacher"
+    """Who learns from success: a small policy on the simulator's state, the adapters, or an actor
+    that chooses the initial noise of the flow, while the policy stays as it is."""
     worlds: int = 64
     """Parallel worlds per task, each for one time limit in every iteration."""
     std: float = 0.1
-    """Standard deviation of exploration [normalized action units]."""
+    """Standard deviation of exploration [normalized action units]; with noise, the share that all
+    actions of a chunk have in common, below 1."""
     correlation: float = 0.9
     """Correlation of this noise in successive actions of a chunk; 0: new noise in each."""
     reward: Literal["sparse", "dense"] = "sparse"
@@ -76,6 +79,8 @@ class Learning:
             raise ValueError(f"online.teacher_worlds must be at least 8, got {self.teacher_worlds}")
         if not 0 <= self.correlation < 1:
             raise ValueError(f"online.correlation must lie in [0, 1), got {self.correlation}")
+        if self.method == "noise" and self.std >= 1:
+            raise ValueError(f"online.std must be below 1 for noise, got {self.std}")
         if self.minutes < 0:
             raise ValueError(f"online.minutes must be at least 0, got {self.minutes}")
 
@@ -93,8 +98,8 @@ _IGNORED = (
 class ReinforceConfig(Config):
     """One run of online reinforcement learning; a step is an iteration of rollout and update.
 
-    `optim.batch_size` are the chunks of a gradient step. With PPO, the learning rate of the
-    adapters adapts to the KL divergence of the iterations, and the first trains only the critic.
+    `optim.batch_size` are the chunks of a gradient step. Without teachers, the learning
+    rate adapts to the KL divergence of the iterations, and the first trains only the critic.
     """
 
     online: Learning = field(default_factory=Learning)
@@ -110,7 +115,7 @@ class ReinforceConfig(Config):
                 raise ValueError(f"{name} is not for reinforcement learning: drop it")
         if self.data.source and not self.online.start:
             raise ValueError("data.source is not for reinforcement learning: drop it")
-        if self.online.method == "ppo" and self.optim.steps == 1:
+        if self.online.method != "teacher" and self.optim.steps == 1:
             raise ValueError(
                 "optim.steps must be at least 2, got 1: the first iteration trains only the critic"
             )

@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from lorasp_jax.models.perceptron import Network, moments
 from lorasp_jax.reinforce.config import Learning
-from lorasp_jax.reinforce.network import Network, moments
 from lorasp_jax.reinforce.rollout import Transitions
 
 _WIDTHS, _BATCH, _EPOCHS = (128, 128), 512, 4  # our choice

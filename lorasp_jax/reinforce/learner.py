@@ -19,9 +19,10 @@ class Learner:
         step: `[]` int32, number of iterations.
         adapters: trainable parameters, an `nnx.State`.
         guard: statistics that decide which updates to skip.
+        opt_state: the optimizer's; that of an actor of the noise is of its layers alone.
         critics: by task.
         rate: `[]` factor of the learning rate, which follows the KL divergence of the iterations.
-        teachers: by task; none if the adapters learn from success themselves.
+        teachers: by task; none unless the policy learns from them.
     """
 
     step: jax.Array

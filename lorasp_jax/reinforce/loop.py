@@ -8,7 +8,7 @@ import numpy as np
 
 from lorasp_jax.base.bars import bars
 from lorasp_jax.base.intervals import wilson_interval
-from lorasp_jax.reinforce import ppo, teaching
+from lorasp_jax.reinforce import ppo, steering, teaching
 from lorasp_jax.reinforce.config import ReinforceConfig
 from lorasp_jax.reinforce.learner import Learner
 from lorasp_jax.reinforce.setting import Setting, prepare
@@ -88,7 +88,7 @@ def _loop(
     return state
 
 
-_ITERATE = {"teacher": teaching.iterate, "ppo": ppo.iterate}
+_ITERATE = {"teacher": teaching.iterate, "ppo": ppo.iterate, "noise": steering.iterate}
 _SKIPPED = (
     "{} consecutive updates were skipped because loss or gradient was non-finite; nothing after "
     "iteration {} was saved: try a lower --optim.learning-rate"

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from flax import nnx
 
 import envs
@@ -14,9 +15,11 @@ from envs.env import Env
 from envs.physics.physics import Backend
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import OptimConfig
-from lorasp_jax.peft import AdaLoRA
+from lorasp_jax.models import noise_actor
+from lorasp_jax.models.noise_actor import PATH, NoiseActor
+from lorasp_jax.peft import AdaLoRA, FullFineTuning
 from lorasp_jax.policies.policy import Policy
-from lorasp_jax.reinforce import noise, rollout, student, update
+from lorasp_jax.reinforce import descent, noise, rollout, student, update
 from lorasp_jax.reinforce.config import ReinforceConfig
 from lorasp_jax.reinforce.critic import Critic
 from lorasp_jax.reinforce.learner import Learner
@@ -29,6 +32,9 @@ from lorasp_jax.training.optim import make_optimizer
 from lorasp_jax.training.program import Frozen
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Run
+
+_WIDTHS = 128, 128
+"""Of the hidden layers of an actor of the noise; our choice."""
 
 
 class Setting(NamedTuple):
@@ -111,15 +117,17 @@ def prepare(run: Run) -> tuple[Setting, Learner, Any]:
         if (count := getattr(learning, name)) % mesh.size:
             devices = f"the number of devices ({mesh.size})"
             raise ValueError(f"online.{name} must be a multiple of {devices}, got {count}")
-    graphdef, adapters, parameters = adaptation.split(run.policy.model)
-    methods = adaptation.methods(run.policy.model).values()
-    if any(isinstance(method, AdaLoRA) for method in methods):
-        raise ValueError("ada_lora needs a number of steps, which reinforcement learning has not")
-    optimizer = make_optimizer(_optim(config), methods)
+    if run.policy.model.noise_actor is not None:
+        raise ValueError("the policy has learned its initial noise: start from an earlier one")
+    if learning.method == "noise":
+        run.trained, run.policy = f"^{PATH}", _steered(config, run.policy)
+    graphdef, adapters, parameters = run.split()
+    optimizer = _optimizer(config, run.policy)
+    learned = adapters[PATH].get_value().network.layers if run.trained else adapters
     zero, one = jnp.zeros((), jnp.int32), jnp.ones(())
     critics, taught = _critics(config, environments), _teachers(config, gyms, run.policy)
     adapters, guard = jax.tree.map(jnp.copy, adapters), Guard.initial()
-    state = Learner(zero, adapters, optimizer.init(adapters), guard, critics, one, taught)
+    state = Learner(zero, adapters, optimizer.init(learned), guard, critics, one, taught)
     shardings = meshes.shardings(state, mesh)
     state = jax.device_put(state, shardings)
     processor = run.policy.processor
@@ -136,6 +144,25 @@ def prepare(run: Run) -> tuple[Setting, Learner, Any]:
     shapes = jax.tree.map(meshes.with_sharding, jax.eval_shape(lambda: state), shardings)
     fixed = config, environments, programs, frozen, start, policy, shardings, imitate, gyms
     return Setting(*fixed), state, shapes
+
+
+def _steered(config: ReinforceConfig, policy: Policy) -> Policy:
+    """Return the policy with a new actor of its noise, which alone is trained."""
+    key, model = RandomStream.NOISE_ACTOR.key(config.seed), policy.model
+    actor = NoiseActor.init(key, model.config, std=config.online.std, widths=_WIDTHS)
+    rules = [(f"^{PATH}$", FullFineTuning())]
+    model = adaptation.adapt(noise_actor.attach(model, actor), rules, rngs=nnx.Rngs(0))
+    return dataclasses.replace(policy, model=model)
+
+
+def _optimizer(config: ReinforceConfig, policy: Policy) -> optax.GradientTransformation:
+    """Return the optimizer of what the method trains."""
+    if config.online.method == "noise":
+        return descent.optimizer()
+    methods = adaptation.methods(policy.model).values()
+    if any(isinstance(method, AdaLoRA) for method in methods):
+        raise ValueError("ada_lora needs a number of steps, which reinforcement learning has not")
+    return make_optimizer(_optim(config), methods)
 
 
 def _optim(config: ReinforceConfig) -> OptimConfig:
@@ -172,6 +199,8 @@ def check_memory(config: ReinforceConfig, environments: Mapping[str, Env]) -> No
     held = 2 * sum(calls)  # those of the calls, and joined
     if config.online.method == "teacher":  # which clones one task after another
         held = max(held, sum(calls) + 2 * max(calls))
+    elif config.online.method == "noise":  # which keeps none
+        held = 2
     pictures = len(Env.cameras) * config.image_size**2 * 3
     needed = held * config.online.worlds * pictures / jax.local_device_count()
     if needed > (available := preflight.available_bytes()):

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
 from flax import nnx
 from rich.console import Console
@@ -12,6 +13,7 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io import native
 from lorasp_jax.base import hub
 from lorasp_jax.config import Config
+from lorasp_jax.models.noise_actor import PATH
 from lorasp_jax.peft import LoRAMoE, LoRASP, LoRASPRelease
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.reinforce.config import ReinforceConfig
@@ -26,11 +28,16 @@ from lorasp_jax.training.start import ADAPTERS, KEPT, with_kept
 
 _ACTING = ("execute_steps", "denoise_steps")
 """Fields of its evaluation that it decides unless they are given: how the policy acts."""
-_OTHERS = {
-    "teacher": ("epochs",),
-    "ppo": ("teacher_worlds", "teacher_learning_rate", "rounds", "gradient_steps"),
-}
-"""Method -> settings of another one."""
+_TEACHERS = tuple(
+    f"online.{name}"
+    for name in ("teacher_worlds", "teacher_learning_rate", "rounds", "gradient_steps")
+)
+_ADAPTERS = (
+    *("online.adapters", "online.correlation", "auxiliary"),
+    *("optim.weight_decay", "optim.b2", "optim.clip_norm", "optim.accumulate"),
+)
+_OTHERS = {"teacher": ("online.epochs",), "ppo": _TEACHERS, "noise": (*_TEACHERS, *_ADAPTERS)}
+"""Method -> settings, or groups of them, of another one."""
 MERGED = "merged"
 """Folder of a base with the adapters of the start run merged into it."""
 
@@ -47,16 +54,20 @@ def resolve(config: ReinforceConfig, given: Collection[str]) -> ReinforceConfig:
             it decides was given; it trained its base; several datasets have statistics or
             cameras of their own; or its adapters cannot be merged into its base.
     """
-    unused = _OTHERS[config.online.method]
-    if wrong := [name for name in unused if f"online.{name}" in given]:
-        raise ValueError(f"online.{wrong[0]} is not for {config.online.method}: drop it")
+    method, groups = config.online.method, {name.partition(".")[0] for name in given}
+    if wrong := [name for name in _OTHERS[method] if name in {*given, *groups}]:
+        raise ValueError(f"{wrong[0]} is not for {method}: drop it")
     if not config.online.start:
+        if method == "noise":
+            raise ValueError("online.method noise needs a finished run: name it with --from")
         return config
     start = Path(config.online.start)
     recorded = recorded_config(start)
     if "distill" in read_json(start / CONFIG_FILE):
         raise ValueError(f"{start} is distilled, which learning would undo: learn, then distill")
     kept = (*KEPT, *(ADAPTERS if config.online.adapters == "continue" else ()))
+    if any(name.startswith("scene.") for name in given):  # the other scene is to be learned
+        kept = tuple(name for name in kept if name != "scene")
     completed = with_kept(config, start, recorded, kept, given)
     tasks = config.tasks if "tasks" in given else recorded.tasks
     if config.online.adapters == "merge":
@@ -101,7 +112,9 @@ def load(config: ReinforceConfig, folder: Path, console: Console, started: float
     setup.check_sizes(config, policy.model.config.chunk)
     run = Run(config, folder, console, base_hash, started)
     run.policy = policy
-    console.print(setup.headline(config, policy.model))
+    frozen = f"scale {config.scale}: the initial noise of a frozen {config.model.backbone}"
+    steers = config.online.method == "noise"
+    console.print(frozen if steers else setup.headline(config, policy.model))
     return run
 
 
@@ -116,5 +129,9 @@ class PolicyExport(Callback):
             export.write(run)
             return
         merged = config.online.adapters == "merge"
-        changes = {"base": hub.portable_path(str(run.folder / MERGED))} if merged else {}
+        changes: dict[str, Any] = {}
+        if merged:
+            changes["base"] = hub.portable_path(str(run.folder / MERGED))
+        if (actor := run.policy.model.noise_actor) is not None:
+            changes[PATH] = actor.get_value().settings
         starts.write(run, Path(config.online.start), **changes)

@@ -18,15 +18,16 @@ import optax
 from envs.env import Env
 from envs.scene.ranges import Randomization
 from lorasp_jax.evaluation.programs import Worlds
+from lorasp_jax.models.perceptron import Network, moments
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor
 from lorasp_jax.reinforce import critic as critics
-from lorasp_jax.reinforce import noise, rollout
+from lorasp_jax.reinforce import descent, noise, rollout
 from lorasp_jax.reinforce.config import Learning
 from lorasp_jax.reinforce.critic import Critic
-from lorasp_jax.reinforce.network import Network, moments
+from lorasp_jax.reinforce.descent import Descent, Learned
 from lorasp_jax.reinforce.rollout import Experience
-from lorasp_jax.reinforce.surrogate import Samples, adapted, clipped_surrogate
+from lorasp_jax.reinforce.surrogate import Samples
 from lorasp_jax.training.random_streams import RandomStream
 
 _WIDTHS, _EPOCHS, _BATCH = (256, 256, 256), 8, 2048  # our choice, like the next ones
@@ -58,7 +59,7 @@ class Teacher:
     def init(cls, key: jax.Array, size: int, length: int, slots: int) -> "Teacher":
         """Create a teacher of states `[D]`, D = `size`, that has learned nothing."""
         network = Network.init(key, (size, *_WIDTHS), (length, slots))
-        return cls(network, _optimizer().init(network.layers), jnp.ones(()), jnp.zeros(()))
+        return cls(network, descent.optimizer().init(network.layers), jnp.ones(()), jnp.zeros(()))
 
 
 class Practice(NamedTuple):
@@ -75,10 +76,6 @@ class Practice(NamedTuple):
     mean: jax.Array
     actions: jax.Array
     noisy: jax.Array
-
-
-def _optimizer() -> optax.GradientTransformation:
-    return optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam())
 
 
 @functools.partial(jax.jit, static_argnums=4)
@@ -189,33 +186,13 @@ def _improve(
     slots: tuple[bool, ...],
 ) -> Teacher:
     """Take gradient steps on minibatches of calls until the teacher has changed enough."""
-    calls, spread, network = found.chunks, noise.Spread.of(learning), teacher.network
+    calls, executed = found.chunks, np.array(slots)
     by_call = lambda x: rollout.by_call(x, calls.actions.shape[1])  # noqa: E731
     valid = by_call(~found.steps.done) & calls.noisy[:, None]
     samples = Samples(calls.actions, by_call(advantages), valid, calls.mean)
+    rate, spread = learning.teacher_learning_rate, noise.Spread.of(learning)
     size = min(_BATCH, len(calls.state) // _MINIBATCHES)
-
-    def step(carry: Any, index: jax.Array) -> tuple[Any, None]:
-        layers, opt_state, within, kl = carry
-        state, rows = jax.tree.map(lambda x: x[index], (calls.state, samples))
-
-        def loss(layers: Any) -> tuple[jax.Array, Any]:
-            mean = dataclasses.replace(network, layers=layers)(state)
-            return clipped_surrogate(mean, rows, spread, np.array(slots), learning.clip)
-
-        gradient, metrics = jax.grad(loss, has_aux=True)(layers)
-        kl = jnp.where(within, metrics["kl"], kl)
-        within &= metrics["kl"] <= learning.max_kl
-        updates, after = _optimizer().update(gradient, opt_state)
-        rate = -learning.teacher_learning_rate * teacher.rate
-        moved = optax.apply_updates(layers, jax.tree.map(lambda x: rate * x, updates))
-        new, old = (moved, after), (layers, opt_state)
-        return (*jax.tree.map(lambda x, y: jnp.where(within, x, y), new, old), within, kl), None
-
-    orders = [jax.random.permutation(k, len(calls.state)) for k in jax.random.split(key, _EPOCHS)]
-    batches = jnp.concatenate([x[: len(x) // size * size].reshape(-1, size) for x in orders])
-    first = network.layers, teacher.opt_state, jnp.bool_(True), jnp.zeros(())
-    (layers, opt_state, _, kl), _ = jax.lax.scan(step, first, batches)
-    network = dataclasses.replace(network, layers=layers)
-    rate = adapted(teacher.rate, kl, learning.max_kl)
-    return Teacher(network, opt_state, rate, teacher.success)
+    settings = Descent(rate, _EPOCHS, size, learning.clip, learning.max_kl)
+    before = Learned(teacher.network, teacher.opt_state, teacher.rate)
+    after, _ = descent.improve(before, calls.state, samples, key, spread, executed, settings)
+    return Teacher(*after, teacher.success)

@@ -18,8 +18,9 @@ from lorasp_jax.adapters.compress.quantization import Kind
 from lorasp_jax.adapters.io import native
 from lorasp_jax.base import hub
 from lorasp_jax.base.digest import digest
-from lorasp_jax.models import backbone
+from lorasp_jax.models import backbone, noise_actor
 from lorasp_jax.models.config import BackboneConfig
+from lorasp_jax.models.noise_actor import NoiseActor
 from lorasp_jax.models.sampling import NUM_STEPS
 from lorasp_jax.policies import tokenizer
 from lorasp_jax.policies.policy import Policy
@@ -72,7 +73,14 @@ def write_variant(
         policy: a policy with adapters, or one without, whose base is then written as well.
         source: folder of the run.
         quantized: how to quantize the base whenever the policy is loaded.
+
+    Raises:
+        ValueError: the policy has learned its initial noise, which is that of its weights.
     """
+    if policy.model.noise_actor is not None:
+        raise ValueError(
+            f"the policy of {source} has learned its initial noise: it has no variants"
+        )
     metadata = describe(source)
     fields = metadata["policy"] | {"config": dataclasses.asdict(policy.model.config)}
     metadata |= {"policy": fields, QUANTIZED: quantized, STEPS: denoise_steps(source)}
@@ -156,6 +164,8 @@ def load_policy(
     """
     recorded = RecordedPolicy.read(folder, base=base, dataset=dataset)
     model = recorded.load_base()
+    if recorded.noise_actor:
+        model = noise_actor.attach(model, recorded.noise_actor)
     if not recorded.is_full:
         model = native.load_adapters(recorded.folder, model, any_base=any_base)
     graphdef, state = nnx.split(quantized(model, recorded.quantized))
@@ -173,6 +183,8 @@ class RecordedPolicy:
         config: of the model.
         is_full: whether the run trained its base, which is then in its folder.
         quantized: how the base is quantized after loading, or None.
+        noise_actor: of the shapes of the policy's, which is saved with its adapters; None: it has
+            none.
         fields: what the processor is made of.
     """
 
@@ -181,6 +193,7 @@ class RecordedPolicy:
     config: BackboneConfig
     is_full: bool
     quantized: Kind | None
+    noise_actor: NoiseActor | None
     fields: Mapping[str, Any] = dataclasses.field(repr=False)
 
     @classmethod
@@ -198,11 +211,13 @@ class RecordedPolicy:
             policy = policy | (policy["datasets"][dataset] if dataset else {})
             config = _config(policy)
             source = folder / BASE if is_full else base or hub.resolve_portable(metadata["base"])
+            chooses = metadata.get(noise_actor.PATH)
+            actor = NoiseActor.blank(config, **chooses) if chooses else None
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} does not describe a policy") from error
         if not source:
             raise ValueError(f"the base of {folder} was randomly initialized and not saved")
-        return cls(folder, source, config, is_full, metadata.get(QUANTIZED), policy)
+        return cls(folder, source, config, is_full, metadata.get(QUANTIZED), actor, policy)
 
     def load_base(self) -> Any:
         """Load the base, not yet quantized; in host memory if it is to be."""

@@ -22,6 +22,7 @@ class RandomStream(enum.IntEnum):
     ROLLOUTS = 8
     """Episodes of online reinforcement learning."""
     TEACHER = 14
+    NOISE_ACTOR = 15
     EVALUATION = 10
     """Evaluations before and during training."""
     FINAL_EVALUATION = 11

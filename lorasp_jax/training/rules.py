@@ -12,6 +12,7 @@ from lorasp_jax.adapters import paths
 from lorasp_jax.config import Config
 from lorasp_jax.dense import AdaptedLayer, AdapterParam
 from lorasp_jax.models import presets
+from lorasp_jax.models.noise_actor import PATH
 from lorasp_jax.peft import Method
 
 TOWERS = ("vision", "language", "action")
@@ -74,7 +75,9 @@ def by_rule(
     for path, parent, name, variable in paths.locate(nnx.List([model]), AdapterParam):
         layer = path.rpartition("/")[0]
         i = paths.find_rule(pairs, layer, *([] if name == "adapter" else [path]))
-        assert i is not None  # `adapt` has used the same rules
+        if i is None:
+            assert path == PATH  # other paths have passed the same rules in `adapt`
+            continue
         row = found[names[i]]
         row["parameters"] += sum(leaf.size for leaf in jax.tree.leaves(variable.get_value()))
         if isinstance(parent, AdaptedLayer) and name in ("adapter", parent.kernel_name):

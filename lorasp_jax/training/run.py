@@ -41,8 +41,8 @@ class Run:
         devices: devices to train on; None: all.
         simulated: whether the tasks can be evaluated in simulation.
         stops: whether training ends with this step, before the last of the config.
-        objective: what to learn in place of the demonstrated actions; only layers that run in each
-            flow step are then trained.
+        objective: what to learn in place of the demonstrated actions.
+        trained: pattern of the paths of the adapters that the run trains; "": all.
         programs: jitted training programs by their inputs; see `program.jit_steps`.
         policy: the current policy; read it in callbacks or after training, since each step donates
             its buffers.
@@ -65,6 +65,7 @@ class Run:
     simulated: bool = True
     stops: bool = False
     objective: Objective | None = None
+    trained: str = ""
     programs: dict[Any, Callable[..., Any]] = field(default_factory=dict)
     policy: Policy = field(init=False)
     seconds: dict[str, float] = field(init=False)
@@ -101,11 +102,10 @@ class Run:
     def split(self) -> tuple[Any, Any, Any]:
         """Split the policy's model into (graphdef, adapters that the run trains, all others)."""
         graphdef, adapters, frozen = adaptation.split(self.policy.model)
-        if not self.objective:
+        if not self.trained:
             return graphdef, adapters, frozen
-        pattern = self.policy.model.flow_layers
-        in_flow = lambda path, _: bool(re.search(pattern, "/".join(map(str, path))))  # noqa: E731
-        adapters, others = nnx.split_state(adapters, in_flow, ...)
+        chosen = lambda path, _: bool(re.search(self.trained, "/".join(map(str, path))))  # noqa: E731
+        adapters, others = nnx.split_state(adapters, chosen, ...)
         return graphdef, adapters, nnx.merge_state(frozen, others)
 
     @contextlib.contextmanager

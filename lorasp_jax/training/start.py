@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 from lorasp_jax.adapters.io import native
 from lorasp_jax.config import Config
+from lorasp_jax.models.noise_actor import PATH
 from lorasp_jax.training import export
 from lorasp_jax.training.export import BASE, describe
 from lorasp_jax.training.run import Run
@@ -31,8 +32,9 @@ def with_kept(
         given: names of the fields that the user set.
 
     Raises:
-        ValueError: a field that the start run decides was given, it trained its base, or it was
-            trained on several datasets that have statistics or cameras of their own.
+        ValueError: a field that the start run decides was given, it trained its base or an actor of
+            its noise, or it was trained on several datasets that have statistics or cameras of
+            their own.
     """
     for name in names:
         values = getattr(config, name), getattr(recorded, name)
@@ -41,12 +43,19 @@ def with_kept(
             raise ValueError(f"--{name.replace('_', '-')} is that of {start}{what}: drop it")
     if (start / BASE).is_dir():
         raise ValueError(f"{start} has no adapters, it trained its base: start from another run")
+    refuse_actor(start, "start from the run that it started from")
     if len(found := export.datasets(describe(start))) > 1:
         raise ValueError(
             f"{start} has statistics or cameras for each of {', '.join(found)}: start from a run "
             "with one dataset"
         )
     return dataclasses.replace(config, **{name: getattr(recorded, name) for name in names})
+
+
+def refuse_actor(run: Path, remedy: str) -> None:
+    """Raise ValueError if the policy of a run has an actor that chooses its noise."""
+    if PATH in describe(run):
+        raise ValueError(f"the policy of {run} has learned its initial noise: {remedy}")
 
 
 def write(run: Run, start: Path, **changes: Any) -> None:

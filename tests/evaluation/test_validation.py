@@ -18,6 +18,7 @@ from lorasp_jax.evaluation import held_out, validation
 from lorasp_jax.evaluation.__main__ import main
 from lorasp_jax.evaluation.held_out import measure, windows
 from lorasp_jax.evaluation.validation import Validation
+from lorasp_jax.models.noise_actor import NoiseActor, attach
 from lorasp_jax.report.html import held_out_verdict, write_report
 from lorasp_jax.training import export, run_folder
 from lorasp_jax.training.loop import train
@@ -189,6 +190,19 @@ def test_errors_by_instruction(recorded):
     assert worst == pytest.approx(off[inside].mean(), rel=1e-5)
     still = np.abs(found.still[:, None] - found.raw.actions)[rows] / spread
     assert result.instructions[phrase][1] == pytest.approx(still[inside].mean(), rel=1e-5)
+
+
+def test_noise_that_a_policy_has_learned_counts(recorded):
+    policy, found = recorded.policy, windows(LeRobot(golden("v3")), OUT, recorded.policy, every=10)
+    actor = NoiseActor.blank(policy.model.config, std=0.999999, widths=(4,))
+    steered = dataclasses.replace(policy, model=attach(policy.model, actor))
+    with mock.patch.object(jax.random, "normal", lambda _, shape: jnp.zeros(shape)):
+        expected = held_out.sample(policy, found, num_steps=2)  # of no noise
+    jax.clear_caches()
+    plain, other = (measure(x, found, num_steps=2) for x in (policy, steered))
+    np.testing.assert_allclose(other.actions, expected, atol=1e-2)
+    assert np.abs(plain.actions - expected).max() > 0.1
+    assert other.loss == pytest.approx(plain.loss, rel=1e-5)
 
 
 def test_fewer_windows_on_a_cpu(recorded, monkeypatch):

@@ -41,7 +41,7 @@ def adapters(run):
     return leaves(adaptation.split(run.policy.model)[1])
 
 
-@pytest.fixture(scope="module", params=["ppo", "teacher"])
+@pytest.fixture(scope="module", params=["ppo", "teacher", "noise"])
 def whole(request, tmp_path_factory):
     """An uninterrupted run."""
     patch = pytest.MonkeyPatch()
@@ -60,9 +60,10 @@ def test_a_run_logs_what_the_report_shows(whole):
     assert np.all(np.diff([row["minutes"] for row in rows]) > 0)
     names = {"rollout/press", "start_kl", "explained_variance/press"}
     assert any(row["updates"] for row in rows)
-    if whole.config.online.method == "ppo":
+    if whole.config.online.method != "teacher":
         names |= {"kl", "clipped"}
         assert rows[0]["updates"] == 0  # the critic learns first
+        assert ("noise_effect" in rows[0]) == (whole.config.online.method == "noise")
     else:
         names |= {"teacher/press", "task"}
     assert names <= set().union(*rows)

@@ -49,6 +49,12 @@ def test_the_start_run_decides(few):
     assert (config.online.std, config.name) == (0.2, "reinforce")
 
 
+def test_another_scene_can_be_learned(few):
+    assert not resolve("--from", few).scene.changed()
+    scene = resolve("--from", few, "--scene.brightness", 0.9, 1.1).scene
+    assert scene.changed() == {"brightness": (0.9, 1.1)}
+
+
 def test_a_run_is_recorded_and_read_again(few, tmp_path):
     config = resolve("--from", few)
     write_json(tmp_path / "config.json", to_json(config))

@@ -46,6 +46,10 @@ def test_flow_steps(tmp_path):
     rebuild("flow_steps", tmp_path)
 
 
+def test_reinforce(tmp_path):
+    rebuild("reinforce", tmp_path)
+
+
 def test_latency(tmp_path):
     rebuild("latency", tmp_path)
 

@@ -167,11 +167,11 @@ def _parts(
     location: paths.Location, matrices: Sequence[int] | None
 ) -> list[tuple[tuple[int, ...], np.ndarray]]:
     """Index and value, in torch's layout, of each layer of a stacked parameter."""
-    value, name = np.asarray(location.child.get_value(), np.float32), location.name
+    name = location.name
     dense = isinstance(location.parent, nnx.Linear | Dense)
     if name not in _TORCH_NAMES or (name == "kernel" and not dense):
         raise ValueError(f"{location.path} is fully trained, but PEFT cannot store it")
-    parts = []
+    value, parts = np.asarray(location.child.get_value(), np.float32), []
     for index in np.ndindex(*_stack(name, value.shape, matrices)):
         part = value[index]
         part = part.T if name == "kernel" else part if name == "embedding" else part.ravel()

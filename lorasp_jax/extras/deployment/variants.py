@@ -11,7 +11,7 @@ import lorasp_jax
 from lorasp_jax.base import compilation_cache as cache
 from lorasp_jax.base.files import check_local
 from lorasp_jax.extras.study.held_out import held_out_demonstrations
-from lorasp_jax.training import export, rules
+from lorasp_jax.training import export, rules, start
 from lorasp_jax.training.base import in_bf16, quantized
 from lorasp_jax.training.demonstrations import Demonstrations
 from lorasp_jax.training.finished_run import recorded_config
@@ -105,8 +105,12 @@ def on_base(policy: lorasp_jax.policies.Policy, base: str) -> lorasp_jax.policie
 
 
 def check_run(run: Path) -> None:
-    """Raise ValueError unless a run is finished, can be simulated, and has LoRA-SP layers."""
+    """Raise ValueError unless a run is finished, can be simulated, and has LoRA-SP layers.
+
+    A run that has learned its noise is refused, too: other weights need other noise.
+    """
     config = recorded_config(run)
+    start.refuse_actor(run, "make variants of the run that it started from")
     if not any(map(is_bank, rules.methods(config))):
         name = rules.describe(config)
         raise ValueError(f"{run} was trained with {name}: only LoRA-SP runs have variants")

@@ -72,12 +72,15 @@ class Bases:
             load: whether to load a base that no earlier run has.
 
         Raises:
-            ValueError: the run trained its base or splits kernels, its files are damaged, or it has
-                another base than it records, or than those loaded if `load` is false.
+            ValueError: the run trained its base or an actor of its noise, or splits kernels, its
+                files are damaged, or it has another base than it records, or than those loaded if
+                `load` is false.
         """
         folder = recorded.folder
         if recorded.is_full:
             raise ValueError(f"{folder} trained its base, so it cannot share one")
+        if recorded.noise_actor:
+            raise ValueError(f"{folder} has learned its noise: serve it on its own")
         description, kind = native.read_description(folder), recorded.quantized
         saved, digest = description["weights"], description["base"]
         if not saved and not self._any_base:
@@ -101,14 +104,15 @@ class Bases:
 
     @staticmethod
     def can_share(run: str, base: str = "") -> bool:
-        """Whether the adapters of a run leave its base as it is; says so if they do not."""
+        """Whether the adapters of a run can share its base; says so if they cannot."""
         recorded = RecordedPolicy.read(run, base=base)
         settings = {} if recorded.is_full else native.read_description(recorded.folder)["methods"]
         methods = map(peft.from_settings, settings.values())
         changes = recorded.is_full or any(method.splits_kernel for method in methods)
-        if changes:
-            print(f"{run} changes its base, so it has a copy of its own", file=sys.stderr)
-        return not changes
+        if changes or recorded.noise_actor:
+            why = "changes its base" if changes else "has learned its noise"
+            print(f"{run} {why}, so it has a copy of its own", file=sys.stderr)
+        return not (changes or recorded.noise_actor)
 
 
 def is_shared(policy: Any) -> bool:

@@ -79,7 +79,7 @@ def _derive(job: Job) -> dict[str, Any]:
 def _finish(job: Job, run: Run, source: lorasp_jax.policies.Policy | None) -> dict[str, Any]:
     """Return what cell.json records about a run, whose policy simulation may have evaluated."""
     with run.timed("evaluate"):
-        found = (job.cell.evaluate or _simulated)(run)
+        found = (job.cell.evaluate or simulated)(run)
     if job.measure:
         with run.timed("measure"):
             episodes = held_out_demonstrations(job.study_folder, run.config)
@@ -87,7 +87,7 @@ def _finish(job: Job, run: Run, source: lorasp_jax.policies.Policy | None) -> di
     return {**found, "provenance": provenance(), "seconds": dict(run.seconds)}
 
 
-def _simulated(run: Run) -> dict[str, Any]:
+def simulated(run: Run) -> dict[str, Any]:
     """Return what cell.json takes from results.json.
 
     Raises:

@@ -28,6 +28,7 @@ from lorasp_jax.base.writing import write_bytes
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models import backbone
 from lorasp_jax.models.checkpoints.tensor_files import INDEX, TensorFiles, weight_files
+from lorasp_jax.models.noise_actor import PATH
 
 CONFIG = "config.json"
 SHARD_BYTES = 15 * 2**20 - 2**16
@@ -87,12 +88,14 @@ def base_arrays(model: nnx.Module) -> dict[str, np.ndarray]:
     """Return every parameter of a model by "/"-joined path, in its own dtype.
 
     Raises:
-        ValueError: the model has adapters or quantized kernels.
+        ValueError: the model has adapters, quantized kernels, or an actor of its noise.
     """
     if jax.tree.leaves(nnx.state(model, (AdapterParam, AdapterSetParam))):
         raise ValueError("saving needs a model without adapters: merge them or save them apart")
     if is_quantized(model):
         raise ValueError("saving needs unquantized kernels: save the base before quantizing")
+    if getattr(model, PATH, None) is not None:
+        raise ValueError("saving needs a model that has not learned its initial noise")
     return {name: np.asarray(leaf) for name, leaf in named_arrays(model).items()}
 
 

@@ -88,7 +88,7 @@ def test_rows_that_the_device_computes_wrongly_fail_the_cell(tmp_path):
     }
     write_json(tmp_path / "results.json", tree)
     with pytest.raises(ValueError, match="success depends on bit 0 of an episode's index"):
-        run_cell._simulated(run)
+        run_cell.simulated(run)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""A multilayer perceptron on the simulator's full state."""
+"""A multilayer perceptron that normalizes its inputs, such as the simulator's full state."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,0 +1,1 @@
+"""How far does trial in simulation take a policy of few demonstrations?"""

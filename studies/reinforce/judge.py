@@ -1,0 +1,107 @@
+"""Let the policy of a finished cell learn from success."""
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from envs import Randomization
+from lorasp_jax.config import OptimConfig
+from lorasp_jax.evaluation.callback import Evaluation
+from lorasp_jax.extras.study.run_cell import simulated
+from lorasp_jax.peft import Method
+from lorasp_jax.reinforce import loop, start
+from lorasp_jax.reinforce.config import Learning, ReinforceConfig
+from lorasp_jax.training.run import Run
+from lorasp_jax.training.run_folder import read_metrics
+from studies.few import judge as scenes
+
+_RECORDED = ("step", "minutes", "environment_steps")
+
+
+@dataclass(frozen=True)
+class Trial:
+    """How a policy learns from success.
+
+    Attributes:
+        every: iterations between evaluations.
+        method: of new adapters, after those of the start are merged; None: those learn further.
+        scene: what the episodes of learning draw; None: nothing.
+        tasks: that are learned; empty: all of the start.
+    """
+
+    learning: Learning
+    optim: OptimConfig
+    every: int
+    method: Method | None = None
+    scene: Randomization | None = None
+    tasks: tuple[str, ...] = ()
+
+    def describe(self) -> dict[str, Any]:
+        """Return all settings as JSON values."""
+        name = {"name": self.method.name} if self.method else {}
+        found = json.loads(json.dumps(dataclasses.asdict(self)))
+        for setting in ("scene", "tasks"):
+            if not getattr(self, setting):
+                del found[setting]  # as in results from before there was one
+        return {"trial": found | name}
+
+    def config(self, run: Run) -> ReinforceConfig:
+        """Return the config for a derived cell, whose source is the start of the same seed."""
+        source = run.folder.parents[1] / "start" / run.folder.name
+        adapters = "merge" if self.method else "continue"
+        evaluation = dataclasses.replace(run.config.evaluation, before=True, every=self.every)
+        fields = {x.name: getattr(run.config, x.name) for x in dataclasses.fields(run.config)}
+        fields |= {
+            "peft": self.method or run.config.peft,
+            "tasks": self.tasks or run.config.tasks,
+            "optim": self.optim,
+            "evaluation": evaluation,
+            "log_every": 1,
+            "checkpoint_every": self.optim.steps,
+            "online": dataclasses.replace(self.learning, start=str(source), adapters=adapters),
+        }
+        if self.scene:
+            fields["scene"] = self.scene
+        given = [
+            *(("scene.light_turn",) if self.scene else ()),
+            *(("tasks",) if self.tasks else ()),
+        ]
+        return start.resolve(ReinforceConfig(**fields), given)
+
+
+def judge(run: Run, trial: Trial) -> dict[str, Any]:
+    """Return what simulation says of the policy that has learned, and its progress.
+
+    That is a row per iteration: minutes, environment steps, and success by task of the policy's and
+    the teachers' own episodes and, if evaluated, on fixed layouts. `shifted` has the outcomes in a
+    shifted scene, such as "after/pour", if all tasks were learned.
+    """
+    folder = run.folder / "learned"
+    folder.mkdir(exist_ok=True)
+    learned = start.load(trial.config(run), folder, run.console, 0.0)
+    loop.train(learned, [start.PolicyExport(), Evaluation(media=False)], resume=True)
+    kinds = ("success/", "rollout/", "teacher/", "active_rank")
+    progress = [
+        {k: round(x, 4) for k, x in row.items() if k in _RECORDED or k.startswith(kinds)}
+        for row in read_metrics(folder)
+    ]
+    found = simulated(learned)
+    if trial.scene:  # its evaluation drew scenes, too
+        found["outcomes"] = _outcomes(learned, "recorded")
+    found |= {"progress": progress}
+    return found if trial.tasks else {**found, "shifted": _shifted(run, learned)}
+
+
+def _shifted(run: Run, learned: Run) -> dict[str, str]:
+    return {
+        f"{when}/{task}": outcomes
+        for when, policy in (("before", run), ("after", learned))
+        for task, outcomes in _outcomes(policy, "shifted").items()
+    }
+
+
+def _outcomes(run: Run, scene: str) -> dict[str, str]:
+    """Return the outcomes of a run's policy in a scene by task."""
+    found = scenes.judge(run, (scene,))["outcomes"]
+    return {name.partition("/")[2]: outcomes for name, outcomes in found.items()}

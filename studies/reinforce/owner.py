@@ -1,0 +1,89 @@
+"""One task from few own episodes of a policy, as the owner of a robot would learn it."""
+
+import dataclasses
+import functools
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal
+
+from envs.datasets import rlds
+from lorasp_jax.config import AugmentConfig, OptimConfig
+from lorasp_jax.evaluation import recording
+from lorasp_jax.evaluation.callback import Evaluation
+from lorasp_jax.extras.study import Derived
+from lorasp_jax.extras.study.held_out import shared_demonstrations
+from lorasp_jax.extras.study.run_cell import simulated
+from lorasp_jax.reinforce.config import Learning
+from lorasp_jax.training import loop, setup
+from lorasp_jax.training.export import Export
+from lorasp_jax.training.run import Run
+from studies.reinforce import page
+from studies.reinforce.judge import Trial
+from studies.reinforce.judge import judge as judge_online
+
+Learn = Literal["imitation", "filtered", "recap"]
+EPISODES = {50: (10, 5), 200: (25, 8), 1000: (50, 20)}
+"""Number of episodes -> worlds and iterations of learning in noise space."""
+_NOISE = Learning(method="noise", std=0.5, epochs=8, max_kl=0.04)
+_OPTIM = OptimConfig(batch_size=512, learning_rate=1e-3)
+
+
+def cells(
+    backbone: str, count: int, seed: int, numbers: Mapping[int, tuple[int, int]]
+) -> Iterator[Derived]:
+    """Yield the policies of a start; `numbers` as `EPISODES`."""
+    yield _offline(backbone, count, seed, "imitation", 0)
+    for episodes, (worlds, iterations) in numbers.items():
+        yield _offline(backbone, count, seed, "filtered", episodes)
+        yield _offline(backbone, count, seed, "recap", episodes)
+        learning = dataclasses.replace(_NOISE, worlds=worlds)
+        optim = dataclasses.replace(_OPTIM, steps=iterations)
+        trial = Trial(learning, optim, every=iterations, tasks=(page.OWNED,))
+        evaluate = functools.partial(judge_online, trial=trial)
+        settings = trial.describe()
+        yield _cell(backbone, count, seed, f"noise_{episodes}", settings, evaluate)
+
+
+def _offline(backbone: str, count: int, seed: int, learn: Learn, episodes: int) -> Derived:
+    settings = {"task": page.OWNED, "learn": learn, "episodes": episodes}
+    evaluate = functools.partial(judge, **settings)
+    return _cell(backbone, count, seed, f"{learn}_{episodes}", {"offline": settings}, evaluate)
+
+
+def _cell(
+    backbone: str, count: int, seed: int, name: str, settings: dict[str, Any], evaluate: Any
+) -> Derived:
+    name, start = (page.cell(backbone, count, policy, seed) for policy in (name, "start"))
+    return Derived(name, start, settings=settings, evaluate=evaluate, measured=False)
+
+
+def judge(run: Run, task: str, learn: Learn, episodes: int) -> dict[str, Any]:
+    """Record episodes of a task, train on them and the start's demonstrations, and evaluate.
+
+    The adapters are new, as `train.py --data.source` makes them; without episodes, they learn the
+    demonstrations alone.
+    """
+    folder, study_folder = run.folder, run.folder.parents[3]
+    single = dataclasses.replace(run.config, tasks=(task,))
+    sources = [folder / "demonstrations", *([folder / "tries"] if episodes else [])]
+    if not sources[0].exists():
+        shared = shared_demonstrations(study_folder, 0, single, folder, lambda *_: None)
+        rlds.write(shared[task], sources[0])
+    if episodes and not sources[1].exists():
+        seed = run.config.seed
+        recording.write(
+            run.policy, single, task, sources[1], episodes, seed=seed, progress=lambda _: None
+        )
+    data = dataclasses.replace(
+        single.data,
+        source=tuple(map(str, sources)),
+        episodes=type(single.data).episodes,
+        augment=AugmentConfig("none"),
+        validation=("0",),
+    )
+    config = dataclasses.replace(single, data=data, learn=learn)
+    learned_folder = folder / "learned"
+    learned_folder.mkdir(exist_ok=True)
+    learned = setup.prepare(config, learned_folder, run.console, time.perf_counter())
+    loop.train(learned, [Export(), Evaluation(media=False)], resume=True)
+    return simulated(learned)

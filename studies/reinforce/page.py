@@ -1,0 +1,272 @@
+"""The tables and figures of README.md, from the results of all policies alone."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+
+from lorasp_jax.evaluation.figure_style import STYLE
+from lorasp_jax.extras.study import Study, page, statistics
+from lorasp_jax.extras.study import figure as figures
+from lorasp_jax.extras.study.page import BACKBONES
+from lorasp_jax.extras.study.study import Results
+
+COUNTS = (16, 32, 64)
+CEILING = 512
+"""Demonstrations of imitation alone."""
+SEEDS = (0, 1, 2)
+PILOTS = {
+    "start": "before",
+    "short": "30 iterations: 5 rounds of teachers, 256 worlds, 300 gradient steps",
+    "long": "12 iterations: 15, 256, 1,000",
+    "wide": "12 iterations: 15, 512, 1,000",
+}
+PILOT_SEED = 1000
+"""In no table but that of pilots."""
+TASKS = ("open_pot", "pour", "press", "pick_place")
+HARD = ("pour", "pick_place")
+OWNED = "pick_place"
+"""The task of few own episodes."""
+EPISODES = (50, 200, 1000)
+OWNERS = {"filtered": "`--learn filtered`", "recap": "`--learn recap`", "noise": "noise space"}
+RANKS = {
+    "r1": "LoRA, r = 1",
+    "r4": "LoRA, r = 4",
+    "r16": "LoRA, r = 16",
+    "r64": "LoRA, r = 64",
+    "lora_sp": "LoRA-SP, R = 64",
+    "full": "full",
+}
+"""New adapters that learn from success after those of the start are merged."""
+COLORS = {16: "#4269d0", 32: "#ff725c", 64: "#3ca951"}
+
+
+def cell(backbone: str, count: int, policy: str, seed: int) -> str:
+    """Return the name of a policy."""
+    return f"{backbone}/n{count}/{policy}/s{seed}"
+
+
+def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
+    """Write the figure into `folder`; return the tables, with the seeds that have run."""
+    seeds = {(b, n): _seeds(results, b, n, "start", "teacher") for b in BACKBONES for n in COUNTS}
+    _figure(results, folder / "progress.svg")
+    return {
+        "success": _success_table(results, seeds),
+        "tasks": _task_table(results, seeds),
+        "ranks": _rank_table(results),
+        "scenes": _scene_table(results),
+        "owner": _owner_table(results),
+        "pilots": _pilot_table(results),
+    }
+
+
+def _seeds(results: Results, backbone: str, count: int, *policies: str) -> list[int]:
+    """Return the seeds whose policies have all run."""
+    return [s for s in SEEDS if all(cell(backbone, count, p, s) in results for p in policies)]
+
+
+def _outcomes(
+    results: Results,
+    where: tuple[str, int],
+    policy: str,
+    seeds: Sequence[int],
+    tasks: Sequence[str] = TASKS,
+) -> np.ndarray:
+    """Stack the episodes of a policy's seeds, bool `[S, T, N]`."""
+    found = [results[cell(*where, policy, seed)]["outcomes"] for seed in seeds]
+    return statistics.outcomes([[{"outcomes": {t: x[t] for t in tasks}}] for x in found])
+
+
+def _success_table(results: Results, seeds: dict[tuple[str, int], list[int]]) -> str:
+    """Return success before and after, and what it took."""
+    rows = []
+    for (backbone, count), own in seeds.items():
+        row = [BACKBONES[backbone], str(count), str(len(own))]
+        if own:
+            at = results, (backbone, count)
+            stacked = [
+                _outcomes(*at, policy, own, tasks)
+                for tasks in (TASKS, HARD)
+                for policy in ("start", "teacher")
+            ]
+            row += [page.percent(statistics.success(x)) for x in stacked]
+            row += [f"{_last(*at, own, 'environment_steps') / 1e6:.1f} M"]
+            row += [f"{_last(*at, own, 'minutes'):.0f}"]
+        rows.append(row + [page.NONE] * (9 - len(row)))
+    for backbone in BACKBONES:
+        own = _seeds(results, backbone, CEILING, "imitation")
+        row = [BACKBONES[backbone], f"{CEILING}, imitation alone", str(len(own))]
+        if own:
+            at = results, (backbone, CEILING), "imitation", own
+            estimates = [statistics.success(_outcomes(*at, tasks)) for tasks in (TASKS, HARD)]
+            row += [page.NONE, page.percent(estimates[0]), page.NONE, page.percent(estimates[1])]
+            seconds = [results[cell(backbone, CEILING, "imitation", s)]["seconds"] for s in own]
+            row += [page.NONE, f"{np.mean([x['total'] for x in seconds]) / 60:.0f}"]
+        rows.append(row + [page.NONE] * (9 - len(row)))
+    heads = ("", "demonstrations", "seeds", "before", "after")
+    hard = " and ".join(HARD)
+    return page.table(
+        [*heads, f"{hard}, before", f"{hard}, after", "environment steps", "minutes"], rows
+    )
+
+
+def _last(results: Results, where: tuple[str, int], seeds: Sequence[int], name: str) -> float:
+    """Return the mean over seeds of what the last row of progress says."""
+    found = [results[cell(*where, "teacher", s)]["progress"][-1][name] for s in seeds]
+    return float(np.mean(found))
+
+
+def _task_table(results: Results, seeds: dict[tuple[str, int], list[int]]) -> str:
+    """Return the gains by task over paired episodes."""
+    rows = []
+    for (backbone, count), own in seeds.items():
+        gains = [
+            page.points(
+                statistics.difference(
+                    *(
+                        _outcomes(results, (backbone, count), policy, own, [task])
+                        for policy in ("teacher", "start")
+                    )
+                )
+            )
+            for task in (TASKS if own else ())
+        ]
+        rows.append([BACKBONES[backbone], str(count), *(gains or [page.NONE] * len(TASKS))])
+    return page.table(["gain [points]", "demonstrations", *TASKS], rows)
+
+
+def _rank_table(results: Results) -> str:
+    """Return success of new adapters by their rank."""
+    rows = []
+    for name, label in RANKS.items():
+        row = [label]
+        for backbone in BACKBONES:
+            where = backbone, COUNTS[0]
+            own = _seeds(results, *where, name)
+            row.append(str(len(own)))
+            estimates = [
+                page.percent(statistics.success(_outcomes(results, where, name, own, tasks)))
+                for tasks in ((TASKS, HARD) if own else ())
+            ]
+            row += estimates or [page.NONE, page.NONE]
+        rows.append(row)
+    heads = [
+        f"{label}, {what}"
+        for label in BACKBONES.values()
+        for what in ("seeds", "four tasks", " and ".join(HARD))
+    ]
+    return page.table([f"new adapters, N = {COUNTS[0]}", *heads], rows)
+
+
+def _scene_table(results: Results) -> str:
+    """Return success as recorded and in a shifted scene."""
+    rows = []
+    for backbone in BACKBONES:
+        where = backbone, COUNTS[0]
+        for label, name, when in (
+            ("before", "teacher", "before"),
+            ("learned as recorded", "teacher", "after"),
+            ("learned in shifted scenes", "randomized", "after"),
+        ):
+            own = _seeds(results, *where, "start", name)
+            row = [BACKBONES[backbone], label, str(len(own))]
+            if own:
+                policy = "start" if when == "before" else name
+                stacked = [
+                    _outcomes(results, where, policy, own),
+                    _shifted(results, where, name, own, when),
+                ]
+                row += [page.percent(statistics.success(x)) for x in stacked]
+            rows.append(row + [page.NONE] * (5 - len(row)))
+    return page.table([f"N = {COUNTS[0]}", "", "seeds", "as recorded", "shifted"], rows)
+
+
+def _shifted(
+    results: Results, where: tuple[str, int], name: str, seeds: Sequence[int], when: str
+) -> np.ndarray:
+    """Stack the episodes of a policy's seeds in a shifted scene."""
+    found = [results[cell(*where, name, seed)]["shifted"] for seed in seeds]
+    return statistics.outcomes(
+        [[{"outcomes": {t: x[f"{when}/{t}"] for t in TASKS}}] for x in found]
+    )
+
+
+def _owner_table(results: Results) -> str:
+    """Return success in one task by the number of own episodes."""
+    rows = []
+    for backbone in BACKBONES:
+        cases = {"before": ("start",), "its 16 demonstrations alone": ("imitation_0",)}
+        cases |= {label: tuple(f"{x}_{n}" for n in EPISODES) for x, label in OWNERS.items()}
+        for label, names in cases.items():
+            row = [BACKBONES[backbone], label]
+            for name in names:
+                own = _seeds(results, backbone, COUNTS[0], name)
+                where = results, (backbone, COUNTS[0]), name, own, [OWNED]
+                row.append(
+                    page.percent(statistics.success(_outcomes(*where))) if own else page.NONE
+                )
+            at = 3 - len(names)
+            rows.append([*row, *[""] * at])
+    return page.table([OWNED, "", *(f"{n} episodes" for n in EPISODES)], rows)
+
+
+def _pilot_table(results: Results) -> str:
+    """Return success of the pilots that have run."""
+    rows = []
+    for name, label in PILOTS.items():
+        row = [label]
+        for backbone in BACKBONES:
+            where = backbone, COUNTS[0]
+            there = cell(*where, name, PILOT_SEED) in results
+            row += [
+                f"{100 * _outcomes(results, where, name, [PILOT_SEED], tasks).mean():.1f}"
+                if there
+                else page.NONE
+                for tasks in (TASKS, HARD)
+            ]
+        rows.append(row)
+    heads = [
+        f"{label}, {what}"
+        for label in BACKBONES.values()
+        for what in ("four tasks", " and ".join(HARD))
+    ]
+    return page.table(["pilots", *heads], rows)
+
+
+@mpl.rc_context(STYLE)
+def _figure(results: Results, path: Path) -> None:
+    """Draw success on fixed layouts over minutes: a panel per backbone, a line per run."""
+    figure = Figure(figsize=(8, 3), layout="constrained")
+    axes = figure.subplots(1, len(BACKBONES), sharey=True)
+    pilot = (COUNTS[0], "wide", PILOT_SEED)
+    for axis, backbone in zip(axes, BACKBONES, strict=True):
+        for case in [pilot, *((n, "teacher", s) for n in COUNTS for s in SEEDS)]:
+            if (name := cell(backbone, *case)) not in results:
+                continue
+            label = "N = 16, pilot" if case == pilot else f"N = {case[0]}, seed {case[2]}"
+            style = {"linestyle": "dashed" if case == pilot else "solid", "marker": "."}
+            minutes, rates = _progress(results[name])
+            axis.plot(minutes, 100 * rates, color=COLORS[case[0]], label=label, **style)
+        axis.set_title(BACKBONES[backbone], loc="left")
+        axis.set_xlabel("minutes")
+        axis.set_ylim(0, 100)
+        if axis.lines:
+            axis.legend(fontsize="x-small")
+    axes[0].set_ylabel("success [%]")
+    figures.write(figure, path, "reinforce")
+
+
+def _progress(result: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the minutes and the mean success of the evaluations of a run, from the start on."""
+    evaluated = [row for row in result["progress"] if f"success/{TASKS[0]}" in row]
+    minutes = [0.0, *(row["minutes"] for row in evaluated)]
+    before = np.mean([_rate(result["before"][task]) for task in TASKS])
+    rates = [before, *(np.mean([row[f"success/{task}"] for task in TASKS]) for row in evaluated)]
+    return np.array(minutes), np.array(rates)
+
+
+def _rate(outcomes: str) -> float:
+    return outcomes.count("1") / len(outcomes)
