@@ -21,5 +21,7 @@ def get_config(scale: str) -> ReinforceConfig:
         steps={"smoke": 2, "cpu": 30, "accelerator": 60}[scale],
         batch_size={"smoke": 64, "cpu": 512, "accelerator": 2048}[scale],
     )
-    learning = dataclasses.replace(config.online, method="noise", std=0.5, epochs=8, max_kl=0.04)
+    settings = {"method": "noise", "std": 0.5, "epochs": 8, "max_kl": 0.04}
+    worlds = {"smoke": 16, "cpu": 128, "accelerator": 512}[scale]
+    learning = dataclasses.replace(config.online, worlds=worlds, **settings)
     return dataclasses.replace(config, name="noise_space", optim=optim, online=learning)
