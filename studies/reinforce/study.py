@@ -1,7 +1,7 @@
 """How far does trial in simulation take a policy of few demonstrations, and with which rank?
 
     lorasp-jax study --config studies/reinforce/study.py \\
-        --results studies/reinforce/results.json --jobs 4
+        --results studies/reinforce/results.json --jobs 5
 
 A policy learns four tasks from N demonstrations of each, then from success alone. `imitation`
 trains on many demonstrations instead, `randomized` learns in scenes that change. The policies of
