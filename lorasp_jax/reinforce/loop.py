@@ -119,7 +119,7 @@ class _Clock:
             round(sum(config.online.worlds * row[f"rollout/{task}"] for task in config.tasks))
             for row in (values, self._first)
         )
-        found = now or any(values.get(f"teacher/{task}", 0) for task in config.tasks)
+        found = now or first or any(values.get(f"teacher/{task}", 0) for task in config.tasks)
         if config.online.reward == "sparse" and not found:
             return "no episode succeeded: start from a run that succeeds more often"
         if (kl := values.get("start_kl", 0)) > config.online.max_start_kl:

@@ -66,9 +66,10 @@ def resolve(config: ReinforceConfig, given: Collection[str]) -> ReinforceConfig:
     if "distill" in read_json(start / CONFIG_FILE):
         raise ValueError(f"{start} is distilled, which learning would undo: learn, then distill")
     kept = (*KEPT, *(ADAPTERS if config.online.adapters == "continue" else ()))
-    if any(name.startswith("scene.") for name in given):  # the other scene is to be learned
-        kept = tuple(name for name in kept if name != "scene")
-    completed = with_kept(config, start, recorded, kept, given)
+    ranges = {name: getattr(config.scene, name) for name in _scene_fields(given)}
+    scene = dataclasses.replace(recorded.scene, **ranges)  # another scene may be learned
+    completed = with_kept(config, start, recorded, [x for x in kept if x != "scene"], given)
+    completed = dataclasses.replace(completed, scene=scene)
     tasks = config.tasks if "tasks" in given else recorded.tasks
     if config.online.adapters == "merge":
         _check_mergeable(start, recorded)
@@ -79,6 +80,10 @@ def resolve(config: ReinforceConfig, given: Collection[str]) -> ReinforceConfig:
     acting = {name: x for name, x in acting.items() if f"evaluation.{name}" not in given}
     evaluation = dataclasses.replace(config.evaluation, **acting)
     return dataclasses.replace(completed, tasks=tasks, evaluation=evaluation)
+
+
+def _scene_fields(given: Collection[str]) -> list[str]:
+    return [name.partition(".")[2] for name in given if name.startswith("scene.")]
 
 
 def _check_mergeable(start: Path, recorded: Config) -> None:

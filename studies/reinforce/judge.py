@@ -63,10 +63,8 @@ class Trial:
         }
         if self.scene:
             fields["scene"] = self.scene
-        given = [
-            *(("scene.light_turn",) if self.scene else ()),
-            *(("tasks",) if self.tasks else ()),
-        ]
+        changed = self.scene.changed() if self.scene else {}
+        given = [f"scene.{name}" for name in changed] + ["tasks"] * bool(self.tasks)
         return start.resolve(ReinforceConfig(**fields), given)
 
 
@@ -74,8 +72,9 @@ def judge(run: Run, trial: Trial) -> dict[str, Any]:
     """Return what simulation says of the policy that has learned, and its progress.
 
     That is a row per iteration: minutes, environment steps, and success by task of the policy's and
-    the teachers' own episodes and, if evaluated, on fixed layouts. `shifted` has the outcomes in a
-    shifted scene, such as "after/pour", if all tasks were learned.
+    the teachers' own episodes and, if evaluated, on fixed layouts, in the scenes of learning, as
+    `before` is. `shifted` has the outcomes in a shifted scene, such as "after/pour", if all tasks
+    were learned.
     """
     folder = run.folder / "learned"
     folder.mkdir(exist_ok=True)

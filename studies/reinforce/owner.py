@@ -29,13 +29,13 @@ _OPTIM = OptimConfig(batch_size=512, learning_rate=1e-3)
 
 
 def cells(
-    backbone: str, count: int, seed: int, numbers: Mapping[int, tuple[int, int]]
+    backbone: str, count: int, seed: int, pool: int, numbers: Mapping[int, tuple[int, int]]
 ) -> Iterator[Derived]:
-    """Yield the policies of a start; `numbers` as `EPISODES`."""
-    yield _offline(backbone, count, seed, "imitation", 0)
+    """Yield the policies of a start; `pool` as in its cell, `numbers` as `EPISODES`."""
+    yield _offline(backbone, count, seed, pool, "imitation", 0)
     for episodes, (worlds, iterations) in numbers.items():
-        yield _offline(backbone, count, seed, "filtered", episodes)
-        yield _offline(backbone, count, seed, "recap", episodes)
+        yield _offline(backbone, count, seed, pool, "filtered", episodes)
+        yield _offline(backbone, count, seed, pool, "recap", episodes)
         learning = dataclasses.replace(_NOISE, worlds=worlds)
         optim = dataclasses.replace(_OPTIM, steps=iterations)
         trial = Trial(learning, optim, every=iterations, tasks=(page.OWNED,))
@@ -44,8 +44,10 @@ def cells(
         yield _cell(backbone, count, seed, f"noise_{episodes}", settings, evaluate)
 
 
-def _offline(backbone: str, count: int, seed: int, learn: Learn, episodes: int) -> Derived:
-    settings = {"task": page.OWNED, "learn": learn, "episodes": episodes}
+def _offline(
+    backbone: str, count: int, seed: int, pool: int, learn: Learn, episodes: int
+) -> Derived:
+    settings = {"task": page.OWNED, "learn": learn, "episodes": episodes, "pool": pool}
     evaluate = functools.partial(judge, **settings)
     return _cell(backbone, count, seed, f"{learn}_{episodes}", {"offline": settings}, evaluate)
 
@@ -57,7 +59,7 @@ def _cell(
     return Derived(name, start, settings=settings, evaluate=evaluate, measured=False)
 
 
-def judge(run: Run, task: str, learn: Learn, episodes: int) -> dict[str, Any]:
+def judge(run: Run, task: str, learn: Learn, episodes: int, pool: int) -> dict[str, Any]:
     """Record episodes of a task, train on them and the start's demonstrations, and evaluate.
 
     The adapters are new, as `train.py --data.source` makes them; without episodes, they learn the
@@ -67,7 +69,7 @@ def judge(run: Run, task: str, learn: Learn, episodes: int) -> dict[str, Any]:
     single = dataclasses.replace(run.config, tasks=(task,))
     sources = [folder / "demonstrations", *([folder / "tries"] if episodes else [])]
     if not sources[0].exists():
-        shared = shared_demonstrations(study_folder, 0, single, folder, lambda *_: None)
+        shared = shared_demonstrations(study_folder, pool, single, folder, lambda *_: None)
         rlds.write(shared[task], sources[0])
     if episodes and not sources[1].exists():
         seed = run.config.seed

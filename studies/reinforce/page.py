@@ -20,7 +20,7 @@ CEILING = 512
 SEEDS = (0, 1, 2)
 PILOTS = {
     "start": "before",
-    "short": "30 iterations: 5 rounds of teachers, 256 worlds, 300 gradient steps",
+    "short": "16 and 18 of 30 iterations: 5 rounds of teachers, 256 worlds, 300 gradient steps",
     "long": "12 iterations: 15, 256, 1,000",
     "wide": "12 iterations: 15, 512, 1,000",
 }

@@ -28,9 +28,9 @@ METHODS: dict[str, Method] = {
 }
 """Adapters that learn from success after those of the start are merged."""
 PILOTS: dict[str, tuple[int, dict[str, int]]] = {
-    "short": (30, {"rounds": 5, "gradient_steps": 300, "worlds": 256}),
-    "long": (12, {"worlds": 256}),
-    "wide": (12, {}),
+    "short": (30, {"rounds": 5, "gradient_steps": 300, "worlds": 256, "minutes": 20}),
+    "long": (12, {"worlds": 256, "minutes": 20}),
+    "wide": (12, {"minutes": 20}),
 }
 """Pilot -> iterations, and settings of learning that differ from the tables'."""
 
@@ -55,6 +55,11 @@ class Scale:
     counts: tuple[int, ...] = page.COUNTS
     seeds: tuple[int, ...] = page.SEEDS
 
+    @property
+    def pool(self) -> int:
+        """Demonstrations per task, of which each seed takes its own."""
+        return self.imitation[0]
+
 
 _OPTIM = OptimConfig(steps=2000, batch_size=64, learning_rate=1e-3, warmup_steps=100)
 _ACCELERATOR = Scale(
@@ -70,7 +75,7 @@ _ACCELERATOR = Scale(
         checkpoint_every=10_000,
     ),
     Trial(
-        Learning(worlds=512, teacher_worlds=1024, rounds=15, gradient_steps=1000, minutes=20),
+        Learning(worlds=512, teacher_worlds=1024, rounds=15, gradient_steps=1000),
         OptimConfig(steps=12, batch_size=128, learning_rate=3e-4),
         every=3,
     ),
@@ -123,16 +128,18 @@ def _cells(scale: Scale, backbone: str, seed: int) -> Iterator[Cell | Derived]:
     """Yield the policies of a backbone and seed but for those of `page.RANKS`."""
     for count in scale.counts:
         config = _config(scale.start, backbone, count, seed)
-        yield Cell(page.cell(backbone, count, "start", seed), config, (), backbone)
+        name = page.cell(backbone, count, "start", seed)
+        yield Cell(name, config, (), backbone, pool=scale.pool)
         yield _learned(scale.trial, backbone, count, "teacher", seed)
     shifted = replace(scale.trial, scene=SHIFT)
     yield _learned(shifted, backbone, scale.counts[0], "randomized", seed)
-    yield from owner.cells(backbone, scale.counts[0], seed, scale.episodes)
+    yield from owner.cells(backbone, scale.counts[0], seed, scale.pool, scale.episodes)
     count, steps = scale.imitation
     config = _config(scale.start, backbone, count, seed)
     optim = replace(config.optim, steps=steps, batch_size=scale.trial.optim.batch_size)
     name = page.cell(backbone, count, "imitation", seed)
-    yield Cell(name, replace(config, optim=optim), (), f"{backbone}/imitation")
+    config = replace(config, optim=optim)
+    yield Cell(name, config, (), f"{backbone}/imitation", pool=scale.pool)
 
 
 def _pilots(scale: Scale) -> Iterator[Cell | Derived]:

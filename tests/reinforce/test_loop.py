@@ -189,8 +189,9 @@ def test_lost_success_stops_the_run():
     assert "fell from 32 to 10 of 64 episodes" in collapse(32, 10)
     assert not collapse(6, 2)  # likely by chance
     assert not collapse(60, 45)
-    assert "no episode succeeded" in collapse(1, 0)
-    assert not collapse(1, 0, reward="dense")
+    assert "no episode succeeded" in collapse(0, 0)
+    assert not collapse(1, 0)
+    assert not collapse(0, 0, reward="dense")
 
 
 def collapse(first, now, **changes):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from envs import Randomization
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.cli.train import _resolved
 from lorasp_jax.config import ModelConfig
@@ -53,6 +54,16 @@ def test_another_scene_can_be_learned(few):
     assert not resolve("--from", few).scene.changed()
     scene = resolve("--from", few, "--scene.brightness", 0.9, 1.1).scene
     assert scene.changed() == {"brightness": (0.9, 1.1)}
+
+
+def test_ranges_of_the_start_stay_unless_given(few, monkeypatch):
+    recorded = recorded_config(few)
+    ranges = Randomization(brightness=(0.8, 1.0), table_height=(-0.01, 0.01))
+    recorded = dataclasses.replace(recorded, scene=ranges)
+    monkeypatch.setattr(start, "recorded_config", lambda _: recorded)
+    assert resolve("--from", few).scene == ranges
+    scene = resolve("--from", few, "--scene.brightness", 0.9, 1.1).scene
+    assert scene == dataclasses.replace(ranges, brightness=(0.9, 1.1))
 
 
 def test_a_run_is_recorded_and_read_again(few, tmp_path):

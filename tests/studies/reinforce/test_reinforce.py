@@ -1,5 +1,6 @@
 """The study of learning from success: its cells, and what its page makes of results."""
 
+import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -7,8 +8,10 @@ import pytest
 
 from lorasp_jax.extras.study import Derived, statistics
 from lorasp_jax.reinforce import start
+from lorasp_jax.training.finished_run import recorded_config
 from studies.few.judge import SHIFT
 from studies.reinforce import page, study
+from tests.runs import finish_with_weights
 
 STUDY = study.get_study("accelerator")
 N = 40
@@ -43,6 +46,7 @@ def test_policies_learn_as_their_names_say(monkeypatch):
     for cell in STUDY.cells:
         backbone, count, name, seed = cell.name.split("/")
         if not isinstance(cell, Derived):
+            assert cell.pool == (0 if cell.config.seed == page.PILOT_SEED else page.CEILING)
             assert (cell.config.model.backbone, f"n{cell.config.data.episodes}") == (
                 backbone,
                 count,
@@ -68,6 +72,20 @@ def test_policies_learn_as_their_names_say(monkeypatch):
         assert cell.settings["trial"].get("name") == (
             study.METHODS[name].name if name in study.METHODS else None
         )
+
+
+@pytest.mark.parametrize("name", ["teacher", "randomized", "r4", "noise_50"])
+def test_a_finished_run_can_be_learned_further(name, tmp_path):
+    folder = tmp_path / "pi0" / "n16" / "start" / "s0"
+    folder.parent.mkdir(parents=True)
+    finish_with_weights(folder)
+    trial = STUDY[f"pi0/n16/{name}/s0"].evaluate.keywords["trial"]
+    if trial.tasks:
+        trial = dataclasses.replace(trial, tasks=("press",))
+    run = SimpleNamespace(config=recorded_config(folder), folder=folder.parents[1] / name / "s0")
+    config = trial.config(run)
+    assert (config.tasks, config.online.start) == (("press",), str(folder))
+    assert config.scene.changed() == (SHIFT.changed() if name == "randomized" else {})
 
 
 def test_no_pilot_is_in_a_table(tmp_path):
