@@ -7,6 +7,7 @@ from rich.console import Console
 from lorasp_jax.evaluation.callback import Evaluation
 from lorasp_jax.reinforce import loop, start
 from lorasp_jax.reinforce.config import ReinforceConfig
+from lorasp_jax.reinforce.films import Films
 from lorasp_jax.report.callback import Report
 
 KIND = "reinforcement learning"
@@ -18,6 +19,7 @@ def run(
 ) -> None:
     """Learn from a start run, evaluate before and after, export the policy, write the report."""
     learned = start.load(config, folder, console, started)
-    loop.train(learned, [start.PolicyExport(), Evaluation(), Report()], resume=resume)
+    callbacks = [start.PolicyExport(), Evaluation(), Films(learned.policy), Report()]
+    loop.train(learned, callbacks, resume=resume)
     report = folder / "report.html"
     console.print(f"finished in {learned.seconds['total']:.0f} s: {report}", markup=False)

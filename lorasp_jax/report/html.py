@@ -354,3 +354,11 @@ def _media(folder: Path, tasks: Collection[str]) -> Iterable[str]:
             "was recorded</figcaption>"
             "</figure>"
         )
+        if (start := join_inside(folder, f"start_{task}.mp4")).exists():
+            video_data = base64.b64encode(read_bytes(start, folder)).decode()
+            yield (
+                "<figure><video width=400 controls autoplay loop muted "
+                f'src="data:video/mp4;base64,{video_data}"></video>'
+                "<figcaption class=muted>the start policy from the same initial state</figcaption>"
+                "</figure>"
+            )
