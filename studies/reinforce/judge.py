@@ -74,7 +74,7 @@ def judge(run: Run, trial: Trial) -> dict[str, Any]:
     That is a row per iteration: minutes, environment steps, and success by task of the policy's and
     the teachers' own episodes and, if evaluated, on fixed layouts, in the scenes of learning, as
     `before` is. `shifted` has the outcomes in a shifted scene, such as "after/pour", if all tasks
-    were learned.
+    were learned. If teachers taught some, `outcomes` has the others, too.
     """
     folder = run.folder / "learned"
     folder.mkdir(exist_ok=True)
@@ -89,7 +89,11 @@ def judge(run: Run, trial: Trial) -> dict[str, Any]:
     if trial.scene:  # its evaluation drew scenes, too
         found["outcomes"] = _outcomes(learned, "recorded")
     found |= {"progress": progress}
-    return found if trial.tasks else {**found, "shifted": _shifted(run, learned)}
+    if not trial.tasks:
+        found["shifted"] = _shifted(run, learned)
+    elif trial.learning.method == "teacher":
+        found["outcomes"] = _outcomes(learned, "recorded", run.config.tasks)
+    return found
 
 
 def _shifted(run: Run, learned: Run) -> dict[str, str]:
@@ -100,7 +104,11 @@ def _shifted(run: Run, learned: Run) -> dict[str, str]:
     }
 
 
-def _outcomes(run: Run, scene: str) -> dict[str, str]:
-    """Return the outcomes of a run's policy in a scene by task."""
-    found = scenes.judge(run, (scene,))["outcomes"]
+def _outcomes(run: Run, scene: str, tasks: tuple[str, ...] = ()) -> dict[str, str]:
+    """Return the outcomes of a run's policy in a scene by task; by default, of its own tasks."""
+    shown = dataclasses.replace(
+        run, config=dataclasses.replace(run.config, tasks=tasks or run.config.tasks)
+    )
+    shown.policy = run.policy
+    found = scenes.judge(shown, (scene,))["outcomes"]
     return {name.partition("/")[2]: outcomes for name, outcomes in found.items()}

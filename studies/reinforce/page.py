@@ -58,6 +58,7 @@ def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
         "tasks": _task_table(results, seeds),
         "ranks": _rank_table(results),
         "scenes": _scene_table(results),
+        "forgetting": _forgetting_table(results),
         "owner": _owner_table(results),
         "pilots": _pilot_table(results),
     }
@@ -192,6 +193,22 @@ def _shifted(
     return statistics.outcomes(
         [[{"outcomes": {t: x[f"{when}/{t}"] for t in TASKS}}] for x in found]
     )
+
+
+def _forgetting_table(results: Results) -> str:
+    """Return the gains of policies that learned `HARD` alone, by task over paired episodes."""
+    rows = []
+    for backbone in BACKBONES:
+        own = _seeds(results, backbone, COUNTS[0], "start", "some")
+        at = results, (backbone, COUNTS[0])
+        gains = [
+            page.points(
+                statistics.difference(*(_outcomes(*at, p, own, [task]) for p in ("some", "start")))
+            )
+            for task in (TASKS if own else ())
+        ]
+        rows.append([BACKBONES[backbone], str(len(own)), *(gains or [page.NONE] * len(TASKS))])
+    return page.table(["gain [points]", "seeds", *TASKS], rows)
 
 
 def _owner_table(results: Results) -> str:

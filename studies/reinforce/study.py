@@ -4,8 +4,9 @@
         --results studies/reinforce/results.json --jobs 5
 
 A policy learns four tasks from N demonstrations of each, then from success alone. `imitation`
-trains on many demonstrations instead, `randomized` learns in scenes that change. The policies of
-`page.RANKS` merge the adapters of a start into its base and learn new ones.
+trains on many demonstrations instead, `randomized` learns in scenes that change, `some` learn two
+tasks alone. The policies of `page.RANKS` merge the adapters of a start into its base and learn new
+ones.
 """
 
 import functools
@@ -133,6 +134,8 @@ def _cells(scale: Scale, backbone: str, seed: int) -> Iterator[Cell | Derived]:
         yield _learned(scale.trial, backbone, count, "teacher", seed)
     shifted = replace(scale.trial, scene=SHIFT)
     yield _learned(shifted, backbone, scale.counts[0], "randomized", seed)
+    some = replace(scale.trial, tasks=page.HARD)
+    yield _learned(some, backbone, scale.counts[0], "some", seed)
     yield from owner.cells(backbone, scale.counts[0], seed, scale.pool, scale.episodes)
     count, steps = scale.imitation
     config = _config(scale.start, backbone, count, seed)

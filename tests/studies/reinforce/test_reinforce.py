@@ -66,6 +66,7 @@ def test_policies_learn_as_their_names_say(monkeypatch):
         if noise == "noise":
             assert config.tasks == (page.OWNED,)
             assert config.online.worlds * config.optim.steps == int(episodes)
+        assert (config.tasks == page.HARD) == (name == "some")
         assert (config.online.adapters == "merge") == (name in page.RANKS)
         assert config.scene.changed() == (SHIFT.changed() if name == "randomized" else {})
         assert config.peft == study.METHODS.get(name, run.config.peft)
@@ -111,6 +112,7 @@ def test_page(tmp_path):
     scenes = [line.split(" | ")[3:] for line in made["scenes"].splitlines()[2:5]]
     rates = [[cell.split()[0] for cell in row] for row in scenes]
     assert rates == [["40.0", "75.0"], ["80.0", "75.0"], ["80.0", "75.0"]]
+    assert made["forgetting"].count("+40.0") == 2 * len(page.TASKS)
     assert made["owner"].count("80.0") == 2 * (1 + 3 * len(page.EPISODES))
     assert made["ranks"].count("80.0") == 2 * 2 * len(page.RANKS)
     assert (tmp_path / "progress.svg").stat().st_size
