@@ -32,7 +32,9 @@ CONFIG = Path(__file__).parents[1] / "configs" / "reinforce.py"
 
 def main() -> None:
     """Parse arguments, measure, print a table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=_Formatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--scale", default="accelerator")
     parser.add_argument("--backbone", default="pi0")
     parser.add_argument("--size", default="small")
@@ -102,10 +104,6 @@ def _timed(call: Callable[[], Any]) -> tuple[Any, float]:
     started = time.perf_counter()
     result = jax.block_until_ready(call())
     return result, time.perf_counter() - started
-
-
-class _Formatter(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
-    """Shows defaults and keeps line breaks."""
 
 
 if __name__ == "__main__":

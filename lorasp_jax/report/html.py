@@ -341,24 +341,26 @@ def _media(folder: Path, tasks: Collection[str]) -> Iterable[str]:
             yield f"<h3>{html.escape(task)}</h3><p>Missing: {names}.</p>"
             continue
         image_data = base64.b64encode(read_bytes(image, folder)).decode()
-        video_data = base64.b64encode(read_bytes(video, folder)).decode()
         yield (
             f"<h3>{html.escape(task)}</h3>"
             f'<figure><img class=camera width=400 alt="side and wrist cameras" '
             f'src="data:image/png;base64,{image_data}">'
             "<figcaption class=muted>side and wrist cameras at policy resolution</figcaption>"
             "</figure>"
-            "<figure><video width=400 controls autoplay loop muted "
-            f'src="data:video/mp4;base64,{video_data}"></video>'
-            "<figcaption class=muted>a closed-loop episode of the adapted policy, a success if any "
-            "was recorded</figcaption>"
-            "</figure>"
         )
+        yield _film(video, folder, _EPISODE)
         if (start := join_inside(folder, f"start_{task}.mp4")).exists():
-            video_data = base64.b64encode(read_bytes(start, folder)).decode()
-            yield (
-                "<figure><video width=400 controls autoplay loop muted "
-                f'src="data:video/mp4;base64,{video_data}"></video>'
-                "<figcaption class=muted>the start policy from the same initial state</figcaption>"
-                "</figure>"
-            )
+            yield _film(start, folder, "the start policy from the same initial state")
+
+
+_EPISODE = "a closed-loop episode of the adapted policy, a success if any was recorded"
+
+
+def _film(path: Path, folder: Path, caption: str) -> str:
+    """Embed a video of a run's folder, with a caption."""
+    data = base64.b64encode(read_bytes(path, folder)).decode()
+    return (
+        "<figure><video width=400 controls autoplay loop muted "
+        f'src="data:video/mp4;base64,{data}"></video>'
+        f"<figcaption class=muted>{caption}</figcaption></figure>"
+    )

@@ -1,6 +1,7 @@
 """Let the policy of a finished cell learn from success."""
 
 import dataclasses
+import functools
 import json
 from dataclasses import dataclass
 from typing import Any
@@ -8,13 +9,16 @@ from typing import Any
 from envs import Randomization
 from lorasp_jax.config import OptimConfig
 from lorasp_jax.evaluation.callback import Evaluation
+from lorasp_jax.extras.study import Derived
 from lorasp_jax.extras.study.run_cell import simulated
+from lorasp_jax.extras.study.study import Evaluate
 from lorasp_jax.peft import Method
 from lorasp_jax.reinforce import loop, start
 from lorasp_jax.reinforce.config import Learning, ReinforceConfig
 from lorasp_jax.training.run import Run
 from lorasp_jax.training.run_folder import read_metrics
 from studies.few import judge as scenes
+from studies.reinforce import page
 
 _RECORDED = ("step", "minutes", "environment_steps")
 
@@ -68,6 +72,20 @@ class Trial:
         return start.resolve(ReinforceConfig(**fields), given)
 
 
+def learned(trial: Trial, backbone: str, count: int, name: str, seed: int) -> Derived:
+    """Return a policy that starts from that of N demonstrations and learns from success."""
+    evaluate = functools.partial(judge, trial=trial)
+    return derived(backbone, count, name, seed, trial.describe(), evaluate)
+
+
+def derived(
+    backbone: str, count: int, name: str, seed: int, settings: dict[str, Any], evaluate: Evaluate
+) -> Derived:
+    """Return a cell whose source is the start with N demonstrations."""
+    name, source = (page.cell(backbone, count, policy, seed) for policy in (name, "start"))
+    return Derived(name, source, settings=settings, evaluate=evaluate, measured=False)
+
+
 def judge(run: Run, trial: Trial) -> dict[str, Any]:
     """Return what simulation says of the policy that has learned, and its progress.
 
@@ -78,28 +96,28 @@ def judge(run: Run, trial: Trial) -> dict[str, Any]:
     """
     folder = run.folder / "learned"
     folder.mkdir(exist_ok=True)
-    learned = start.load(trial.config(run), folder, run.console, 0.0)
-    loop.train(learned, [start.PolicyExport(), Evaluation(media=False)], resume=True)
+    after = start.load(trial.config(run), folder, run.console, 0.0)
+    loop.train(after, [start.PolicyExport(), Evaluation(media=False)], resume=True)
     kinds = ("success/", "rollout/", "teacher/", "active_rank")
     progress = [
         {k: round(x, 4) for k, x in row.items() if k in _RECORDED or k.startswith(kinds)}
         for row in read_metrics(folder)
     ]
-    found = simulated(learned)
+    found = simulated(after)
     if trial.scene:  # its evaluation drew scenes, too
-        found["outcomes"] = _outcomes(learned, "recorded")
+        found["outcomes"] = _outcomes(after, "recorded")
     found |= {"progress": progress}
     if not trial.tasks:
-        found["shifted"] = _shifted(run, learned)
+        found["shifted"] = _shifted(run, after)
     elif trial.learning.method == "teacher":
-        found["outcomes"] = _outcomes(learned, "recorded", run.config.tasks)
+        found["outcomes"] = _outcomes(after, "recorded", run.config.tasks)
     return found
 
 
-def _shifted(run: Run, learned: Run) -> dict[str, str]:
+def _shifted(run: Run, after: Run) -> dict[str, str]:
     return {
         f"{when}/{task}": outcomes
-        for when, policy in (("before", run), ("after", learned))
+        for when, policy in (("before", run), ("after", after))
         for task, outcomes in _outcomes(policy, "shifted").items()
     }
 

@@ -18,8 +18,7 @@ from lorasp_jax.training import loop, setup
 from lorasp_jax.training.export import Export
 from lorasp_jax.training.run import Run
 from studies.reinforce import page
-from studies.reinforce.judge import Trial
-from studies.reinforce.judge import judge as judge_online
+from studies.reinforce.judge import Trial, derived, learned
 
 Learn = Literal["imitation", "filtered", "recap"]
 EPISODES = {50: (10, 5), 200: (25, 8), 1000: (50, 20)}
@@ -39,9 +38,7 @@ def cells(
         learning = dataclasses.replace(_NOISE, worlds=worlds)
         optim = dataclasses.replace(_OPTIM, steps=iterations)
         trial = Trial(learning, optim, every=iterations, tasks=(page.OWNED,))
-        evaluate = functools.partial(judge_online, trial=trial)
-        settings = trial.describe()
-        yield _cell(backbone, count, seed, f"noise_{episodes}", settings, evaluate)
+        yield learned(trial, backbone, count, f"noise_{episodes}", seed)
 
 
 def _offline(
@@ -49,14 +46,8 @@ def _offline(
 ) -> Derived:
     settings = {"task": page.OWNED, "learn": learn, "episodes": episodes, "pool": pool}
     evaluate = functools.partial(judge, **settings)
-    return _cell(backbone, count, seed, f"{learn}_{episodes}", {"offline": settings}, evaluate)
-
-
-def _cell(
-    backbone: str, count: int, seed: int, name: str, settings: dict[str, Any], evaluate: Any
-) -> Derived:
-    name, start = (page.cell(backbone, count, policy, seed) for policy in (name, "start"))
-    return Derived(name, start, settings=settings, evaluate=evaluate, measured=False)
+    name = f"{learn}_{episodes}"
+    return derived(backbone, count, name, seed, {"offline": settings}, evaluate)
 
 
 def judge(run: Run, task: str, learn: Learn, episodes: int, pool: int) -> dict[str, Any]:
@@ -84,8 +75,8 @@ def judge(run: Run, task: str, learn: Learn, episodes: int, pool: int) -> dict[s
         validation=("0",),
     )
     config = dataclasses.replace(single, data=data, learn=learn)
-    learned_folder = folder / "learned"
-    learned_folder.mkdir(exist_ok=True)
-    learned = setup.prepare(config, learned_folder, run.console, time.perf_counter())
-    loop.train(learned, [Export(), Evaluation(media=False)], resume=True)
-    return simulated(learned)
+    made_folder = folder / "learned"
+    made_folder.mkdir(exist_ok=True)
+    made = setup.prepare(config, made_folder, run.console, time.perf_counter())
+    loop.train(made, [Export(), Evaluation(media=False)], resume=True)
+    return simulated(made)

@@ -124,19 +124,22 @@ def _task_table(results: Results, seeds: dict[tuple[str, int], list[int]]) -> st
     """Return the gains by task over paired episodes."""
     rows = []
     for (backbone, count), own in seeds.items():
-        gains = [
-            page.points(
-                statistics.difference(
-                    *(
-                        _outcomes(results, (backbone, count), policy, own, [task])
-                        for policy in ("teacher", "start")
-                    )
-                )
-            )
-            for task in (TASKS if own else ())
-        ]
-        rows.append([BACKBONES[backbone], str(count), *(gains or [page.NONE] * len(TASKS))])
+        gains = _gains(results, (backbone, count), "teacher", own)
+        rows.append([BACKBONES[backbone], str(count), *gains])
     return page.table(["gain [points]", "demonstrations", *TASKS], rows)
+
+
+def _gains(
+    results: Results, where: tuple[str, int], policy: str, seeds: Sequence[int]
+) -> list[str]:
+    """Return the gains of a policy over its start, by task."""
+    if not seeds:
+        return [page.NONE] * len(TASKS)
+    pairs = [
+        [_outcomes(results, where, name, seeds, [task]) for name in (policy, "start")]
+        for task in TASKS
+    ]
+    return [page.points(statistics.difference(*pair)) for pair in pairs]
 
 
 def _rank_table(results: Results) -> str:
@@ -200,14 +203,8 @@ def _forgetting_table(results: Results) -> str:
     rows = []
     for backbone in BACKBONES:
         own = _seeds(results, backbone, COUNTS[0], "start", "some")
-        at = results, (backbone, COUNTS[0])
-        gains = [
-            page.points(
-                statistics.difference(*(_outcomes(*at, p, own, [task]) for p in ("some", "start")))
-            )
-            for task in (TASKS if own else ())
-        ]
-        rows.append([BACKBONES[backbone], str(len(own)), *(gains or [page.NONE] * len(TASKS))])
+        gains = _gains(results, (backbone, COUNTS[0]), "some", own)
+        rows.append([BACKBONES[backbone], str(len(own)), *gains])
     return page.table(["gain [points]", "seeds", *TASKS], rows)
 
 

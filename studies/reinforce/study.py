@@ -9,7 +9,6 @@ tasks alone. The policies of `page.RANKS` merge the adapters of a start into its
 ones.
 """
 
-import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
@@ -20,7 +19,7 @@ from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP, Method
 from lorasp_jax.reinforce.config import Learning
 from studies.few.judge import SHIFT
 from studies.reinforce import owner, page
-from studies.reinforce.judge import Trial, judge
+from studies.reinforce.judge import Trial, learned
 
 METHODS: dict[str, Method] = {
     **{f"r{rank}": LoRA(rank=rank) for rank in (1, 4, 16, 64)},
@@ -115,7 +114,7 @@ def get_study(scale: str) -> Study:
         for cell in _cells(chosen, backbone, seed)
     ]
     cells += [
-        _learned(replace(chosen.trial, method=method), backbone, chosen.counts[0], name, seed)
+        learned(replace(chosen.trial, method=method), backbone, chosen.counts[0], name, seed)
         for seed in chosen.seeds
         for name, method in METHODS.items()
         for backbone in BACKBONES
@@ -131,11 +130,11 @@ def _cells(scale: Scale, backbone: str, seed: int) -> Iterator[Cell | Derived]:
         config = _config(scale.start, backbone, count, seed)
         name = page.cell(backbone, count, "start", seed)
         yield Cell(name, config, (), backbone, pool=scale.pool)
-        yield _learned(scale.trial, backbone, count, "teacher", seed)
+        yield learned(scale.trial, backbone, count, "teacher", seed)
     shifted = replace(scale.trial, scene=SHIFT)
-    yield _learned(shifted, backbone, scale.counts[0], "randomized", seed)
+    yield learned(shifted, backbone, scale.counts[0], "randomized", seed)
     some = replace(scale.trial, tasks=page.HARD)
-    yield _learned(some, backbone, scale.counts[0], "some", seed)
+    yield learned(some, backbone, scale.counts[0], "some", seed)
     yield from owner.cells(backbone, scale.counts[0], seed, scale.pool, scale.episodes)
     count, steps = scale.imitation
     config = _config(scale.start, backbone, count, seed)
@@ -155,7 +154,7 @@ def _pilots(scale: Scale) -> Iterator[Cell | Derived]:
             learning = replace(trial.learning, **changes)
             optim = replace(trial.optim, steps=steps)
             made = replace(trial, learning=learning, optim=optim)
-            yield _learned(made, backbone, count, name, page.PILOT_SEED)
+            yield learned(made, backbone, count, name, page.PILOT_SEED)
 
 
 def _config(start: Config, backbone: str, count: int, seed: int) -> Config:
@@ -165,11 +164,3 @@ def _config(start: Config, backbone: str, count: int, seed: int) -> Config:
         data=replace(start.data, episodes=count),
         seed=seed,
     )
-
-
-def _learned(trial: Trial, backbone: str, count: int, name: str, seed: int) -> Derived:
-    """Return a policy that starts from that of N demonstrations."""
-    start = page.cell(backbone, count, "start", seed)
-    evaluate = functools.partial(judge, trial=trial)
-    name = page.cell(backbone, count, name, seed)
-    return Derived(name, start, settings=trial.describe(), evaluate=evaluate, measured=False)
