@@ -50,9 +50,10 @@ def cell(backbone: str, count: int, policy: str, seed: int) -> str:
 
 
 def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
-    """Write the figure into `folder`; return the tables, with the seeds that have run."""
+    """Write the figures into `folder`; return the tables, with the seeds that have run."""
     seeds = {(b, n): _seeds(results, b, n, "start", "teacher") for b in BACKBONES for n in COUNTS}
     _figure(results, folder / "progress.svg")
+    _rank_figure(results, folder / "ranks.svg")
     return {
         "success": _success_table(results, seeds),
         "tasks": _task_table(results, seeds),
@@ -260,17 +261,47 @@ def _figure(results: Results, path: Path) -> None:
         for case in [pilot, *((n, "teacher", s) for n in COUNTS for s in SEEDS)]:
             if (name := cell(backbone, *case)) not in results:
                 continue
-            label = "N = 16, pilot" if case == pilot else f"N = {case[0]}, seed {case[2]}"
+            label = f"N = {case[0]}" + ", pilot" * (case == pilot)
+            label = label if case[2] in (SEEDS[0], PILOT_SEED) else None
             style = {"linestyle": "dashed" if case == pilot else "solid", "marker": "."}
             minutes, rates = _progress(results[name])
             axis.plot(minutes, 100 * rates, color=COLORS[case[0]], label=label, **style)
         axis.set_title(BACKBONES[backbone], loc="left")
         axis.set_xlabel("minutes")
         axis.set_ylim(0, 100)
-        if axis.lines:
-            axis.legend(fontsize="x-small")
     axes[0].set_ylabel("success [%]")
     figures.write(figure, path, "reinforce")
+
+
+@mpl.rc_context(STYLE)
+def _rank_figure(results: Results, path: Path) -> None:
+    """Draw success after learning by the new adapters, a line per backbone."""
+    figure = Figure(figsize=(8, 3), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    for axis, (title, tasks) in zip(
+        axes, (("four tasks", TASKS), (" and ".join(HARD), HARD)), strict=True
+    ):
+        for number, (backbone, label) in enumerate(BACKBONES.items()):
+            where, color = (backbone, COUNTS[0]), list(COLORS.values())[number]
+            own = {name: _seeds(results, *where, name) for name in ("start", *RANKS)}
+            found = {
+                name: statistics.success(_outcomes(results, where, name, seeds, tasks))
+                for name, seeds in own.items()
+                if seeds
+            }
+            if "start" in found:
+                start = 100 * found.pop("start").value
+                axis.axhline(start, color=color, linestyle="dotted", label=f"{label}, before")
+            at = [list(RANKS).index(name) for name in found]
+            rates = 100 * np.array([[x.value, x.low, x.high] for x in found.values()])
+            if at:
+                bars = np.abs(rates[:, 1:].T - rates[:, 0])
+                axis.errorbar(at, rates[:, 0], bars, color=color, marker=".", label=label)
+        axis.set_title(title, loc="left")
+        axis.set_xticks(range(len(RANKS)), [x.replace(", ", "\n") for x in RANKS.values()])
+        axis.set_ylim(0, 100)
+    axes[0].set_ylabel("success [%]")
+    figures.write(figure, path, "ranks")
 
 
 def _progress(result: Any) -> tuple[np.ndarray, np.ndarray]:
