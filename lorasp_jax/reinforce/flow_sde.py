@@ -65,7 +65,7 @@ def sample(
     level: float | jax.Array,
     *,
     num_steps: int,
-    slots: jax.Array,
+    slots: jax.Array | None = None,
 ) -> tuple[jax.Array, tuple[jax.Array, jax.Array, jax.Array]]:
     """Sample chunks `[W, C, A]`, each with one stochastic step; do not reuse `key`.
 

@@ -52,8 +52,9 @@ def integrate(std, count, level=LEVEL, samples=100_000):
         key = jax.random.fold_in(jax.random.key(2), index)
         k = jnp.full(len(x), index)
         v, _ = flow(std)(x, 1 - k / count)
-        change = flow_sde.spread_of(k, count, level).std[..., None] * jax.random.normal(key, x.shape)
-        return x - flow_sde.drift(x, v, k, count, level) / count + change, None
+        scale = flow_sde.spread_of(k, count, level).std[..., None]
+        mean = x - flow_sde.drift(x, v, k, count, level) / count
+        return mean + scale * jax.random.normal(key, x.shape), None
 
     return jax.lax.scan(step, initial(samples, 1, 1), jnp.arange(count))[0]
 
