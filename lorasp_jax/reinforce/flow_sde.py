@@ -83,8 +83,8 @@ def sample(
     """
     step_key, noise_key = jax.random.split(key)
     step = jax.random.randint(step_key, noise.shape[:1], 0, num_steps)
-    scale = spread_of(step, num_steps, level).std[..., None]
-    change = scale * jax.random.normal(noise_key, noise.shape) * num_steps
+    scales = spread_of(step, num_steps, level).scales(noise.shape[1])
+    change = num_steps * scales * jax.random.normal(noise_key, noise.shape)
 
     def stochastic(x: jax.Array, flow_time: jax.Array) -> tuple[jax.Array, jax.Array]:
         v, _ = velocity(x, flow_time)
