@@ -8,6 +8,7 @@ from scipy import stats
 
 from lorasp_jax.models import flow_matching
 from lorasp_jax.reinforce import flow_sde, noise
+from lorasp_jax.reinforce.config import Learning
 
 LEVEL, MEAN = 0.5, 0.3
 TABLE = {  # K: standard deviations of the steps' noise, computed apart from this code
@@ -115,3 +116,8 @@ def test_without_noise_it_is_the_deterministic_sampler():
     _, chunk, _ = sample(0.1, 4, level=0.0)
     expected, _ = flow_matching.sample(flow(0.1), initial(len(chunk), 3, 2), num_steps=4)
     np.testing.assert_allclose(chunk, expected, atol=1e-6)
+
+
+def test_the_config_names_the_level():
+    learning = Learning(method="ppo", exploration="sde", noise_level=0.3)
+    assert noise.Spread.of(learning) == (0.3, 0.0)
