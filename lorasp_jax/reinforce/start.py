@@ -37,8 +37,11 @@ _ADAPTERS = (
     *("optim.weight_decay", "optim.b2", "optim.clip_norm", "optim.accumulate"),
 )
 _OTHERS = {
-    **{"teacher": ("online.epochs",), "ppo": _TEACHERS, "noise": (*_TEACHERS, *_ADAPTERS)},
-    **{"actions": ("online.noise_level",), "sde": ("online.std", "online.correlation")},
+    "teacher": ("online.epochs",),
+    "ppo": _TEACHERS,
+    "noise": (*_TEACHERS, *_ADAPTERS),
+    "actions": ("online.noise_level",),
+    "sde": ("online.std", "online.correlation"),
 }
 """Method or exploration -> settings, or groups of them, of another one."""
 MERGED = "merged"

@@ -100,6 +100,7 @@ PILOTS = {
     "ppo": _pilot(_PPO.online, _PPO.optim),
     "ppo_sde": _pilot(_PPO.online, _PPO.optim, exploration="sde"),
 }
+"""How the pilots learn."""
 _SMOKE = Scale(
     replace(
         _ACCELERATOR.start,
