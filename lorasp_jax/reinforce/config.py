@@ -33,6 +33,12 @@ class Learning:
     actions of a chunk have in common, below 1."""
     correlation: float = 0.9
     """Correlation of this noise in successive actions of a chunk; 0: new noise in each."""
+    exploration: Literal["actions", "sde"] = "actions"
+    """Where ppo adds noise: to the actions that the flow returns, or in one random step of the flow
+    (Flow-SDE, arXiv 2510.25889)."""
+    noise_level: float = 0.5
+    """Standard deviation of the noise of sde in the first of K flow steps, at most 1; in the last,
+    it is that over √(K (K - 1)) [normalized action units]."""
     reward: Literal["sparse", "dense"] = "sparse"
     """1 on success, or that and the progress of the task's stages."""
     discount: float = 0.997
@@ -81,6 +87,10 @@ class Learning:
             raise ValueError(f"online.correlation must lie in [0, 1), got {self.correlation}")
         if self.method == "noise" and self.std >= 1:
             raise ValueError(f"online.std must be below 1 for noise, got {self.std}")
+        if self.exploration == "sde" and self.method != "ppo":
+            raise ValueError(f"online.exploration sde is for ppo, not for {self.method}")
+        if not 0 < self.noise_level <= 1:
+            raise ValueError(f"online.noise_level must lie in (0, 1], got {self.noise_level}")
         if self.minutes < 0:
             raise ValueError(f"online.minutes must be at least 0, got {self.minutes}")
 
@@ -119,6 +129,8 @@ class ReinforceConfig(Config):
             raise ValueError(
                 "optim.steps must be at least 2, got 1: the first iteration trains only the critic"
             )
+        if self.online.exploration == "sde" and (count := self.evaluation.denoise_steps) < 2:
+            raise ValueError(f"evaluation.denoise_steps must be at least 2 for sde, got {count}")
         super().__post_init__()
 
     def evaluates(self, step: int) -> bool:

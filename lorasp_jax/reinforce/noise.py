@@ -26,7 +26,8 @@ class Spread(NamedTuple):
     """Distribution of the noise.
 
     Attributes:
-        std: s, the standard deviation of each action [normalized action units].
+        std: s, the standard deviation of each action [normalized action units], or `[N, 1]`, that
+            of each chunk.
         correlation: c, that of successive actions of a chunk, below 1.
     """
 
@@ -35,13 +36,16 @@ class Spread(NamedTuple):
 
     @classmethod
     def of(cls, learning: Learning) -> "Spread":
-        """Return the distribution that the config names."""
+        """Return the distribution that the config names; of `flow_sde`, that of step 0."""
+        if learning.exploration == "sde":
+            return cls(learning.noise_level, 0.0)
         return cls(learning.std, learning.correlation)
 
     def scales(self, length: int) -> jax.Array:
-        """Return `[length, 1]` standard deviations of actions given the earlier ones."""
+        """Return standard deviations of actions given the earlier ones, `[length, 1]` or
+        `[N, length, 1]`."""
         later = self.std * jnp.sqrt(1 - jnp.square(self.correlation))
-        return jnp.where(jnp.arange(length) == 0, self.std, later)[:, None]
+        return jnp.where(jnp.arange(length) == 0, self.std, later)[..., None]
 
 
 def action_slots(processor: Processor) -> np.ndarray:
@@ -67,7 +71,7 @@ def log_prob(mean: jax.Array, actions: jax.Array, spread: Spread, slots: np.ndar
         spread: of the noise.
         slots: `[A]` bool.
     """
-    scales = spread.scales(mean.shape[-2])[:, 0]
+    scales = spread.scales(mean.shape[-2])[..., 0]
     normalizer = slots.sum() * (jnp.log(scales) + 0.5 * np.log(2 * np.pi))
     return -_energy(actions - mean, spread, slots) - normalizer
 

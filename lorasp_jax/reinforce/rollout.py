@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from envs import traced
 from envs.env import Env
@@ -15,7 +16,7 @@ from lorasp_jax.base import fast_cpu
 from lorasp_jax.evaluation.programs import Worlds
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import RawObservation
-from lorasp_jax.reinforce import noise
+from lorasp_jax.reinforce import flow_sde, noise
 from lorasp_jax.reinforce.noise import Spread
 from lorasp_jax.training.distributed import mesh as meshes
 
@@ -26,15 +27,17 @@ class Chunks(NamedTuple):
     Attributes:
         observation: from `env.observe`, images in uint8.
         prompts: `[N]` int32, rows of the policy's prompt table.
-        noise: `[N, C, A]` initial noise of the flow.
+        noise: `[N, C, A]` initial noise of the flow, or x_k of `flow_sde`.
         actions: `[N, C, A]` normalized actions: S that were executed, with noise, and the rest of
-            the sampler's chunk.
+            the sampler's chunk; or x_{k+1} of `flow_sde`.
+        step: `[N]` int32 k of `flow_sde`; None: the noise is that of `noise`.
     """
 
     observation: RawObservation
     prompts: jax.Array
     noise: jax.Array
     actions: jax.Array
+    step: jax.Array | None = None
 
 
 class Transitions(NamedTuple):
@@ -89,6 +92,7 @@ def collect(
     *,
     execute_steps: int,
     denoise_steps: int,
+    sde: bool = False,
     ranges: Randomization | None = None,
 ) -> Experience:
     """Let a policy act, with noise; its calls are `Chunks`. For the arguments see `play`.
@@ -96,13 +100,14 @@ def collect(
     Args:
         spread: distribution of the noise.
         denoise_steps: Euler steps.
+        sde: whether the noise is that of `flow_sde`, at the level `spread.std`.
     """
     rows = jnp.asarray(policy.processor.prompts.rows(env.instructions))
     spread = Spread(*map(jnp.float32, spread))
 
     def act(key: jax.Array, worlds: Worlds) -> tuple[jax.Array, Chunks]:
         prompts = rows[worlds.state.info["instruction"]]
-        inputs = key, worlds.observe(), prompts, spread, denoise_steps, execute_steps
+        inputs = key, worlds.observe(), prompts, spread, denoise_steps, execute_steps, sde
         return _explore()(worlds.policy, *inputs)
 
     return play(env, policy, act, key, execute_steps=execute_steps, ranges=ranges)
@@ -156,7 +161,7 @@ def _over_devices(tree: Any, policy: Policy) -> Any:
 def _explore() -> Callable[..., Any]:
     """Return the jitted `explore`; not a constant, because its options start JAX's backend."""
     options = fast_cpu.without_simulation()
-    return jax.jit(explore, static_argnums=(5, 6), compiler_options=options)
+    return jax.jit(explore, static_argnums=(5, 6, 7), compiler_options=options)
 
 
 def explore(
@@ -167,22 +172,24 @@ def explore(
     spread: Spread,
     denoise_steps: int,
     execute_steps: int,
+    sde: bool = False,
 ) -> tuple[jax.Array, Chunks]:
     """Return noisy actions `[W, S, J+1]` [rad, m] of the next chunks, and the chunks."""
     flow_key, action_key, _ = jax.random.split(key, 3)
     processor, config = policy.processor, policy.model.config
     initial = jax.random.normal(flow_key, (len(prompts), config.chunk, config.action_dim))
-    mean = policy.model.sample_actions(
-        None,
-        processor.encode(observation, prompts),
-        num_steps=denoise_steps,
-        noise=initial,
-        slots=processor.flow_slots,
-    )
-    slots = noise.action_slots(processor)
-    actions = noise.explore(action_key, mean[:, :execute_steps], spread, slots)
-    whole = jnp.concatenate([actions, mean[:, execute_steps:]], axis=1)
-    chunks = Chunks(observation, prompts, initial, whole)
+    flow = {"num_steps": denoise_steps, "slots": jnp.asarray(processor.flow_slots)}
+    obs, slots = processor.encode(observation, prompts), noise.action_slots(processor)
+    if sde:
+        noisy = (np.arange(config.chunk) < execute_steps)[:, None] & slots
+        inputs = policy.model.encode(obs)[0], initial, noisy, spread.std
+        chunk, taken = flow_sde.sample(action_key, *inputs, **flow)
+        actions, chunks = chunk[:, :execute_steps], Chunks(observation, prompts, *taken)
+    else:
+        mean = policy.model.sample_actions(None, obs, noise=initial, **flow)
+        actions = noise.explore(action_key, mean[:, :execute_steps], spread, slots)
+        whole = jnp.concatenate([actions, mean[:, execute_steps:]], axis=1)
+        chunks = Chunks(observation, prompts, initial, whole)
     return processor.decode(actions, observation["state"]), chunks
 
 

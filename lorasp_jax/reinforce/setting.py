@@ -71,6 +71,7 @@ class Setting(NamedTuple):
             spread if std is None else spread._replace(std=std),
             execute_steps=self.config.evaluation.execute_steps,
             denoise_steps=self.config.evaluation.denoise_steps,
+            sde=self.config.online.exploration == "sde",
             ranges=self.config.ranges,
         )
 
@@ -92,8 +93,7 @@ class Setting(NamedTuple):
         now, start = (
             self.programs.means(x, self.frozen, chunks, index) for x in (state.adapters, self.start)
         )
-        slots = noise.action_slots(self.frozen.processor)
-        kl = noise.divergence(now, start, noise.Spread.of(self.config.online), slots)
+        kl = self.programs.divergence(now, start, self.frozen, chunks, index)
         executed = kl[:, : self.config.evaluation.execute_steps]
         extra = {"start_kl": float(jnp.mean(executed)), "in_a_row": float(rows["in_a_row"][-1])}
         return values | extra | {"updates": len(rows["loss"])}

@@ -36,8 +36,14 @@ _ADAPTERS = (
     *("online.adapters", "online.correlation", "auxiliary"),
     *("optim.weight_decay", "optim.b2", "optim.clip_norm", "optim.accumulate"),
 )
-_OTHERS = {"teacher": ("online.epochs",), "ppo": _TEACHERS, "noise": (*_TEACHERS, *_ADAPTERS)}
-"""Method -> settings, or groups of them, of another one."""
+_OTHERS = {
+    "teacher": ("online.epochs",),
+    "ppo": _TEACHERS,
+    "noise": (*_TEACHERS, *_ADAPTERS),
+    "actions": ("online.noise_level",),
+    "sde": ("online.std", "online.correlation"),
+}
+"""Method or exploration -> settings, or groups of them, of another one."""
 MERGED = "merged"
 """Folder of a base with the adapters of the start run merged into it."""
 
@@ -55,8 +61,9 @@ def resolve(config: ReinforceConfig, given: Collection[str]) -> ReinforceConfig:
             cameras of their own; or its adapters cannot be merged into its base.
     """
     method, groups = config.online.method, {name.partition(".")[0] for name in given}
-    if wrong := [name for name in _OTHERS[method] if name in {*given, *groups}]:
-        raise ValueError(f"{wrong[0]} is not for {method}: drop it")
+    for kind in (method, config.online.exploration):
+        if wrong := [name for name in _OTHERS[kind] if name in {*given, *groups}]:
+            raise ValueError(f"{wrong[0]} is not for {kind}: drop it")
     if not config.online.start:
         if method == "noise":
             raise ValueError("online.method noise needs a finished run: name it with --from")

@@ -11,8 +11,8 @@ import numpy as np
 import optax
 from flax import nnx
 
-from lorasp_jax.peft.auxiliary import AUXILIARY_WEIGHTS, auxiliary_losses
-from lorasp_jax.reinforce import noise
+from lorasp_jax.peft.auxiliary import auxiliary_losses
+from lorasp_jax.reinforce import flow_sde, noise
 from lorasp_jax.reinforce.config import ReinforceConfig
 from lorasp_jax.reinforce.learner import Learner
 from lorasp_jax.reinforce.rollout import Chunks
@@ -45,14 +45,7 @@ Loss = Callable[..., tuple[jax.Array, Metrics]]
 
 def make_loss(config: ReinforceConfig, graphdef: Any) -> Loss:
     """Return the loss that the config describes."""
-    return functools.partial(
-        surrogate_loss,
-        graphdef=graphdef,
-        weights={name: getattr(config.auxiliary, name) for name in AUXILIARY_WEIGHTS},
-        spread=noise.Spread.of(config.online),
-        clip=config.online.clip,
-        denoise_steps=config.evaluation.denoise_steps,
-    )
+    return functools.partial(surrogate_loss, config=config, graphdef=graphdef)
 
 
 def surrogate_loss(
@@ -60,30 +53,37 @@ def surrogate_loss(
     frozen: Frozen,
     batch: WeightedChunks,
     *,
+    config: ReinforceConfig,
     graphdef: Any,
-    weights: dict[str, Any],
-    spread: noise.Spread,
-    clip: float,
-    denoise_steps: int,
     num_valid: jax.Array | None = None,
 ) -> tuple[jax.Array, Metrics]:
     """Return the loss of the adapters, `clipped_surrogate` plus weighted auxiliary losses."""
-    mean, aux = means(adapters, frozen, batch.chunks, graphdef, denoise_steps)
-    slots = noise.action_slots(frozen.processor)
+    mean, aux = means(adapters, frozen, batch.chunks, graphdef, config)
+    slots, noisy = noise.action_slots(frozen.processor), spread(config, batch.chunks.step)
     samples = Samples(batch.chunks.actions, batch.advantages, batch.valid, batch.means)
-    total, metrics = clipped_surrogate(mean, samples, spread, slots, clip, num_valid)
+    total, metrics = clipped_surrogate(mean, samples, noisy, slots, config.online.clip, num_valid)
     losses = auxiliary_losses(aux)
-    total += sum(weights[name] * value for name, value in losses.items())
+    total += sum(getattr(config.auxiliary, name) * value for name, value in losses.items())
     return total, metrics | {"loss": total, **losses, **active_ranks(aux)}
 
 
+def spread(config: ReinforceConfig, step: jax.Array | None) -> noise.Spread:
+    """Return the distribution of the noise of chunks, given their `step`."""
+    if step is None:
+        return noise.Spread.of(config.online)
+    return flow_sde.spread_of(step, config.evaluation.denoise_steps, config.online.noise_level)
+
+
 def means(
-    adapters: Any, frozen: Frozen, chunks: Chunks, graphdef: Any, denoise_steps: int
+    adapters: Any, frozen: Frozen, chunks: Chunks, graphdef: Any, config: ReinforceConfig
 ) -> tuple[jax.Array, Any]:
     """Return the means of the actions `[N, C, A]`, and the adapters' aux."""
-    model = nnx.merge(graphdef, adapters, frozen.parameters)
-    inputs = chunks.observation, chunks.prompts, chunks.noise
-    mean, aux = noise.means(model, frozen.processor, *inputs, denoise_steps)
+    model, count = nnx.merge(graphdef, adapters, frozen.parameters), config.evaluation.denoise_steps
+    inputs = model, frozen.processor, chunks.observation, chunks.prompts, chunks.noise
+    if chunks.step is None:
+        mean, aux = noise.means(*inputs, count)
+    else:
+        mean, aux = flow_sde.means(*inputs, chunks.step, count, config.online.noise_level)
     return mean[:, : chunks.actions.shape[1]], aux
 
 
@@ -125,11 +125,18 @@ class Programs:
 
     def _means(self, adapters: Any, frozen: Frozen, chunks: Chunks, index: jax.Array) -> jax.Array:
         def part(index: jax.Array) -> jax.Array:
-            rows, steps = self._take(chunks, index), self.config.evaluation.denoise_steps
-            return means(adapters, frozen, rows, self._graphdef, steps)[0]
+            rows = self._take(chunks, index)
+            return means(adapters, frozen, rows, self._graphdef, self.config)[0]
 
         found = jax.lax.map(part, self._parts(index))
         return found.reshape(-1, *found.shape[2:])
+
+    def divergence(
+        self, mean: jax.Array, other: jax.Array, frozen: Frozen, chunks: Chunks, index: np.ndarray
+    ) -> jax.Array:
+        """Return the KL divergence of each action `[n, C]` between two means of chunks."""
+        noisy = spread(self.config, jax.tree.map(lambda x: x[index], chunks.step))
+        return noise.divergence(mean, other, noisy, noise.action_slots(frozen.processor))
 
     def _gradient(
         self, adapters: Any, frozen: Frozen, batch: WeightedChunks, index: jax.Array
@@ -210,8 +217,7 @@ def _change(
 ) -> float:
     """Return the mean KL divergence of the valid actions from the policy that acted."""
     mean = programs.means(state.adapters, frozen, batch.chunks, index)
-    spread, slots = noise.Spread.of(programs.config.online), noise.action_slots(frozen.processor)
-    kl = noise.divergence(mean, batch.means[index], spread, slots)
+    kl = programs.divergence(mean, batch.means[index], frozen, batch.chunks, index)
     return float(jnp.mean(kl, where=batch.valid[index]))
 
 

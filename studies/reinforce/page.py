@@ -23,6 +23,8 @@ PILOTS = {
     "short": "16 and 18 of 30 iterations: 5 rounds of teachers, 256 worlds, 300 gradient steps",
     "long": "12 iterations: 15, 256, 1,000",
     "wide": "12 iterations: 15, 512, 1,000",
+    "ppo": "`configs/ppo.py` for 20 minutes",
+    "ppo_sde": "the same, `--online.exploration sde`",
 }
 PILOT_SEED = 1000
 """In no table but that of pilots."""

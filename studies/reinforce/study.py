@@ -11,12 +11,15 @@ ones.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 from lorasp_jax.config import Config, DataConfig, EvaluationConfig, ModelConfig, OptimConfig
 from lorasp_jax.extras.study import Cell, Derived, Study
 from lorasp_jax.extras.study.page import BACKBONES
 from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP, Method
 from lorasp_jax.reinforce.config import Learning
+from lorasp_jax.training import experiment_file
 from studies.few.judge import SHIFT
 from studies.reinforce import owner, page
 from studies.reinforce.judge import Trial, learned
@@ -27,12 +30,6 @@ METHODS: dict[str, Method] = {
     "full": FullFineTuning(),
 }
 """Adapters that learn from success after those of the start are merged."""
-PILOTS: dict[str, tuple[int, dict[str, int]]] = {
-    "short": (30, {"rounds": 5, "gradient_steps": 300, "worlds": 256, "minutes": 20}),
-    "long": (12, {"worlds": 256, "minutes": 20}),
-    "wide": (12, {"minutes": 20}),
-}
-"""Pilot -> iterations, and settings of learning that differ from the tables'."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +79,29 @@ _ACCELERATOR = Scale(
     imitation=(512, 20_000),
     episodes=owner.EPISODES,
 )
+
+
+def _pilot(
+    learning: Learning = _ACCELERATOR.trial.learning,
+    optim: OptimConfig = _ACCELERATOR.trial.optim,
+    **changes: Any,
+) -> Trial:
+    """Return learning for at most 20 minutes; unless given, the settings are the tables'."""
+    learning = replace(learning, minutes=20, **changes)
+    return replace(_ACCELERATOR.trial, learning=learning, optim=optim)
+
+
+_SHORT = replace(_ACCELERATOR.trial.optim, steps=30)
+_CONFIG = Path(__file__).parents[2] / "configs" / "ppo.py"
+_PPO = experiment_file.call(_CONFIG, "get_config", "accelerator")
+PILOTS = {
+    "short": _pilot(optim=_SHORT, rounds=5, gradient_steps=300, worlds=256),
+    "long": _pilot(worlds=256),
+    "wide": _pilot(),
+    "ppo": _pilot(_PPO.online, _PPO.optim),
+    "ppo_sde": _pilot(_PPO.online, _PPO.optim, exploration="sde"),
+}
+"""How the pilots learn."""
 _SMOKE = Scale(
     replace(
         _ACCELERATOR.start,
@@ -146,15 +166,12 @@ def _cells(scale: Scale, backbone: str, seed: int) -> Iterator[Cell | Derived]:
 
 def _pilots(scale: Scale) -> Iterator[Cell | Derived]:
     """Yield policies of a seed that no table uses, which decided how the others learn."""
-    count, trial = scale.counts[0], scale.trial
+    count = scale.counts[0]
     for backbone in BACKBONES:
         config = _config(scale.start, backbone, count, page.PILOT_SEED)
         yield Cell(page.cell(backbone, count, "start", page.PILOT_SEED), config, (), backbone)
-        for name, (steps, changes) in PILOTS.items():
-            learning = replace(trial.learning, **changes)
-            optim = replace(trial.optim, steps=steps)
-            made = replace(trial, learning=learning, optim=optim)
-            yield learned(made, backbone, count, name, page.PILOT_SEED)
+        for name, trial in PILOTS.items():
+            yield learned(trial, backbone, count, name, page.PILOT_SEED)
 
 
 def _config(start: Config, backbone: str, count: int, seed: int) -> Config:

@@ -41,14 +41,21 @@ def adapters(run):
     return leaves(adaptation.split(run.policy.model)[1])
 
 
-@pytest.fixture(scope="module", params=["ppo", "teacher", "noise"])
+SDE = {"method": "ppo", "exploration": "sde"}
+
+
+@pytest.fixture(
+    scope="module",
+    params=[{"method": "ppo"}, SDE, {"method": "teacher"}, {"method": "noise"}],
+    ids=lambda changes: changes.get("exploration", changes["method"]),
+)
 def whole(request, tmp_path_factory):
     """An uninterrupted run."""
     patch = pytest.MonkeyPatch()
     patch.setattr(setting, "environment", lambda *_: rooms.Room())
     patch.setattr(teaching, "_leads", lambda *_: True)
     patch.setattr(teacher, "_CLONE_STEPS", 100)
-    learn = dataclasses.replace(rooms.config().online, method=request.param)
+    learn = dataclasses.replace(rooms.config().online, **request.param)
     yield train(tmp_path_factory.mktemp("whole"), online=learn)
     patch.undo()
 
@@ -95,10 +102,12 @@ def test_several_devices_learn_the_same(whole, leading, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_policy_learns_from_success_alone(tmp_path, monkeypatch):
+@pytest.mark.parametrize("exploration", ["actions", "sde"])
+def test_a_policy_learns_from_success_alone(tmp_path, monkeypatch, exploration):
     room = rooms.Room(num_envs=64, goal=0.15)
     monkeypatch.setattr(setting, "environment", lambda *_: room)
     learn = Learning(method="ppo", worlds=64, std=0.3, max_kl=0.2, max_start_kl=1e9)
+    learn = dataclasses.replace(learn, exploration=exploration)
     train(tmp_path, online=learn, optim=OptimConfig(steps=20, batch_size=32, learning_rate=3e-3))
     rates = [row["rollout/press"] for row in read_metrics(tmp_path)]
     assert np.mean(rates[:4]) < 0.2
@@ -215,9 +224,10 @@ def test_the_divergence_from_the_start_is_that_of_all_valid_chunks(tmp_path):
         seen.append(index)
         return np.zeros((8, 4, 8))
 
-    fixed = fixed._replace(programs=SimpleNamespace(means=means))
+    programs = SimpleNamespace(means=means, divergence=fixed.programs.divergence)
+    fixed = fixed._replace(programs=programs)
     rows = {"loss": np.ones(1), "in_a_row": np.zeros(1, int)}
-    fixed.summary(state, None, np.arange(64) % 2 == 1, rows)
+    fixed.summary(state, SimpleNamespace(step=None), np.arange(64) % 2 == 1, rows)
     assert seen[0].tolist() == [1, 9, 17, 27, 35, 45, 53, 63]
 
 

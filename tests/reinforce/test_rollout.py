@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lorasp_jax.reinforce import noise, rollout
+from lorasp_jax.reinforce import flow_sde, noise, rollout
 from tests.reinforce import rooms
 
 OPTIONS = {"execute_steps": 2, "denoise_steps": 2}
@@ -16,8 +16,9 @@ def policy(tmp_path_factory):
     return rooms.start(tmp_path_factory.mktemp("run"), rooms.config()).policy
 
 
-def collect(policy, room, std=0.2):
-    return rollout.collect(room, policy, jax.random.key(4), noise.Spread(std, 0.0), **OPTIONS)
+def collect(policy, room, std=0.2, sde=False):
+    spread = noise.Spread(std, 0.0)
+    return rollout.collect(room, policy, jax.random.key(4), spread, sde=sde, **OPTIONS)
 
 
 def test_the_recorded_noise_gives_the_mean_of_the_actions(policy):
@@ -32,6 +33,23 @@ def test_the_recorded_noise_gives_the_mean_of_the_actions(policy):
     assert np.abs(z.mean()) < 0.2
     assert 0.8 < z.std() < 1.2
     assert chunks.observation["image"]["side"].dtype == np.uint8
+
+
+def test_the_recorded_step_gives_the_mean_of_its_end(policy):
+    chunks, processor = collect(policy, rooms.Room(), sde=True).chunks, policy.processor.shared()
+    inputs = chunks.observation, chunks.prompts, chunks.noise, chunks.step
+    means, _ = flow_sde.means(policy.model, processor, *inputs, 2, 0.2)
+    slots = noise.action_slots(processor)
+    z = (chunks.actions - means) / flow_sde.spread_of(chunks.step, 2, 0.2).std[..., None]
+    z = z[:, :2, slots]
+    assert np.abs(z.mean()) < 0.2
+    assert 0.8 < z.std() < 1.2
+    assert set(chunks.step.tolist()) == {0, 1}
+
+
+def test_without_noise_both_ways_to_explore_are_the_sampler(policy):
+    found, expected = (collect(policy, rooms.Room(), 0.0, sde).steps.state for sde in (True, False))
+    np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 def test_steps_follow_the_worlds(policy):

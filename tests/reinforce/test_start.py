@@ -25,6 +25,7 @@ from tests import ROOT
 from tests.reinforce import rooms
 from tests.runs import CONFIG, RESULTS, finish_with_weights, leaves, write_description
 
+SDE = ["--online.method", "ppo", "--online.exploration", "sde"]
 FILE = str(ROOT / "configs/reinforce.py")
 
 
@@ -92,6 +93,14 @@ def test_a_run_is_recorded_and_read_again(few, tmp_path):
         (
             ["--online.method", "ppo", "--optim.steps", 1],
             "optim.steps must be at least 2, got 1: the first iteration",
+        ),
+        (["--online.exploration", "sde"], "online.exploration sde is for ppo, not for teacher"),
+        (["--online.noise-level", 2], "online.noise_level must lie in \\(0, 1\\], got 2.0"),
+        (["--online.noise-level", 0.2], "online.noise_level is not for actions: drop it"),
+        ([*SDE, "--online.std", 0.2], "online.std is not for sde: drop it"),
+        (
+            [*SDE, "--evaluation.denoise-steps", 1],
+            "evaluation.denoise_steps must be at least 2 for sde, got 1",
         ),
         (["--online.discount", 1.5], "online.discount must lie in \\(0, 1\\], got 1.5"),
         (["--method", "lora"], "--peft is that of .*few: drop it"),

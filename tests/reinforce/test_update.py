@@ -14,7 +14,7 @@ from lorasp_jax.config import AuxiliaryConfig
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.reinforce import noise, update
+from lorasp_jax.reinforce import flow_sde, noise, update
 from lorasp_jax.reinforce.config import Learning
 from lorasp_jax.reinforce.learner import Learner
 from lorasp_jax.reinforce.rollout import Chunks
@@ -27,6 +27,9 @@ from tests.reinforce import rooms
 STD = 0.1
 CHUNKS, EXECUTED = 64, 2
 KEY = jax.random.key(9)
+LEVEL = 0.2
+SDE = {"method": "ppo", "exploration": "sde", "noise_level": LEVEL}
+both = pytest.mark.parametrize("changes", [{}, SDE], ids=["actions", "sde"])
 
 
 def settings(size=32, epochs=4, **changes):
@@ -70,16 +73,27 @@ def make(model, processor, config=None, rate=3e-2):
     return programs, jax.device_put(state, shardings), Frozen(parameters, processor)
 
 
-def chunks(processor, means, key, std=STD, count=CHUNKS):
-    """Return chunks whose actions are drawn around `means`, `[S, A]`."""
+def explored(processor, means, key, changes=(), std=STD, count=CHUNKS):
+    """Return executed actions that are drawn around `means`, `[S, A]`, and their chunks."""
     rng, config = np.random.default_rng(0), Pi0Config.dummy()
     image = rng.integers(0, 255, (count, 32, 32, 3), np.uint8)
     state = rng.normal(size=(count, 7)).astype("f")
     raw = {"image": {"side": image, "wrist": image}, "state": state}
     flow = jax.random.normal(jax.random.key(1), (count, config.chunk, config.action_dim))
+    prompts, slots = np.zeros(count, np.int32), noise.action_slots(processor)
+    if changes:
+        target = jnp.zeros(flow.shape[1:]).at[: len(means)].set(means)
+        velocity = lambda x, t: ((x - target) / t[:, None, None], None)  # noqa: E731
+        inputs = key, velocity, flow, slots, changes["noise_level"]
+        ends, (x, after, step) = flow_sde.sample(*inputs, num_steps=2)
+        return ends[:, : len(means)], Chunks(raw, prompts, x, after[:, : len(means)], step)
     mean = jnp.broadcast_to(means, (count, *means.shape))
-    actions = noise.explore(key, mean, noise.Spread(std, 0.0), noise.action_slots(processor))
-    return Chunks(raw, np.zeros(count, np.int32), flow, actions)
+    actions = noise.explore(key, mean, noise.Spread(std, 0.0), slots)
+    return actions, Chunks(raw, prompts, flow, actions)
+
+
+def chunks(*args, **options):
+    return explored(*args, **options)[1]
 
 
 def batch(chunks, advantages, valid=None):
@@ -87,20 +101,21 @@ def batch(chunks, advantages, valid=None):
     return WeightedChunks(chunks, advantages, valid, jnp.zeros_like(chunks.actions))
 
 
-def test_a_bandit_finds_its_optimum(processor):
+@both
+def test_a_bandit_finds_its_optimum(processor, changes):
     """The reward is minus the squared distance of each action to its target."""
-    programs, state, frozen = make(Bandit(), processor)
+    programs, state, frozen = make(Bandit(), processor, settings(**changes))
     slots = noise.action_slots(processor)
     target = 0.5 * jax.random.normal(jax.random.key(3), (EXECUTED, 8)) * slots
     for step in range(60):
         means = state.adapters["chunk"].get_value()[:EXECUTED]
-        data = chunks(processor, means, jax.random.key(step))
-        rewards = -jnp.sum(jnp.square(data.actions - target), axis=-1)
+        actions, data = explored(processor, means, jax.random.key(step), changes)
+        rewards = -jnp.sum(jnp.square(actions - target), axis=-1)
         advantages = rewards - rewards.mean(0)
         advantages = advantages / advantages.std()
         key = jax.random.key(step)
         state, rows = update.improve(programs, state, frozen, batch(data, advantages), key)
-        assert rows["kl"][0] == 0
+        assert rows["kl"][0] < 1e-12
     found = np.asarray(state.adapters["chunk"].get_value())
     np.testing.assert_allclose(found[:EXECUTED], target, atol=0.1)
     assert not found[:, ~slots].any()  # the robot does not execute them
@@ -123,16 +138,18 @@ def test_gradients_are_those_of_the_log_probability(processor):
     )
 
 
-def test_gradients_of_a_backbone_match_finite_differences(processor, tmp_path):
+@both
+def test_gradients_of_a_backbone_match_finite_differences(processor, tmp_path, changes):
     policy = rooms.start(tmp_path, rooms.config()).policy
     graphdef, adapters, parameters = adaptation.split(policy.model)
     adapters = jax.tree.map(
         lambda x: x + 0.03 * jnp.sin(jnp.arange(x.size)).reshape(x.shape), adapters
     )
     frozen = Frozen(parameters, processor)
-    data = chunks(processor, jnp.zeros((EXECUTED, 8)), jax.random.key(0), std=0.5, count=4)
+    changes = changes and {**changes, "noise_level": 1.0}
+    data = chunks(processor, jnp.zeros((EXECUTED, 8)), KEY, changes, std=0.5, count=4)
     full = batch(data, jax.random.normal(jax.random.key(2), (4, EXECUTED)))
-    of_config = update.make_loss(settings(std=2.0, clip=100.0), graphdef)
+    of_config = update.make_loss(settings(std=2.0, clip=100.0, **changes), graphdef)
     loss = jax.jit(lambda x: of_config(x, frozen, full)[0])
     gradient = jax.jit(jax.grad(loss))(adapters)
     direction = jax.tree.map(lambda x: x / optax.tree.norm(gradient), gradient)
@@ -141,10 +158,11 @@ def test_gradients_of_a_backbone_match_finite_differences(processor, tmp_path):
     assert float(found) == pytest.approx(float(optax.tree.norm(gradient)), rel=0.03)
 
 
-def test_without_learning_the_ratio_is_exactly_one(processor, tmp_path):
+@both
+def test_without_learning_the_ratio_is_exactly_one(processor, tmp_path, changes):
     policy = rooms.start(tmp_path, rooms.config()).policy
-    programs, state, frozen = make(policy.model, processor, settings(8, 2), rate=0.0)
-    data = chunks(processor, jnp.zeros((EXECUTED, 8)), jax.random.key(0), count=24)
+    programs, state, frozen = make(policy.model, processor, settings(8, 2, **changes), rate=0.0)
+    data = chunks(processor, jnp.zeros((EXECUTED, 8)), jax.random.key(0), changes, count=24)
     advantages = jax.random.normal(jax.random.key(2), (24, EXECUTED))
     state, rows = update.improve(programs, state, frozen, batch(data, advantages), KEY)
     assert float(state.rate) == 1.5  # the policy may change more

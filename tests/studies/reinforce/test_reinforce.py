@@ -57,12 +57,14 @@ def test_policies_learn_as_their_names_say(monkeypatch):
         if offline := cell.settings.get("offline"):
             assert name == f"{offline['learn']}_{offline['episodes']}"
             continue
+        recorded = cell.settings["trial"]["learning"].get("exploration")
+        assert recorded == ("sde" if name == "ppo_sde" else None)  # as in older results
         trial = cell.evaluate.keywords["trial"]
         run = SimpleNamespace(config=STUDY[cell.source].config, folder=Path("runs", cell.name))
         config = trial.config(run)
         assert config.online.start == f"runs/{cell.source}"
         noise, _, episodes = name.partition("_")
-        assert (config.online.method == "noise") == (noise == "noise")
+        assert config.online.method == (noise if noise in ("noise", "ppo") else "teacher")
         if noise == "noise":
             assert config.tasks == (page.OWNED,)
             assert config.online.worlds * config.optim.steps == int(episodes)
@@ -75,12 +77,13 @@ def test_policies_learn_as_their_names_say(monkeypatch):
         )
 
 
-@pytest.mark.parametrize("name", ["teacher", "randomized", "r4", "noise_50"])
+@pytest.mark.parametrize("name", ["teacher", "randomized", "r4", "noise_50", "ppo_sde"])
 def test_a_finished_run_can_be_learned_further(name, tmp_path):
     folder = tmp_path / "pi0" / "n16" / "start" / "s0"
     folder.parent.mkdir(parents=True)
     finish_with_weights(folder)
-    trial = STUDY[f"pi0/n16/{name}/s0"].evaluate.keywords["trial"]
+    seed = page.PILOT_SEED if name in study.PILOTS else 0
+    trial = STUDY[f"pi0/n16/{name}/s{seed}"].evaluate.keywords["trial"]
     if trial.tasks:
         trial = dataclasses.replace(trial, tasks=("press",))
     run = SimpleNamespace(config=recorded_config(folder), folder=folder.parents[1] / name / "s0")

@@ -1,0 +1,125 @@
+"""Exploration in the flow (Flow-SDE, arXiv 2510.25889): one of its K Euler steps is stochastic.
+
+Step k leads from x_k, at time t = 1 - k/K, to
+
+    x_{k+1} ~ N(x_k - δ (v + σ²/(2t) ε), δ σ²),   δ = 1/K,   σ² = a² t / max(1 - t, δ),
+
+where v is the velocity and ε = x_k + (1 - t) v the noise that the policy estimates. With every step
+stochastic and K large, the chunks have the distribution that those of the ODE have. Here each world
+draws one step per call, and the others are the ODE's: the probability of a call is that of this
+step, and needs one velocity. Only the actions that the robot executes get noise.
+
+Noise in an early step also moves the other actions of its chunk. The update ignores this: it weighs
+the noise of an action by the advantage of that action alone, as if the step were the last.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from lorasp_jax.models import flow_matching
+from lorasp_jax.models.backbone import Backbone
+from lorasp_jax.models.flow_matching import Velocity
+from lorasp_jax.models.transformer.layers import ModelAux, merge_action_aux
+from lorasp_jax.policies.processor import Processor, RawObservation
+from lorasp_jax.reinforce.noise import Spread
+
+
+def spread_of(step: jax.Array, num_steps: int, level: float | jax.Array) -> Spread:
+    """Return the distribution of the noise of steps k `[N]`; its std is `[N, 1]`.
+
+    Args:
+        step: k.
+        num_steps: K.
+        level: a, the standard deviation of the first step's noise [normalized action units].
+    """
+    t, rest = _times(step, num_steps)
+    return Spread((level * jnp.sqrt(t / (num_steps * rest)))[:, None], 0.0)
+
+
+def drift(
+    x: jax.Array, v: jax.Array, step: jax.Array, num_steps: int, level: float | jax.Array
+) -> jax.Array:
+    """Return the velocity `[N, C, A]` whose Euler step ends at the mean of x_{k+1}.
+
+    Args:
+        x: `[N, C, A]` x_k.
+        v: `[N, C, A]` the flow's velocity.
+        step: `[N]` k.
+        num_steps: K.
+        level: a.
+    """
+    t, rest = (each[:, None, None] for each in _times(step, num_steps))
+    return v + jnp.square(level) / (2 * rest) * (x + (1 - t) * v)
+
+
+def _times(step: jax.Array, num_steps: int) -> tuple[jax.Array, jax.Array]:
+    """Return t and max(1 - t, δ) of steps k `[N]`."""
+    return 1 - step / num_steps, jnp.maximum(step, 1) / num_steps
+
+
+def sample(
+    key: jax.Array,
+    velocity: Velocity,
+    noise: jax.Array,
+    noisy: jax.Array,
+    level: float | jax.Array,
+    *,
+    num_steps: int,
+    slots: jax.Array | None = None,
+) -> tuple[jax.Array, tuple[jax.Array, jax.Array, jax.Array]]:
+    """Sample chunks `[W, C, A]`, each with one stochastic step; do not reuse `key`.
+
+    Args:
+        key: draws the steps and their noise.
+        velocity: of the flow.
+        noise: `[W, C, A]` initial noise of the flow.
+        noisy: bool broadcastable to `[W, C, A]`: what gets noise; the rest follows the ODE.
+        level: a.
+        num_steps: K, at least 2.
+        slots: see `flow_matching.sample`.
+
+    Returns:
+        The chunks, and of their stochastic steps x_k, x_{k+1} `[W, C, A]` and k `[W]` int32.
+    """
+    step_key, noise_key = jax.random.split(key)
+    step = jax.random.randint(step_key, noise.shape[:1], 0, num_steps)
+    scales = spread_of(step, num_steps, level).scales(noise.shape[1])
+    change = num_steps * scales * jax.random.normal(noise_key, noise.shape)
+
+    def stochastic(x: jax.Array, flow_time: jax.Array) -> tuple[jax.Array, jax.Array]:
+        v, _ = velocity(x, flow_time)
+        here = jnp.round((1 - flow_time) * num_steps) == step
+        moved = drift(x, v, step, num_steps, level) - change
+        return jnp.where(here[:, None, None] & noisy, moved, v), x
+
+    chunk, states = flow_matching.sample(stochastic, noise, num_steps=num_steps, slots=slots)
+    states, rows = jnp.concatenate([states, chunk[None]]), jnp.arange(len(step))
+    return chunk, (states[step, rows], states[step + 1, rows], step)
+
+
+def means(
+    model: Backbone,
+    processor: Processor,
+    observation: RawObservation,
+    prompts: jax.Array,
+    x: jax.Array,
+    step: jax.Array,
+    num_steps: int,
+    level: float | jax.Array,
+) -> tuple[jax.Array, ModelAux]:
+    """Return the means of x_{k+1} `[N, C, A]` where there is noise, and the adapters' aux.
+
+    Args:
+        model: the adapted model, not its sampler.
+        processor: the robot's.
+        observation: from `env.observe`, N rows.
+        prompts: `[N]` int32, rows of the processor's prompt table.
+        x: `[N, C, A]` x_k.
+        step: `[N]` k.
+        num_steps: K.
+        level: a.
+    """
+    obs = processor.encode(observation, prompts)
+    prefix, aux = model.run_prefix(obs)
+    v, action_aux = model.run_suffix(prefix, obs, x, 1 - step / num_steps)
+    return x - drift(x, v, step, num_steps, level) / num_steps, merge_action_aux(aux, action_aux)
