@@ -9,7 +9,6 @@ import math
 from typing import Any
 
 import jax
-from jax.interpreters import mlir
 from jax.lax import linalg
 
 from lorasp_jax.base import _compat
@@ -44,6 +43,6 @@ def _split(primitive: Any) -> None:
             )
             return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), results)
 
-        return mlir.lower_fun(parts, primitive.multiple_results)(context, *operands)
+        return _compat.mlir.lower_fun(parts, primitive.multiple_results)(context, *operands)
 
-    mlir.register_lowering(primitive, lower, platform="cpu")
+    _compat.mlir.register_lowering(primitive, lower, platform="cpu")
