@@ -95,9 +95,11 @@ class Run:
 
     @property
     def parameters(self) -> tuple[int, int]:
-        """Numbers of trainable parameters and of all parameters."""
+        """Numbers of trainable parameters and of all parameters; see `adaptation.count`."""
+        model = self.policy.model
         trained = sum(x.size for x in jax.tree.leaves(self.split()[1]))
-        return trained, adaptation.count(self.policy.model).total
+        unused = {p: n for p, n in adaptation.padding(model).items() if re.search(self.trained, p)}
+        return trained - sum(unused.values()), adaptation.count(model).total
 
     def split(self) -> tuple[Any, Any, Any]:
         """Split the policy's model into (graphdef, adapters that the run trains, all others)."""
