@@ -54,7 +54,7 @@ class LoRA(Method):
         super().__post_init__()
         if self.rank < 1:
             raise ValueError(f"rank must be at least 1, got {self.rank}")
-        if self.ranks and not (0 <= min(self.ranks) and 1 <= max(self.ranks) <= self.rank):
+        if self.ranks and not (min(self.ranks) >= 0 and 1 <= max(self.ranks) <= self.rank):
             raise ValueError(
                 f"ranks must be from 0 to rank {self.rank}, not all 0, got {short(self.ranks)}"
             )

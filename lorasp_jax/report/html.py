@@ -284,6 +284,8 @@ def _rule_cells(row: dict[str, Any]) -> tuple[str, ...]:
 
 def _largest_rank(folder: Path, config: dict[str, Any]) -> int:
     """Return the largest rank of the run's methods."""
+    if "plan" in config:
+        return max(map(max, config["plan"]["ranks"].values()))
     if "adapt" not in config:
         with as_value_error(folder / CONFIG_FILE):
             check(config, records.WITH_RANK)

@@ -82,8 +82,8 @@ def load_peft(
     modules that PEFT trained in full (`bias`, `modules_to_save`) become trainable parameters.
     Embeddings and output layers that it only stored (`save_embedding_layers`) replace the model's.
     AdaLoRA is loaded as the equivalent LoRA. If ranks differ within a stack, or some of its layers
-    have no adapter, the method has `ranks`. `lora_dropout` becomes the methods' `dropout`, which is active only
-    under `with_dropout`.
+    have no adapter, the method has `ranks`. `lora_dropout` becomes the methods' `dropout`, which
+    is active only under `with_dropout`.
 
     The adapter of an `nnx.Embed` also changes the logits of its `attend`. In PEFT, that of an
     embedding changes the logits only with `ensure_weight_tying`.
