@@ -24,7 +24,7 @@ from lorasp_jax.base.files import as_value_error, read_json
 from lorasp_jax.base.json_values import check
 from lorasp_jax.base.writing import write_text
 from lorasp_jax.peft.dora import DoRA
-from lorasp_jax.peft.fields import short
+from lorasp_jax.peft.fields import check_names, short
 from lorasp_jax.peft.lora import LoRA
 from lorasp_jax.peft.method import Method
 
@@ -62,20 +62,16 @@ class Plan:
                 raise ValueError(f"a plan's ranks must be at least 0, got {min(ranks)} for {path}")
 
     @classmethod
-    def from_json(cls, fields: Mapping[str, Any]) -> "Plan":
+    def from_json(cls, fields: dict[str, Any]) -> "Plan":
         """Return a plan from the fields of its file, except format and version.
 
         Raises:
-            ValueError: a field is missing or invalid.
+            ValueError: a field is missing, unknown or invalid.
         """
-        check(dict(fields), _FIELDS)
-        known = {
-            field.name: fields[field.name]
-            for field in dataclasses.fields(cls)
-            if field.name in fields
-        }
+        check(fields, _FIELDS)
+        check_names(cls, "a plan", (), fields)
         ranks = {path: tuple(each) for path, each in fields["ranks"].items()}
-        return cls(**known | {"ranks": ranks})
+        return cls(**fields | {"ranks": ranks})
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the plan to a file, with one line per layer."""

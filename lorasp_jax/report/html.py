@@ -303,10 +303,11 @@ def _active_rank(
     rank = _largest_rank(folder, config)
     yield "<h2>Active rank</h2>"
     yield _image(figures.active_rank(rows, rank))
-    if not results["layer_active_rank"]:  # not evaluated
+    if not results["layer_active_rank"]:
         return
+    where = "closed loop" if results["tasks"] else "training"
     modules = ((module, f"{mean:.1f}") for module, mean in results["active_rank"].items())
-    yield _table(("module", "active rank in closed loop"), modules)
+    yield _table(("module", f"active rank in {where}"), modules)
     yield _image(figures.layer_ranks(results["layer_active_rank"], rank))
     if results["active_rank_histogram"]:
         yield _image(figures.rank_histogram(results["active_rank_histogram"]))

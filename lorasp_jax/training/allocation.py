@@ -10,6 +10,7 @@ from lorasp_jax.peft.plan import Plan, allocate
 from lorasp_jax.training import export, records, rules
 from lorasp_jax.training.run_folder import read_json
 
+RESULTS = "results.json"
 METHODS = ("lora_sp", "lora_sp_release", "ada_lora")
 """Methods whose layers differ in active rank."""
 
@@ -17,7 +18,8 @@ METHODS = ("lora_sp", "lora_sp_release", "ada_lora")
 def from_run(run: Path, *, rank: float | None = None, least: int = 1, drop: int = 0) -> Plan:
     """Return a plan with ranks in proportion to the mean active ranks of a run's layers.
 
-    These are from the run's final evaluation; see `plan.allocate`.
+    These are from the run's final evaluation or, without one, from the end of its training; see
+    `plan.allocate`.
 
     Args:
         run: folder of a finished run of one of `METHODS`.
@@ -27,7 +29,7 @@ def from_run(run: Path, *, rank: float | None = None, least: int = 1, drop: int 
         drop: how many layers, those with the lowest active rank, get no adapter.
 
     Raises:
-        ValueError: the run is not finished, has another method, or was not evaluated; or `rank` is
+        ValueError: the run is not finished, has another method, or recorded no ranks; or `rank` is
             below `least` or above the run's own.
     """
     recorded = export.RecordedPolicy.read(run)
@@ -39,14 +41,12 @@ def from_run(run: Path, *, rank: float | None = None, least: int = 1, drop: int 
             f"{run} was trained with {', '.join(sorted(names))}: a plan is made from the active "
             f"ranks of a run of {' or '.join(METHODS)}"
         )
-    results = read_json(run / "results.json", records.RESULTS)
+    results = read_json(run / RESULTS, records.RESULTS)
     try:
         found = results["layer_active_rank"]
         ranks = {path: found[rules.tower(path)][rules.short_name(path)] for path in methods}
     except KeyError as error:
-        raise ValueError(
-            f"{run} has no active ranks by layer, which are measured in simulation: lacks {error}"
-        ) from error
+        raise ValueError(f"{run / RESULTS} has no active ranks of {error}") from error
     model = nnx.eval_shape(lambda: recorded.config.create(nnx.Rngs(0)))
     shapes = rules.shapes(model, [f"^{re.escape(path)}$" for path in methods])
     most = max(settings["rank"] for settings in methods.values())
