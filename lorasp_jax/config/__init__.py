@@ -8,7 +8,7 @@ from lorasp_jax.config.augment import AugmentConfig
 from lorasp_jax.config.recap import RecapConfig
 from lorasp_jax.peft import Method, fields
 from lorasp_jax.peft.auxiliary import AUXILIARY_WEIGHTS
-from lorasp_jax.peft.plan import Plan
+from lorasp_jax.peft.plan import RankPlan
 
 SCALES = ("smoke", "cpu", "accelerator")
 VALIDATION_WINDOWS = 16
@@ -270,7 +270,7 @@ class Config:
     targets: tuple[str, ...] = (".*",)
     """Layers to adapt: presets (paper, all-linear, openpi, expert-only, vision, language, action,
     projections) and regular expressions over layer paths."""
-    plan: Plan | None = None
+    plan: RankPlan | None = None
     """Ranks by layer for the method in peft, which must be of fixed rank; None: all layers have
     that of the method."""
     adapt: tuple[str, ...] = ()

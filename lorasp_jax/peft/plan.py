@@ -36,7 +36,7 @@ Shapes = Mapping[str, tuple[int, int, int]]
 
 
 @dataclasses.dataclass(frozen=True)
-class Plan:
+class RankPlan:
     """Ranks by layer.
 
     Raises:
@@ -62,7 +62,7 @@ class Plan:
                 raise ValueError(f"a plan's ranks must be at least 0, got {min(ranks)} for {path}")
 
     @classmethod
-    def from_json(cls, fields: dict[str, Any]) -> "Plan":
+    def from_json(cls, fields: dict[str, Any]) -> "RankPlan":
         """Return a plan from the fields of its file, except format and version.
 
         Raises:
@@ -134,7 +134,7 @@ def _planned(method: LoRA, ranks: tuple[int, ...]) -> LoRA:
     return dataclasses.replace(method, rank=rank, alpha=alpha, ranks=ranks)
 
 
-def read(path: str | os.PathLike[str]) -> Plan:
+def read(path: str | os.PathLike[str]) -> RankPlan:
     """Read a plan's file.
 
     Raises:
@@ -146,7 +146,7 @@ def read(path: str | os.PathLike[str]) -> Plan:
         check(fields, {"format": str, "version": int})
         if (fields.pop("format"), fields.pop("version")) != (FORMAT, VERSION):
             raise ValueError(f"it must be a {FORMAT} of version {VERSION}")
-        return Plan.from_json(fields)
+        return RankPlan.from_json(fields)
 
 
 def allocate(
@@ -211,7 +211,7 @@ def _within(
     return ranks
 
 
-def shuffled(plan: Plan, shapes: Shapes, key: jax.Array) -> Plan:
+def shuffled(plan: RankPlan, shapes: Shapes, key: jax.Array) -> RankPlan:
     """Return the plan with its ranks permuted among the layers of equal size, as a control.
 
     Only layers whose kernels are both [I, O] or [O, I] swap ranks, so the number of parameters is

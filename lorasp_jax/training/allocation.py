@@ -6,7 +6,7 @@ from pathlib import Path
 from flax import nnx
 
 from lorasp_jax.adapters.io import native
-from lorasp_jax.peft.plan import Plan, allocate
+from lorasp_jax.peft.plan import RankPlan, allocate
 from lorasp_jax.training import export, records, rules
 from lorasp_jax.training.run_folder import read_json
 
@@ -15,7 +15,7 @@ METHODS = ("lora_sp", "lora_sp_release", "ada_lora")
 """Methods whose layers differ in active rank."""
 
 
-def from_run(run: Path, *, rank: float | None = None, least: int = 1, drop: int = 0) -> Plan:
+def from_run(run: Path, *, rank: float | None = None, least: int = 1, drop: int = 0) -> RankPlan:
     """Return a plan with ranks in proportion to the mean active ranks of a run's layers.
 
     These are from the run's final evaluation or, without one, from the end of its training; see
@@ -57,4 +57,4 @@ def from_run(run: Path, *, rank: float | None = None, least: int = 1, drop: int 
     planned = allocate(ranks, shapes, budget, most=most, least=least, drop=drop)
     rule = f"active rank, least {least}, drop {drop}"
     source = f"{run.resolve().name} {saved['sha256']}"
-    return Plan(recorded.fields["backbone"], planned, source, rule, budget)
+    return RankPlan(recorded.fields["backbone"], planned, source, rule, budget)

@@ -16,7 +16,7 @@ from lorasp_jax.config import (
     OptimConfig,
 )
 from lorasp_jax.config.recap import RecapConfig
-from lorasp_jax.peft.plan import Plan
+from lorasp_jax.peft.plan import RankPlan
 from lorasp_jax.training import records
 from lorasp_jax.training.run_folder import CONFIG_FILE, RELATIVE, read_json, recorded_ranges
 
@@ -78,9 +78,9 @@ def _from_json(recorded: Mapping[str, Any], tasks: tuple[str, ...]) -> Config:
     return Config(**fields | {"tasks": tasks, **lists})
 
 
-def recorded_plan(recorded: Mapping[str, Any]) -> Plan | None:
+def recorded_plan(recorded: Mapping[str, Any]) -> RankPlan | None:
     """Return the plan of a recorded config, if it has one."""
-    return Plan.from_json(recorded["plan"]) if "plan" in recorded else None
+    return RankPlan.from_json(recorded["plan"]) if "plan" in recorded else None
 
 
 def recorded_method(settings: Mapping[str, Any]) -> peft.Method:

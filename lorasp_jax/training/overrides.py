@@ -231,7 +231,7 @@ def _concrete(config: Config) -> type[Config]:
         [
             ("peft", type(config.peft), dataclasses.field()),
             ("scale", tyro.conf.Suppress[str], dataclasses.field()),
-            ("plan", tyro.conf.Suppress[plan.Plan | None], dataclasses.field()),
+            ("plan", tyro.conf.Suppress[plan.RankPlan | None], dataclasses.field()),
         ],
         bases=(type(config),),
         frozen=True,

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP, plan
-from lorasp_jax.peft.plan import Plan
+from lorasp_jax.peft.plan import RankPlan
 
 SHAPES = {"a/q_proj": (3, 8, 16), "a/o_proj": (3, 16, 8), "a/up": (2, 8, 40), "head": (1, 40, 4)}
 IMPORTANCE = {"a/q_proj": (1.0, 5.5, 2.0), "a/o_proj": (0.5, 3.0, 0.0), "a/up": (4.0, 7.0)}
 IMPORTANCE |= {"head": (6.0,)}
-PLAN = Plan("pi0", {"a/q_proj": (1, 6, 2), "a/o_proj": (0, 3, 0), "a/up": (4, 7), "head": (0,)})
+PLAN = RankPlan("pi0", {"a/q_proj": (1, 6, 2), "a/o_proj": (0, 3, 0), "a/up": (4, 7), "head": (0,)})
 UNIFORM = sum(layers * (d_in + d_out) for layers, d_in, d_out in SHAPES.values())
 LARGEST = max(d_in + d_out for _, d_in, d_out in SHAPES.values())
 
@@ -26,7 +26,7 @@ def flat(ranks):
 def test_a_budget_is_met_within_one_direction(mean, drop):
     budget = mean * UNIFORM
     ranks = plan.allocate(IMPORTANCE, SHAPES, budget, most=8, drop=drop)
-    found = Plan("pi0", ranks)
+    found = RankPlan("pi0", ranks)
     found.check(SHAPES)
     left = budget - found.parameters(SHAPES)
     assert 0 <= left < LARGEST
@@ -51,7 +51,7 @@ def test_equal_layers_use_the_budget():
     equal = {path: (1.0,) * layers for path, (layers, _, _) in SHAPES.items()}
     ranks = plan.allocate(equal, SHAPES, 2.5 * UNIFORM, most=8)
     assert {2, 3} == set(flat(ranks))
-    assert 2.5 * UNIFORM - Plan("pi0", ranks).parameters(SHAPES) < LARGEST
+    assert 2.5 * UNIFORM - RankPlan("pi0", ranks).parameters(SHAPES) < LARGEST
 
 
 @pytest.mark.parametrize(("budget", "drop"), [(UNIFORM - 1, 0), (10 * UNIFORM, 9)])
@@ -80,7 +80,7 @@ def test_files(tmp_path):
     assert '"a/q_proj": [1, 6, 2],\n' in (tmp_path / "plan.json").read_text()
     by_hand = {"format": plan.FORMAT, "version": 1, "backbone": "pi0", "ranks": {"head": [2]}}
     (tmp_path / "plan.json").write_text(json.dumps(by_hand))
-    assert plan.read(tmp_path / "plan.json") == Plan("pi0", {"head": (2,)})
+    assert plan.read(tmp_path / "plan.json") == RankPlan("pi0", {"head": (2,)})
 
 
 GOOD = {"format": plan.FORMAT, "version": 1, "backbone": "pi0", "ranks": {"head": [2]}}
@@ -126,7 +126,7 @@ def test_no_file(tmp_path):
 def test_plans_for_other_layers(change, message):
     ranks = {path: each for path, each in (PLAN.ranks | change).items() if each is not None}
     with pytest.raises(ValueError, match=message):
-        Plan("pi0", ranks).check(SHAPES)
+        RankPlan("pi0", ranks).check(SHAPES)
 
 
 def test_rules_keep_the_scale():
