@@ -49,8 +49,6 @@ class LoRA(Method):
     zero, hence no gradient, and stays zero. The scale is that of R in all layers."""
 
     def __post_init__(self) -> None:
-        if isinstance(self.ranks, list):  # from JSON
-            object.__setattr__(self, "ranks", tuple(self.ranks))
         super().__post_init__()
         if self.rank < 1:
             raise ValueError(f"rank must be at least 1, got {self.rank}")

@@ -151,7 +151,7 @@ def test_a_plan_follows_active_ranks(finished):
     assert 0 <= budget - found.parameters(shapes) < max(i + o for _, i, o in shapes.values())
     planned = np.concatenate([*found.ranks.values()])
     active = [ranks[rules.tower(path)][rules.short_name(path)] for path in found.ranks]
-    assert np.corrcoef(planned, np.concatenate(active))[0, 1] > 0.97
+    assert np.corrcoef(planned, np.concatenate(active))[0, 1] > 0.9
     assert found.backbone == "pi0"
     assert found.source.startswith("sp ")
     default = allocation.from_run(finished / "sp")
