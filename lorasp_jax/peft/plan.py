@@ -80,11 +80,6 @@ class RankPlan:
         text = re.sub(r"\[\s([^]]*)\]", lambda m: f"[{' '.join(m[1].split())}]", text)
         write_text(Path(path), f"{text}\n")
 
-    def parameters(self, shapes: Shapes) -> int:
-        """Return the number of LoRA parameters, Σ r (I + O)."""
-        widths = {path: d_in + d_out for path, (_, d_in, d_out) in shapes.items()}
-        return sum(sum(ranks) * widths[path] for path, ranks in self.ranks.items())
-
     def check(self, shapes: Shapes) -> None:
         """Raise ValueError unless the plan is one for exactly these layers."""
         names = ", ".join([*shapes][:5])

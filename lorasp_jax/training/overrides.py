@@ -79,8 +79,8 @@ def parse(arguments: Sequence[str], program: str = "python train.py") -> Command
     _check_rules(config, ["--method"] * bool(known.method) + rest)
     options = (text.partition("=")[0] for text in rest if text.startswith("--"))
     given = frozenset(option.lstrip("-").replace("-", "_") for option in options)
-    given |= {name for name in ("method", "plan") if getattr(known, name)}
-    given = frozenset("peft" if name == "method" else name for name in given)
+    given |= {"peft"} if known.method else set()
+    given |= {"plan"} if known.plan else set()
     return Command(config, known.resume, known.dry_run, known.wandb, known.fit, given)
 
 

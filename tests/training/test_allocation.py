@@ -26,6 +26,7 @@ from lorasp_jax.training.finished_run import recorded_config
 from lorasp_jax.training.overrides import Command, override
 from lorasp_jax.training.run_folder import open_run, read_json, to_json, write_json
 from tests.models.random_models import random_backbone
+from tests.peft.test_plan import parameters
 from tests.runs import CONFIG, RESULTS, Terminate, finish_with_weights, leaves, make_run
 
 DUMMIES = {"pi0": Pi0Config.dummy(), "smolvla": SmolVLAConfig.dummy()}
@@ -56,8 +57,8 @@ def test_a_run_adapts_by_its_plan(backbone):
     model = preflight.abstract_model(config, DUMMIES[backbone])
     found = {path: method.ranks for path, method in adaptation.methods(model).items()}
     assert found == {path: ranks for path, ranks in config.plan.ranks.items() if any(ranks)}
-    parameters = config.plan.parameters(base_shapes(backbone))
-    assert adaptation.count(model).trainable == parameters > 0
+    planned = parameters(config.plan.ranks, base_shapes(backbone))
+    assert adaptation.count(model).trainable == planned > 0
 
 
 def test_a_plan_is_part_of_the_config(tmp_path):
@@ -148,7 +149,7 @@ def test_a_plan_follows_active_ranks(finished):
     found.check(shapes)
     budget = 3 * sum(layers * (d_in + d_out) for layers, d_in, d_out in shapes.values())
     assert found.budget == budget
-    assert 0 <= budget - found.parameters(shapes) < max(i + o for _, i, o in shapes.values())
+    assert 0 <= budget - parameters(found.ranks, shapes) < max(i + o for _, i, o in shapes.values())
     planned = np.concatenate([*found.ranks.values()])
     active = [ranks[rules.tower(path)][rules.short_name(path)] for path in found.ranks]
     assert np.corrcoef(planned, np.concatenate(active))[0, 1] > 0.9
@@ -235,11 +236,11 @@ def test_a_planned_run_from_start_to_export(trained, tmp_path):
             assert not b[i, rank:].view(np.uint32).any()
             assert a[i, :, :rank].all()
             assert b[i, :rank].any() or not rank
-    parameters = config.plan.parameters(base_shapes("pi0"))
+    planned = parameters(config.plan.ranks, base_shapes("pi0"))
     results = read_json(run.folder / "results.json")
-    assert results["trainable_parameters"] == parameters == adaptation.count(loaded).trainable
+    assert results["trainable_parameters"] == planned == adaptation.count(loaded).trainable
     total = adaptation.count(lorasp_jax.merge(loaded)).total
-    assert results["total_parameters"] == total + parameters
+    assert results["total_parameters"] == total + planned
     means = [np.mean(ranks) for ranks in config.plan.ranks.values() if any(ranks)]
     found = [np.mean(x) for each in results["layer_active_rank"].values() for x in each.values()]
     np.testing.assert_allclose(sorted(found), sorted(means), rtol=1e-5)
@@ -251,7 +252,7 @@ def test_a_planned_run_from_start_to_export(trained, tmp_path):
     live = sum(rank > 0 for ranks in config.plan.ranks.values() for rank in ranks)
     assert len(stored["target_modules"]) == live
     again = hugging_face.load_peft(tmp_path, models.load(config.model.checkpoint), names=names)
-    assert adaptation.count(again).trainable == parameters
+    assert adaptation.count(again).trainable == planned
     a, b = (leaves(nnx.state(lorasp_jax.merge(m), nnx.Param)) for m in (again, loaded))
     for name, value in a.items():
         np.testing.assert_allclose(value, b[name], atol=1e-6, err_msg=name)
