@@ -304,6 +304,22 @@ def test_ranks_by_layer_are_counted_and_reported(kind, x):
     assert f" {min(RANKS[kind])}-3 " in lorasp_jax.summary(model)
 
 
+def test_ranks_by_layer_of_eva(net):
+    """Each layer has its leading directions."""
+    roots = np.random.default_rng(0).normal(size=(LAYERS, WIDTH, WIDTH)).astype("f")
+    moments = {"blocks": jnp.einsum("lik,ljk->lij", roots, roots)}
+    adapt = lambda method: adaptation.adapt(  # noqa: E731
+        net, [("blocks", method)], rngs=nnx.Rngs(0), statistics=moments
+    )
+    whole, some = (
+        adapt(LoRA(rank=3, initialization="eva", ranks=ranks)).blocks.adapter.get_value()["lora_a"]
+        for ranks in ((), (2, 0, 3))
+    )
+    for i, rank in enumerate((2, 0, 3)):
+        np.testing.assert_array_equal(some[i, :, :rank], whole[i, :, :rank])
+        assert not some[i, :, rank:].any()
+
+
 def test_ranks_of_another_stack(net):
     with pytest.raises(ValueError, match=r"adapt blocks: ranks must .* stack \(3\), got 2"):
         adapted(net, ("blocks", LoRA(rank=2, ranks=(1, 2))))
