@@ -137,9 +137,11 @@ def count(model: nnx.Module) -> Counts:
 
 def padding(model: nnx.Module) -> dict[str, int]:
     """Return how many parameters pad the adapter of a stack, by the adapter's path."""
+    locations = paths.locate(nnx.List([model]), AdaptedLayer)
+    once = {id(location.child): location for location in locations}  # a layer may be shared
     return {
         f"{path}/adapter": layer.method.unused(layer.adapter.get_value())
-        for path, _, _, layer in paths.locate(nnx.List([model]), AdaptedLayer)
+        for path, _, _, layer in once.values()
         if isinstance(layer.adapter, AdapterParam) and layer.method is not None
     }
 

@@ -153,8 +153,8 @@ def _match_folder(
             raise ValueError(f"{folder} adapts only some layers of the stack {path} with DoRA")
         for name, adapter in present.items():
             _check_fits(folder, name, adapter, d_in, d_out)
-        blank = {"lora_a": np.zeros((d_in, 0), np.float32), "lora_b": np.zeros((0, d_out))}
-        blank["scale"] = next(iter(present.values()))["scale"]
+        first = next(iter(present.values()))
+        blank = {**first, "lora_a": first["lora_a"][:, :0], "lora_b": first["lora_b"][:0]}
         adapters = [present.get(name, blank) for name in module_names]
         scale, values[path] = _stacked(adapters, leading)
         rank = values[path]["lora_a"].shape[-1]
