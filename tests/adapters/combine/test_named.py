@@ -127,7 +127,7 @@ def test_combined_model_is_frozen_and_shares_the_base():
         return model
 
     jax.eval_shape(combine)
-    assert models()["pour"].blocks.method == LoRA(rank=3)
+    assert models()["pour"].blocks.method == LoRA(rank=3, ranks=(1, 3, 2))
     models_by_choice = (lorasp_jax.choose(combined(), name) for name in ("pour", "open"))
     assert not np.array_equal(
         *(jax.tree.leaves(nnx.state(model, named.AdapterChoice)) for model in models_by_choice)
