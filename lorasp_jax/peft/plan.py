@@ -71,7 +71,8 @@ class RankPlan:
         check(fields, _FIELDS)
         check_names(cls, "a plan", (), fields)
         ranks = {path: tuple(each) for path, each in fields["ranks"].items()}
-        return cls(**fields | {"ranks": ranks})
+        values: dict[str, Any] = {**fields, "ranks": ranks}
+        return cls(**values)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the plan to a file, with one line per layer."""

@@ -162,8 +162,9 @@ def override(config: Config, arguments: Sequence[str], program: str = "") -> Con
         prog=program,
         config=(tyro.conf.AvoidSubcommands,),
     )
-    method = _fields(parsed.peft, config.peft)
-    return type(config)(**_fields(parsed, config) | {"peft": type(config.peft)(**method)})
+    values = _fields(parsed, config)
+    values["peft"] = type(config.peft)(**_fields(parsed.peft, config.peft))
+    return type(config)(**values)
 
 
 def _fields(value: Any, like: Any) -> dict[str, Any]:
