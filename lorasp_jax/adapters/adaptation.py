@@ -125,9 +125,25 @@ def with_dropout(model: Model, key: jax.Array) -> Model:
 
 
 def count(model: nnx.Module) -> Counts:
-    """Count trainable and total parameters; also works on shapes (`nnx.eval_shape`)."""
+    """Count trainable and total parameters; also works on shapes (`nnx.eval_shape`).
+
+    What pads the adapters of a stack to a common rank is not counted.
+    """
     validate.module(model)
-    return Counts(_size(nnx.state(model, AdapterParam)), _size(nnx.state(model, nnx.Param)))
+    unused = sum(padding(model).values())
+    sizes = (_size(nnx.state(model, kind)) - unused for kind in (AdapterParam, nnx.Param))
+    return Counts(*sizes)
+
+
+def padding(model: nnx.Module) -> dict[str, int]:
+    """Return how many parameters pad the adapter of a stack, by the adapter's path."""
+    locations = paths.locate(nnx.List([model]), AdaptedLayer)
+    once = {id(location.child): location for location in locations}  # a layer may be shared
+    return {
+        f"{path}/adapter": layer.method.unused(layer.adapter.get_value())
+        for path, _, _, layer in once.values()
+        if isinstance(layer.adapter, AdapterParam) and layer.method is not None
+    }
 
 
 def methods(model: nnx.Module) -> dict[str, Method]:
@@ -197,8 +213,8 @@ def attach(
     `statistics` are the second moments `[..., I, I]` of its inputs, if the method requires them.
 
     Raises:
-        ValueError: the layer does not support the method or already has an adapter, or the method
-            would split a quantized kernel.
+        ValueError: the layer does not support the method or already has an adapter, the method is
+            for another number of layers, or it would split a quantized kernel.
     """
     if layer.adapter is not None and layer.method is not None:
         raise ValueError(f"it already has a {layer.method.name} adapter: merge the model first")
@@ -213,6 +229,7 @@ def attach(
         params, kernel = _split_on_host(key, init, kernel)
     else:
         params, kernel = init_stack(key, init, kernel, statistics)
+    params = method.trimmed(params)
     layer.method = method
     if method.splits_kernel:
         layer.set_kernel_matrices(kernel)

@@ -194,6 +194,7 @@ class LinenAdapter:
             layer = layer_call(module, self.einsums, args, kwargs)
             init, key = layer.adapter_init(method), module.make_rng("params")
             params, rest = init_stack(key, init, layer.matrices())
+            params = method.trimmed(params)
         if method.splits_kernel:
             layer.set_matrices(rest)
         module.put_variable("params", ADAPTER, params)

@@ -71,7 +71,8 @@ def _rows(model: nnx.Module) -> list[Row]:
         inside |= {id(v) for v in vars(layer).values() if isinstance(v, nnx.Variable)}
         method, counts = getattr(layer, "method", None), count(layer)
         name = method.name if method else "full" if counts.trainable else "-"
-        rank = getattr(method, "rank", "-")
+        rank, ranks = getattr(method, "rank", "-"), getattr(method, "ranks", ())
+        rank = f"{min(ranks)}-{max(ranks)}" if ranks else rank
         rows.append(_row(path, name, kernel_of(layer).get_value(), rank, counts))
     for path, _, _, variable in locate(root, AdapterParam):
         if id(variable) not in inside:

@@ -31,6 +31,10 @@ COMMANDS = {
         "lorasp_jax.report.__main__",
         "rebuild the report of a run, or film its active ranks",
     ),
+    "allocate": (
+        "lorasp_jax.cli.allocate",
+        "plan ranks by layer from a finished run, for train --plan",
+    ),
     "deploy": (
         "lorasp_jax.extras.deployment.__main__",
         "compare forms in which a run can be deployed, or save one",

@@ -51,13 +51,25 @@ def main(arguments: Sequence[str], program: str = "python train.py") -> int:
                 versions = {x.__name__: x.__version__ for x in (jax, flax, lorasp_jax)}
                 processes.agree("versions", versions)
             with processes.together():
-                command = _resolved(parse(arguments, program))
+                command = _resolved(_with_plan(parse(arguments, program)))
             options = {"resume": command.resume, "dry_run": command.dry_run}
             processes.agree("settings", to_json(command.config) | options)
             _execute(command, console, started)
 
     remedy = ": free some memory or disk space and add --resume"
     return run_command(adapt, errors, f"stopped; to resume: {resume}", remedy)
+
+
+def _with_plan(command: "Command") -> "Command":
+    """Resume a run with its own plan of ranks, whose file need not exist any more."""
+    from lorasp_jax.training import finished_run, records, run_folder
+
+    config = command.config
+    if not command.resume or config.plan:
+        return command
+    path = RUNS / config.name / run_folder.CONFIG_FILE
+    plan = finished_run.recorded_plan(run_folder.read_json(path, records.CONFIG))
+    return dataclasses.replace(command, config=dataclasses.replace(config, plan=plan))
 
 
 def _resolved(command: "Command") -> "Command":

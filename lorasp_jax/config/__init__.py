@@ -8,6 +8,7 @@ from lorasp_jax.config.augment import AugmentConfig
 from lorasp_jax.config.recap import RecapConfig
 from lorasp_jax.peft import Method, fields
 from lorasp_jax.peft.auxiliary import AUXILIARY_WEIGHTS
+from lorasp_jax.peft.plan import RankPlan
 
 SCALES = ("smoke", "cpu", "accelerator")
 VALIDATION_WINDOWS = 16
@@ -269,6 +270,9 @@ class Config:
     targets: tuple[str, ...] = (".*",)
     """Layers to adapt: presets (paper, all-linear, openpi, expert-only, vision, language, action,
     projections) and regular expressions over layer paths."""
+    plan: RankPlan | None = None
+    """Ranks by layer for the method in peft, which must be of fixed rank; None: all layers have
+    that of the method."""
     adapt: tuple[str, ...] = ()
     """Methods by rule, the first match wins; replaces targets. A rule is TARGET=METHOD[:RANK], such
     as language=lora:16, with one target and a method or none; or a recipe (paper, openpi-lora,
@@ -320,6 +324,16 @@ class Config:
         """Whether to measure on held-out episodes when logging `step`."""
         return step == self.optim.steps or self._due(step, self.evaluation.validate_every)
 
+    def _check_plan(self) -> None:
+        if getattr(self.peft, "ranks", ()):
+            raise ValueError("peft.ranks are those of a plan: name its file with --plan")
+        if self.plan is None:
+            return
+        self.plan.rules(self.peft)
+        _require(not self.adapt, "plan and adapt cannot be combined: drop one", self.adapt)
+        of, rule = self.plan.backbone, "model.backbone must be the plan's"
+        _require(of == self.model.backbone, f"{rule}, {of}", self.model.backbone)
+
     def _due(self, step: int, every: int) -> bool:
         return bool(every) and step // every > (step - self.log_every) // every
 
@@ -332,6 +346,7 @@ class Config:
         _require(self.control_dt > 0, "control_dt must be above 0", self.control_dt)
         _require(0 <= self.seed < 2**32, "seed must lie in [0, 2**32)", self.seed)
         self.scene.check(self.control_dt)
+        self._check_plan()
         self.recap.check(self.learn, bool(self.data.source))
         every, rule = self.data.fresh_every, "data.fresh_every must be a multiple of log_every"
         _require(every % self.log_every == 0, rule, f"{every} and {self.log_every}")

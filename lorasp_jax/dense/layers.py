@@ -173,7 +173,7 @@ class Dense(AdaptedLayer):
         if method is not None and not method.trains_base:
             params, kernel = method.init(rngs.params(), self.kernel.get_value())
             self.kernel.set_value(kernel)
-            self.adapter = AdapterParam(params)
+            self.adapter = AdapterParam(method.trimmed(params))
 
     def __call__(
         self,

@@ -71,4 +71,4 @@ class LinenDense(nn.Module):
                 "this initialization changes the kernel, which Linen does not allow: choose "
                 "another one, or use `adapt` on an NNX model"
             )
-        return self.method.init(self.make_rng("params"), kernel)[0]
+        return self.method.trimmed(self.method.init(self.make_rng("params"), kernel)[0])

@@ -194,7 +194,7 @@ def success(result: Result) -> dict[str, Any]:
 def summarize(run: Run, after: dict[str, Result]) -> dict[str, Any]:
     """Return the content of results.json."""
     before = read_json(run.folder / "before.json", records.BEFORE)
-    layers = _mean([result.active_rank for result in after.values()])
+    layers = _mean([result.active_rank for result in after.values()]) if after else _training(run)
     modules = {
         tower: float(np.mean(np.concatenate(list(layers[tower].values()))))
         for tower in TOWERS
@@ -223,6 +223,15 @@ def summarize(run: Run, after: dict[str, Result]) -> dict[str, Any]:
         "trainable_parameters": trainable,
         "total_parameters": total,
     }
+
+
+def _training(run: Run) -> dict[str, dict[str, list[float]]]:
+    """Return the active ranks of the end of training, as `Result` has those of an evaluation."""
+    layers: dict[str, dict[str, list[float]]] = {}
+    for name, ranks in run.layer_ranks.items():
+        _, tower, layer = name.split("/", 2)
+        layers.setdefault(tower, {})[layer] = ranks.tolist()
+    return layers
 
 
 def _mean(trees: list[Any]) -> Any:

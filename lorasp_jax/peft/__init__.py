@@ -89,5 +89,7 @@ def from_settings(settings: Any) -> Method:
     """
     if not isinstance(settings, dict) or not isinstance(settings.get("method"), str):
         raise ValueError(f"adapter settings must name a method, got {short(settings)}")
-    fields = without_removed(settings)
+    # JSON has no tuples.
+    fields = {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
+    fields = without_removed(fields)
     return create(fields.pop("method"), **fields)

@@ -5,13 +5,14 @@ initializations follow Hugging Face PEFT.
 """
 
 import dataclasses
+import math
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 
 from lorasp_jax.peft.auxiliary import Aux
-from lorasp_jax.peft.fields import check_kernel
+from lorasp_jax.peft.fields import check_kernel, short
 from lorasp_jax.peft.method import Kernel, Method, Params, kaiming_uniform
 
 
@@ -42,11 +43,24 @@ class LoRA(Method):
     dropout: float = 0.0
     """Dropout rate on the adapter's input, in training only. Enable it with `with_dropout` (NNX) or
     rngs={"dropout": key} (Linen)."""
+    ranks: tuple[int, ...] = ()
+    """Ranks r ≤ R of the layers of a stack, of which `adapt` needs one per layer; empty: all have
+    rank R. A plan sets them (`lorasp_jax.peft.plan`). A direction beyond a layer's rank has A and B
+    zero, hence no gradient, and stays zero. The scale is that of R in all layers."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.rank < 1:
             raise ValueError(f"rank must be at least 1, got {self.rank}")
+        if self.ranks and not (min(self.ranks) >= 0 and 1 <= max(self.ranks) <= self.rank):
+            raise ValueError(
+                f"ranks must be from 0 to rank {self.rank}, not all 0, got {short(self.ranks)}"
+            )
+        if self.ranks and self.initialization not in ("kaiming", "eva"):
+            raise ValueError(
+                f"initialization must be 'kaiming' or 'eva' if ranks differ by layer, since "
+                f"{self.initialization!r} depends on the rank, got {short(self.ranks)}"
+            )
         if self.initialization == "pissa" and self.scale < 0:
             raise ValueError(f"alpha must be positive for 'pissa', got {self.alpha}")
 
@@ -126,13 +140,37 @@ class LoRA(Method):
     def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
-        """Eq. (3) of Hu et al.: z = scale x A. Every token uses the full rank."""
-        del params, token_mask
-        return self.scale * rows, Aux(jnp.full(rows.shape[:-1], self.rank, jnp.float32))
+        """Eq. (3) of Hu et al.: z = scale x A. Every token uses the layer's full rank."""
+        del token_mask
+        if not self.ranks:
+            return self.scale * rows, Aux(jnp.full(rows.shape[:-1], self.rank, jnp.float32))
+        rank = (params["lora_a"] != 0).any(0).sum().astype(jnp.float32)
+        return self.scale * rows, Aux(jnp.broadcast_to(rank, rows.shape[:-1]))
 
     def up(self, params: Params) -> jax.Array:
         """B."""
         return params["lora_b"]
+
+    def trimmed(self, params: Params) -> Params:
+        """Zero the directions beyond the `ranks` of the layers; see `Method.trimmed`."""
+        if not self.ranks:
+            return params
+        *stack, _, rank = params["lora_a"].shape
+        if len(self.ranks) != math.prod(stack):
+            raise ValueError(
+                f"ranks must have one entry for each layer of the stack ({math.prod(stack)}), got "
+                f"{len(self.ranks)}"
+            )
+        live = jnp.arange(rank) < jnp.array(self.ranks).reshape(*stack, 1)
+        # Not a product with the mask, which would leave negative zeros.
+        a = jnp.where(live[..., None, :], params["lora_a"], 0)
+        b = jnp.where(live[..., None], params["lora_b"], 0)
+        return {**params, "lora_a": a, "lora_b": b}
+
+    def unused(self, params: Params) -> int:
+        """Number of parameters of the directions beyond `ranks`; see `Method.unused`."""
+        width = params["lora_a"].shape[-2] + params["lora_b"].shape[-1]
+        return sum(self.rank - rank for rank in self.ranks) * width
 
     @property
     def as_saved(self) -> "LoRA":

@@ -115,6 +115,19 @@ class Method(Bottleneck):
         """Initialize parameters for a kernel [d_in, d_out]; a pure function of key and shape."""
         raise NotImplementedError
 
+    def trimmed(self, params: Params) -> Params:
+        """Zero what a stack's layers do not use of initial parameters `[...layers, ...]`, if any.
+
+        Raises:
+            ValueError: the method is for a stack of another size.
+        """
+        return params
+
+    def unused(self, params: Params) -> int:
+        """Number of parameters, or of their shapes, that `trimmed` zeroes; they stay zero."""
+        del params
+        return 0
+
     def down(self, params: Params) -> jax.Array:
         """Down-projection P [I, Q]."""
         raise NotImplementedError

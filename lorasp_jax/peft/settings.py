@@ -13,8 +13,9 @@ _LORA_SP = ("lora_sp", "lora_sp_release", "LoRASP", "LoRASPRelease")
 
 
 def to_settings(method: Any) -> Settings:
-    """The name of a method and its fields, as stored with an adapter."""
-    return {"method": method.name, **dataclasses.asdict(method.as_saved)}
+    """The name of a method and its fields, as stored with an adapter; empty `ranks` are not."""
+    settings = {"method": method.name, **dataclasses.asdict(method.as_saved)}
+    return {name: value for name, value in settings.items() if name != "ranks" or value}
 
 
 def without_removed(settings: Mapping[str, Any]) -> Settings:

@@ -284,6 +284,8 @@ def _rule_cells(row: dict[str, Any]) -> tuple[str, ...]:
 
 def _largest_rank(folder: Path, config: dict[str, Any]) -> int:
     """Return the largest rank of the run's methods."""
+    if "plan" in config:
+        return max(map(max, config["plan"]["ranks"].values()))
     if "adapt" not in config:
         with as_value_error(folder / CONFIG_FILE):
             check(config, records.WITH_RANK)
@@ -301,10 +303,11 @@ def _active_rank(
     rank = _largest_rank(folder, config)
     yield "<h2>Active rank</h2>"
     yield _image(figures.active_rank(rows, rank))
-    if not results["layer_active_rank"]:  # not evaluated
+    if not results["layer_active_rank"]:
         return
+    where = "closed loop" if results["tasks"] else "training"
     modules = ((module, f"{mean:.1f}") for module, mean in results["active_rank"].items())
-    yield _table(("module", "active rank in closed loop"), modules)
+    yield _table(("module", f"active rank in {where}"), modules)
     yield _image(figures.layer_ranks(results["layer_active_rank"], rank))
     if results["active_rank_histogram"]:
         yield _image(figures.rank_histogram(results["active_rank_histogram"]))

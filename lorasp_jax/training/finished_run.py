@@ -16,6 +16,7 @@ from lorasp_jax.config import (
     OptimConfig,
 )
 from lorasp_jax.config.recap import RecapConfig
+from lorasp_jax.peft.plan import RankPlan
 from lorasp_jax.training import records
 from lorasp_jax.training.run_folder import CONFIG_FILE, RELATIVE, read_json, recorded_ranges
 
@@ -68,12 +69,18 @@ def _from_json(recorded: Mapping[str, Any], tasks: tuple[str, ...]) -> Config:
     for name, group in _GROUPS.items():
         fields[name] = group(**fields[name])
     fields["peft"] = recorded_method(fields["peft"])
+    fields["plan"] = recorded_plan(recorded)
     if scene := recorded_ranges(recorded):
         fields["scene"] = scene
     if "recap" in fields:
         fields["recap"] = RecapConfig(**fields["recap"])
     lists = {name: tuple(fields.get(name, ())) for name in ("targets", "adapt")}
     return Config(**fields | {"tasks": tasks, **lists})
+
+
+def recorded_plan(recorded: Mapping[str, Any]) -> RankPlan | None:
+    """Return the plan of a recorded config, if it has one."""
+    return RankPlan.from_json(recorded["plan"]) if "plan" in recorded else None
 
 
 def recorded_method(settings: Mapping[str, Any]) -> peft.Method:

@@ -174,6 +174,7 @@ def _loop(
             state, metrics = program(state, key, done, count)
             rows, done = jax.device_get(metrics), done + count
             means = summarize(rows)
+            run.layer_ranks = {name: mean for name, mean in means.items() if mean.ndim}
             values = {name: float(x.mean()) for name, x in means.items()} | program.speed.end(count)
             if error := _failure(config.optim, rows, values, done, saved):
                 log.write(done, values)
@@ -184,7 +185,7 @@ def _loop(
             progress.update(bar, completed=done, description=text, rate=rate)
             run.policy = policy(state)
             values = _call_on_log(callbacks, run, done, values)
-            log.write(done, values, {name: mean for name, mean in means.items() if mean.ndim})
+            log.write(done, values, run.layer_ranks)
             if done // config.checkpoint_every > saved // config.checkpoint_every:
                 checkpoints.save(state)
                 saved = done

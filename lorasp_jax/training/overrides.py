@@ -12,7 +12,7 @@ import tyro
 from envs.names import check
 from lorasp_jax import peft
 from lorasp_jax.config import SCALES, Config
-from lorasp_jax.peft import LoRASP
+from lorasp_jax.peft import LoRASP, plan
 from lorasp_jax.training import experiment_file
 
 HELP = {"-h", "--help"}
@@ -73,11 +73,14 @@ def parse(arguments: Sequence[str], program: str = "python train.py") -> Command
     if known.resume and known.dry_run:
         raise ValueError("--resume and --dry-run cannot be combined")
     config = override(config, rest, program)
+    if known.plan is not None:
+        config = dataclasses.replace(config, plan=plan.read(known.plan))
     _check_simulated(config)
     _check_rules(config, ["--method"] * bool(known.method) + rest)
     options = (text.partition("=")[0] for text in rest if text.startswith("--"))
     given = frozenset(option.lstrip("-").replace("-", "_") for option in options)
     given |= {"peft"} if known.method else set()
+    given |= {"plan"} if known.plan else set()
     return Command(config, known.resume, known.dry_run, known.wandb, known.fit, given)
 
 
@@ -101,6 +104,8 @@ def _option_parser(program: str = "", method: str = "") -> argparse.ArgumentPars
     methods = ", ".join(peft.names())
     default = ", ".join(filter(None, ["the experiment's", method]))
     parser.add_argument("--method", help=f"adapter method: {methods} (default: {default})")
+    text = "ranks by layer for lora or dora, as written by lorasp-jax allocate"
+    parser.add_argument("--plan", type=Path, metavar="FILE", help=text)
     text = "resume the run of this name; with auto, start it if it does not exist"
     resume: Any = {"nargs": "?", "const": True, "default": False, "choices": ["auto"]}
     parser.add_argument("--resume", help=text, **resume)
@@ -149,15 +154,33 @@ def override(config: Config, arguments: Sequence[str], program: str = "") -> Con
     Raises:
         SystemExit: after printing the help text, or what is wrong with a field.
     """
+    shown = dataclasses.replace(config, peft=_without_ranks(config.peft))
     parsed = tyro.cli(
-        _concrete(config),
-        default=config,
+        _concrete(shown),
+        default=shown,
         args=[*arguments],
         prog=program,
         config=(tyro.conf.AvoidSubcommands,),
     )
-    names = (field.name for field in dataclasses.fields(config))
-    return type(config)(**{name: getattr(parsed, name) for name in names})
+    values = _fields(parsed, config)
+    values["peft"] = type(config.peft)(**_fields(parsed.peft, config.peft))
+    return type(config)(**values)
+
+
+def _fields(value: Any, like: Any) -> dict[str, Any]:
+    """Return the values of the fields that a dataclass has."""
+    return {field.name: getattr(value, field.name) for field in dataclasses.fields(like)}
+
+
+def _without_ranks(method: peft.Method) -> peft.Method:
+    """Return a method that hides its `ranks`, which a plan sets, from the command line."""
+    kind = type(method)
+    if not hasattr(method, "ranks"):
+        return method
+    hidden = ("ranks", tyro.conf.Suppress[tuple[int, ...]], dataclasses.field(default=()))
+    same = {"__module__": kind.__module__, "__doc__": kind.__doc__}
+    options: Any = {"bases": (kind,), "frozen": True, "namespace": same}
+    return dataclasses.make_dataclass(kind.__name__, [hidden], **options)(**_fields(method, kind))
 
 
 def _check_rules(config: Config, arguments: Sequence[str]) -> None:
@@ -202,13 +225,14 @@ def _with_rank_of(current: peft.Method, name: str) -> peft.Method:
 def _concrete(config: Config) -> type[Config]:
     """Return a config class whose `peft` has the chosen method's type, to expose its fields.
 
-    `scale` is hidden, because it only selects defaults.
+    `scale`, which only selects defaults, and `plan`, which is a file's content, are hidden.
     """
     return dataclasses.make_dataclass(
         "Config",
         [
             ("peft", type(config.peft), dataclasses.field()),
             ("scale", tyro.conf.Suppress[str], dataclasses.field()),
+            ("plan", tyro.conf.Suppress[plan.RankPlan | None], dataclasses.field()),
         ],
         bases=(type(config),),
         frozen=True,

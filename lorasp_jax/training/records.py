@@ -43,5 +43,6 @@ CONFIG: Schema = {
     "optim": {"steps": int},
     "scene?": {str: (float, float)},
     "adapt?": [str],
+    "plan?": {"ranks": {str: [int]}},
 }
 WITH_RANK: Schema = CONFIG | {"peft": {"method": str, "rank": int}}

@@ -1,7 +1,8 @@
 """The rules by which a run adapts its model: which layers get which method."""
 
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -9,17 +10,19 @@ import jax
 from flax import nnx
 
 from lorasp_jax.adapters import paths
+from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.config import Config
 from lorasp_jax.dense import AdaptedLayer, AdapterParam
 from lorasp_jax.models import presets
 from lorasp_jax.models.noise_actor import PATH
 from lorasp_jax.peft import Method
+from lorasp_jax.peft.plan import Shapes
 
 TOWERS = ("vision", "language", "action")
 
 
 def named_rules(config: Config) -> presets.NamedRules:
-    """Return a run's rules by their text: those of `adapt`, or `peft` on all `targets`.
+    """Return a run's rules by their text: those of `adapt` or `plan`, or `peft` on all `targets`.
 
     Raises:
         ValueError: a rule or target is invalid, or only full fine-tuning trains a quantized base.
@@ -27,6 +30,8 @@ def named_rules(config: Config) -> presets.NamedRules:
     found: presets.NamedRules
     if config.adapt:
         found = presets.parse(config.adapt, config.peft)
+    elif config.plan:
+        found = config.plan.rules(config.peft)
     else:
         found = {p: (p, config.peft) for p in presets.patterns(config.targets)}
     if config.model.base_dtype and all(not m or m.trains_base for _, m in found.values()):
@@ -43,6 +48,27 @@ def rules(config: Config, *, as_saved: bool = False) -> paths.Rules:
 def methods(config: Config) -> list[Method]:
     """Return the distinct methods of a run's rules."""
     return [*dict.fromkeys(method for _, method in rules(config) if method)]
+
+
+def check_plan(config: Config, model: nnx.Module) -> None:
+    """Raise ValueError if a run has a plan that is not one for the layers of its targets.
+
+    Args:
+        config: the run's config.
+        model: the base, or its shapes.
+    """
+    if config.plan:
+        config.plan.check(shapes(model, presets.patterns(config.targets)))
+
+
+def shapes(model: nnx.Module, patterns: Sequence[str] = ("",)) -> Shapes:
+    """Return the shapes of a model's layers whose path one of the patterns matches."""
+    found: dict[str, tuple[int, int, int]] = {}
+    for layer in paths.locate_layers(nnx.List([model])):
+        if any(re.search(pattern, layer.path) for pattern in patterns):
+            *stack, d_in, d_out = nnx_layers.matrices_shape(layer.child, {})
+            found[layer.path] = math.prod(stack), d_in, d_out
+    return found
 
 
 def trains_base(config: Config) -> bool:

@@ -43,6 +43,7 @@ class Run:
         stops: whether training ends with this step, before the last of the config.
         objective: what to learn in place of the demonstrated actions.
         trained: pattern of the paths of the adapters that the run trains; "": all.
+        layer_ranks: the active ranks `[L]` of the last log interval, by name as logged.
         programs: jitted training programs by their inputs; see `program.jit_steps`.
         policy: the current policy; read it in callbacks or after training, since each step donates
             its buffers.
@@ -66,6 +67,7 @@ class Run:
     stops: bool = False
     objective: Objective | None = None
     trained: str = ""
+    layer_ranks: dict[str, np.ndarray] = field(default_factory=dict)
     programs: dict[Any, Callable[..., Any]] = field(default_factory=dict)
     policy: Policy = field(init=False)
     seconds: dict[str, float] = field(init=False)
@@ -95,9 +97,11 @@ class Run:
 
     @property
     def parameters(self) -> tuple[int, int]:
-        """Numbers of trainable parameters and of all parameters."""
+        """Numbers of trainable parameters and of all parameters; see `adaptation.count`."""
+        model = self.policy.model
         trained = sum(x.size for x in jax.tree.leaves(self.split()[1]))
-        return trained, adaptation.count(self.policy.model).total
+        unused = {p: n for p, n in adaptation.padding(model).items() if re.search(self.trained, p)}
+        return trained - sum(unused.values()), adaptation.count(model).total
 
     def split(self) -> tuple[Any, Any, Any]:
         """Split the policy's model into (graphdef, adapters that the run trains, all others)."""

@@ -43,8 +43,8 @@ _OPTIONAL = (
     *(("model", "base_dtype"), ("model", "chunk"), ("model", "openpi_config")),
     ("optim", "rtc_max_delay"),
 )
-"""Settings that `to_json` omits at their defaults, which are 0 or empty, as it omits `adapt`:
-results files of studies do not have them."""
+"""Settings that `to_json` omits at their defaults, which are 0 or empty, as it omits `adapt` and
+`plan`: results files of studies do not have them."""
 
 
 RELATIVE: dict[bool | None, bool | None] = {None: False, False: None, True: True}
@@ -74,8 +74,11 @@ def to_json(config: Config) -> dict[str, Any]:
         data["augment"] = {"preset": augment.preset, **augment.given}
     if config.data.validation == ("0",) or not config.data.source:  # likewise
         del data["validation"], fields["keep"], fields["evaluation"]["validate_every"]
-    if not config.adapt:
-        del fields["adapt"]
+    for name in ("adapt", "plan"):
+        if not fields[name]:
+            del fields[name]
+    if "ranks" in fields["peft"]:  # those of the plan
+        del fields["peft"]["ranks"]
     if config.learn != "recap":
         del fields["recap"]
     if config.learn == "imitation":

@@ -100,6 +100,7 @@ def build(
     use_bundled = abstract and hub.is_remote(config.model.tokenizer)
     tokenizer = load_tokenizer("" if use_bundled else config.model.tokenizer)
     base, base_hash = base_model(config, abstract=abstract)
+    rules.check_plan(config, base)
     chosen = {name: getattr(config.model, name) for name in ("max_tokens", "chunk")}
     base = with_config(base, **{name: value for name, value in chosen.items() if value})
     source = dataset.open_dataset(config, base.config, folder) if config.data.source else None

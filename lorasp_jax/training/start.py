@@ -15,7 +15,7 @@ from lorasp_jax.training.run import Run
 C = TypeVar("C", bound=Config)
 KEPT = ("model", "robot", "image_size", "scene", "control_dt", "data")
 """Fields of the config that a start run decides."""
-ADAPTERS = ("peft", "targets", "adapt")
+ADAPTERS = ("peft", "targets", "adapt", "plan")
 """Fields that it decides if its adapters are trained further."""
 
 

@@ -1,5 +1,7 @@
 """Adapt whole models: rules, stacked layers, splitting, counting, merging."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +13,7 @@ import lorasp_jax
 from lorasp_jax import peft
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.dense import AdapterParam, Dense
-from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP
+from lorasp_jax.peft import DoRA, FullFineTuning, LoRA, LoRASP
 from tests.cases import mostly_slow
 from tests.models.random_models import with_random_parameters
 
@@ -246,3 +248,85 @@ def test_nnx_tree_mode(net, x):
     with nnx.set_graph_mode(False):
         y, _ = jax.jit(lambda a: nnx.merge(graphdef, a, frozen)(x))(adapters)
     np.testing.assert_allclose(y, call(model, x)[0], rtol=1e-5, atol=1e-5)
+
+
+RANKS = {LoRA: (2, 0, 3), DoRA: (2, 1, 3)}
+
+
+@functools.cache
+def trained_by_rank(kind):
+    """A stack with ranks by layer, before and after steps with momentum and weight decay."""
+    net = with_random_parameters(lambda: Net(nnx.Rngs(0)))
+    before = adapted(net, ("blocks", kind(rank=3, ranks=RANKS[kind], dropout=0.5)))
+    graphdef, adapters, frozen = adaptation.split(before)
+    optimizer = optax.adamw(1e-2, weight_decay=0.1)
+    x = np.random.default_rng(0).normal(size=(6, 5)).astype("f")
+
+    def loss(adapters, key):
+        model = adaptation.with_dropout(nnx.merge(graphdef, adapters, frozen, copy=True), key)
+        return (model(x)[0] ** 2).mean()
+
+    @jax.jit
+    def step(adapters, state, key):
+        updates, state = optimizer.update(jax.grad(loss)(adapters, key), state, adapters)
+        return optax.apply_updates(adapters, updates), state
+
+    state = optimizer.init(adapters)
+    for key in jax.random.split(jax.random.key(0), 4):
+        adapters, state = step(adapters, state, key)
+    return before, nnx.merge(graphdef, adapters, frozen)
+
+
+@pytest.mark.parametrize("kind", RANKS)
+def test_directions_beyond_a_rank_stay_zero_to_the_bit(kind):
+    for model, is_trained in zip(trained_by_rank(kind), (False, True), strict=True):
+        values = model.blocks.adapter.get_value()
+        for i, rank in enumerate(RANKS[kind]):
+            a, b = (np.asarray(values[name][i]) for name in ("lora_a", "lora_b"))
+            for beyond in (a[:, rank:], b[rank:]):
+                assert not beyond.view(np.uint32).any()  # no negative zeros either
+            assert a[:, :rank].all()
+            assert b[:rank].all() == (is_trained or not rank)
+
+
+@pytest.mark.parametrize("kind", RANKS)
+def test_ranks_by_layer_are_counted_and_reported(kind, x):
+    _, model = trained_by_rank(kind)
+    size = sum(RANKS[kind]) * 2 * WIDTH + (kind is DoRA) * LAYERS * WIDTH
+    assert adaptation.count(model).trainable == size
+    assert adaptation.count(model).total == adaptation.count(adaptation.merge(model)).total + size
+    shapes = nnx.eval_shape(lambda: adapted(Net(nnx.Rngs(0)), ("blocks", model.blocks.method)))
+    assert adaptation.count(shapes) == adaptation.count(model) or kind is DoRA
+    y, aux = call(model, x)
+    assert [*aux.active_rank.mean(1)] == [*RANKS[kind]]
+    merged = lorasp_jax.merge(model)
+    np.testing.assert_allclose(call(merged, x)[0], y, rtol=1e-4, atol=1e-5)
+    assert f" {min(RANKS[kind])}-3 " in lorasp_jax.summary(model)
+
+
+def test_ranks_by_layer_of_eva(net):
+    """Each layer has its leading directions."""
+    roots = np.random.default_rng(0).normal(size=(LAYERS, WIDTH, WIDTH)).astype("f")
+    moments = {"blocks": jnp.einsum("lik,ljk->lij", roots, roots)}
+    adapt = lambda method: adaptation.adapt(  # noqa: E731
+        net, [("blocks", method)], rngs=nnx.Rngs(0), statistics=moments
+    )
+    whole, some = (
+        adapt(LoRA(rank=3, initialization="eva", ranks=ranks)).blocks.adapter.get_value()["lora_a"]
+        for ranks in ((), (2, 0, 3))
+    )
+    for i, rank in enumerate((2, 0, 3)):
+        np.testing.assert_array_equal(some[i, :, :rank], whole[i, :, :rank])
+        assert not some[i, :, rank:].any()
+
+
+def test_ranks_of_another_stack(net):
+    with pytest.raises(ValueError, match=r"adapt blocks: ranks must .* stack \(3\), got 2"):
+        adapted(net, ("blocks", LoRA(rank=2, ranks=(1, 2))))
+    with pytest.raises(ValueError, match=r"adapt inp: ranks must .* stack \(1\), got 3"):
+        adapted(net, ("inp", LoRA(rank=2, ranks=(1, 2, 0))))
+    with pytest.raises(ValueError, match="ranks must have one entry"):
+        Dense(2, 2, method=LoRA(rank=2, ranks=(1, 2)), rngs=nnx.Rngs(0))
+    for ranks in ((1, 3), (-1, 2), (0, 0)):
+        with pytest.raises(ValueError, match="ranks must be from 0 to rank 2, not all 0"):
+            LoRA(rank=2, ranks=ranks)

@@ -43,10 +43,8 @@ def test_fields_of_lora(fields, message):
 
 
 def test_too_many_values():
-    with pytest.raises(
-        ValueError, match=r"lora takes at most 5 values \(rank, .* dropout\), got 6"
-    ):
-        LoRA(1, 2.0, False, "kaiming", 0.1, 3)  # pyright: ignore[reportCallIssue]
+    with pytest.raises(ValueError, match=r"lora takes at most 6 values \(rank, .* ranks\), got 7"):
+        LoRA(1, 2.0, False, "kaiming", 0.1, (), 3)  # pyright: ignore[reportCallIssue]
 
 
 @pytest.mark.parametrize(
@@ -86,7 +84,7 @@ def test_every_field_of_every_method(cls, field):
     """A wrong value raises an error that names the field, or the method works."""
     for value in BAD:
         if (message := error_message(cls, field, value)) is None:
-            assert value in (None, True, -1)
+            assert value in (None, True, -1, ())
         else:
             assert "\n" not in message
             assert field in message or repr(value) in message

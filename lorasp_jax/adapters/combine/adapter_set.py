@@ -208,7 +208,9 @@ def set_slot(bank: Params, slot: int, method: LoRA | None, params: Params) -> Pa
         a = a.at[..., slot, :rank].set(params["lora_a"])
         b = b.at[..., slot, :rank, :].set(params["lora_b"])
     scale = bank["scale"].at[..., slot].set(0.0 if method is None else method.scale)
-    ranks = bank["rank"].at[..., slot].set(rank)
+    ranks = bank["rank"][..., slot]
+    ranks = jnp.array(method.ranks).reshape(ranks.shape) if method and method.ranks else rank
+    ranks = bank["rank"].at[..., slot].set(ranks)
     return {"lora_a": a, "lora_b": b, "scale": scale, "rank": ranks}
 
 
@@ -222,7 +224,9 @@ def get_slot(bank: Params, slot: int) -> tuple[LoRA | None, Params]:
         "lora_a": bank["lora_a"][..., slot, :rank],
         "lora_b": bank["lora_b"][..., slot, :rank, :],
     }
-    return LoRA(rank=rank, alpha=scale * rank), params
+    ranks = tuple(bank["rank"][..., slot].ravel().tolist())
+    ranks = ranks if min(ranks) < rank else ()
+    return LoRA(rank=rank, alpha=scale * rank, ranks=ranks), params
 
 
 def _active_rank(weight: jax.Array, aux: Aux) -> jax.Array:

@@ -81,9 +81,9 @@ def load_peft(
     heads are concatenated as in torch, and LoRA also to embeddings and convolutions. Biases and
     modules that PEFT trained in full (`bias`, `modules_to_save`) become trainable parameters.
     Embeddings and output layers that it only stored (`save_embedding_layers`) replace the model's.
-    AdaLoRA is loaded as the equivalent LoRA. If ranks differ within a stack, adapters are
-    zero-padded to the largest. `lora_dropout` becomes the methods' `dropout`, which is active only
-    under `with_dropout`.
+    AdaLoRA is loaded as the equivalent LoRA. If ranks differ within a stack, or some of its layers
+    have no adapter, the method has `ranks`. `lora_dropout` becomes the methods' `dropout`, which
+    is active only under `with_dropout`.
 
     The adapter of an `nnx.Embed` also changes the logits of its `attend`. In PEFT, that of an
     embedding changes the logits only with `ensure_weight_tying`.
@@ -146,17 +146,23 @@ def _match_folder(
     for path, (*leading, d_in, d_out) in shapes.items():
         module_names = [names(path, index) for index in np.ndindex(*leading)]
         candidates += module_names
-        adapters = [unused.pop(name) for name in module_names if name in unused]
-        if not adapters:
+        present = {name: unused.pop(name) for name in module_names if name in unused}
+        if not present:
             continue
-        if len(adapters) < len(module_names):
-            raise ValueError(f"{folder} adapts only some layers of the stack {path}")
-        for name, adapter in zip(module_names, adapters, strict=True):
+        if len(present) < len(module_names) and kind is DoRA:
+            raise ValueError(f"{folder} adapts only some layers of the stack {path} with DoRA")
+        for name, adapter in present.items():
             _check_fits(folder, name, adapter, d_in, d_out)
+        first = next(iter(present.values()))
+        blank = {**first, "lora_a": first["lora_a"][:, :0], "lora_b": first["lora_b"][:0]}
+        adapters = [present.get(name, blank) for name in module_names]
         scale, values[path] = _stacked(adapters, leading)
         rank = values[path]["lora_a"].shape[-1]
+        ranks = tuple(adapter["lora_a"].shape[-1] for adapter in adapters)
+        ranks = ranks if min(ranks) < max(ranks) else ()
         with paths.naming("load", folder):
-            rules.append((f"^{re.escape(path)}$", kind(rank, scale * rank, dropout=dropout)))
+            method = kind(rank, scale * rank, dropout=dropout, ranks=ranks)
+            rules.append((f"^{re.escape(path)}$", method))
     if not contents.adapters:
         raise ValueError(f"{folder} contains no adapters")
     if effective := sorted(name for name, adapter in unused.items() if _has_effect(adapter)):
@@ -196,7 +202,8 @@ def save_peft(
 ) -> None:
     """Save the adapters of a model as a Hugging Face PEFT folder.
 
-    AdaLoRA is saved as the equivalent LoRA, without pruned directions.
+    AdaLoRA is saved as the equivalent LoRA, without pruned directions. Layers of a stack are saved
+    with their own `ranks`, and not at all if the rank is 0.
 
     Args:
         folder: created if absent; an adapter in it is replaced.
@@ -221,6 +228,7 @@ def save_peft(
         names(path, index): _to_peft(layer, index)
         for path, layer in layers.items()
         for index in np.ndindex(*layer.kernel_matrices().shape[:-2])
+        if use_dora or _rank(layer, index) != 0
     }
     tensors = {
         f"{PREFIX}{module}.{name}": value
@@ -277,14 +285,22 @@ def _stacked(adapters: list[Adapter], leading: list[int]) -> tuple[float, Adapte
     return scale, {name: x.reshape(*leading, *x.shape[1:]) for name, x in stacked.items()}
 
 
+def _rank(layer: AdaptedLayer, index: tuple[int, ...]) -> int | None:
+    """The rank of one layer of a stack, or None if all have the rank of the method."""
+    ranks = getattr(layer.method, "ranks", ())
+    return int(np.reshape(ranks, layer.stack_shape())[index]) if ranks else None
+
+
 def _to_peft(layer: AdaptedLayer, index: tuple[int, ...]) -> tuple[float, Adapter]:
     """Scale and tensors of one module, with PEFT's names and layout."""
     assert layer.adapter is not None
     params = {k: np.asarray(v[index], np.float32) for k, v in layer.adapter.get_value().items()}
     a, b = params["lora_a"], params["lora_b"]
+    if (rank := _rank(layer, index)) is not None:
+        a, b = a[:, : max(rank, 1)], b[: max(rank, 1)]  # PEFT needs a rank of at least 1
     if isinstance(layer.method, AdaLoRA):
         active = np.flatnonzero(params["lora_e"])
-        active = active if len(active) else np.array([0])  # PEFT needs a rank of at least 1
+        active = active if len(active) else np.array([0])
         a, b = (a * params["lora_e"])[:, active], b[active]
     if isinstance(layer, nnx_layers.ConvLayer):
         sizes = layer.kernel_size  # pyright: ignore[reportAttributeAccessIssue]

@@ -26,7 +26,9 @@ WEIGHTS = {"pour": 0.5, "press": -0.7}
 @functools.cache
 def models():
     return {
-        "pour": trained(("inp", LoRA(rank=2, alpha=3)), ("blocks", LoRA(rank=3)), seed=1),
+        "pour": trained(
+            ("inp", LoRA(rank=2, alpha=3)), ("blocks", LoRA(rank=3, ranks=(1, 3, 2))), seed=1
+        ),
         "press": trained(("", LoRA(rank=4, alpha=5, rank_stabilized=True)), seed=2),
         "open": trained(("inp", SP), ("blocks", DoRA(rank=2)), seed=3),
         "pick": trained(("inp", AdaLoRA(rank=3)), ("blocks", LoRAMoE(experts=2, rank=2)), seed=4),
@@ -125,7 +127,7 @@ def test_combined_model_is_frozen_and_shares_the_base():
         return model
 
     jax.eval_shape(combine)
-    assert models()["pour"].blocks.method == LoRA(rank=3)
+    assert models()["pour"].blocks.method == LoRA(rank=3, ranks=(1, 3, 2))
     models_by_choice = (lorasp_jax.choose(combined(), name) for name in ("pour", "open"))
     assert not np.array_equal(
         *(jax.tree.leaves(nnx.state(model, named.AdapterChoice)) for model in models_by_choice)

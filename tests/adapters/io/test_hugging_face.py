@@ -137,7 +137,44 @@ def test_stacks(tmp_path):
     with pytest.raises(ValueError, match="layer is a stack"):
         hugging_face.load_peft(tmp_path, Stack())
     edit_tensors(tmp_path, lambda t: {k: v for k, v in t.items() if "blocks.2" not in k})
-    with pytest.raises(ValueError, match="only some layers"):
+    some = hugging_face.load_peft(tmp_path, Stack(), names=module)
+    assert some.layer.method == LoRA(rank=2, alpha=3.0, ranks=(2, 1, 0))
+    kernel = adaptation.merge(some).layer.kernel.get_value()
+    np.testing.assert_array_equal(kernel[2], Stack().layer.kernel.get_value()[2])
+    np.testing.assert_array_equal(kernel[:2], ours[:2])
+
+
+@pytest.mark.parametrize("kind", [LoRA, DoRA])
+def test_ranks_by_layer(kind, tmp_path):
+    """A layer of rank 0 has no module in PEFT, unless it has a magnitude."""
+    least = int(kind is DoRA)
+    method = kind(rank=3, alpha=6.0, ranks=(3, least, 1))
+    model = adaptation.adapt(Stack(), [("layer", method)], rngs=nnx.Rngs(0))
+    values = dict(model.layer.adapter.get_value())
+    values["lora_b"] = method.trimmed(values | {"lora_b": values["lora_b"] + 0.5})["lora_b"]
+    model.layer.adapter.set_value(values)
+    hugging_face.save_peft(tmp_path, model, names=module)
+    config = json.loads((tmp_path / hugging_face.CONFIG).read_text())
+    ranks = {n: r for n, r in enumerate(method.ranks) if r}
+    assert config["target_modules"] == [f"blocks.{n}.layer" for n in ranks]
+    of = lambda n, r: config[f"{r}_pattern"].get(f"^blocks\\.{n}\\.layer")  # noqa: E731
+    assert {n: of(n, "rank") or config["r"] for n in ranks} == ranks
+    assert {n: of(n, "alpha") or config["lora_alpha"] for n in ranks} == {
+        n: 2.0 * r for n, r in ranks.items()
+    }
+    stored = safetensors.numpy.load_file(tmp_path / hugging_face.TENSORS)
+    assert sum(x.size for x in stored.values()) == adaptation.count(model).trainable
+    again = hugging_face.load_peft(tmp_path, Stack(), names=module)
+    assert again.layer.method == method
+    for name, value in again.layer.adapter.get_value().items():
+        np.testing.assert_array_equal(value, values[name], err_msg=name)
+
+
+def test_dora_on_some_layers_of_a_stack(tmp_path):
+    model = adaptation.adapt(Stack(), [("layer", DoRA(rank=2))], rngs=nnx.Rngs(0))
+    hugging_face.save_peft(tmp_path, model, names=module)
+    edit_tensors(tmp_path, lambda t: {k: v for k, v in t.items() if "blocks.2" not in k})
+    with pytest.raises(ValueError, match="only some layers of the stack layer with DoRA"):
         hugging_face.load_peft(tmp_path, Stack(), names=module)
 
 
