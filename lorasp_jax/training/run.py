@@ -43,6 +43,7 @@ class Run:
         stops: whether training ends with this step, before the last of the config.
         objective: what to learn in place of the demonstrated actions.
         trained: pattern of the paths of the adapters that the run trains; "": all.
+        fixed: which parameters of the adapters training leaves as they are; None: it changes all.
         programs: jitted training programs by their inputs; see `program.jit_steps`.
         policy: the current policy; read it in callbacks or after training, since each step donates
             its buffers.
@@ -66,6 +67,7 @@ class Run:
     stops: bool = False
     objective: Objective | None = None
     trained: str = ""
+    fixed: Any = None
     programs: dict[Any, Callable[..., Any]] = field(default_factory=dict)
     policy: Policy = field(init=False)
     seconds: dict[str, float] = field(init=False)

@@ -76,6 +76,8 @@ def to_json(config: Config) -> dict[str, Any]:
         del data["validation"], fields["keep"], fields["evaluation"]["validate_every"]
     if not config.adapt:
         del fields["adapt"]
+    if not config.protect:
+        del fields["protect"]
     if config.learn != "recap":
         del fields["recap"]
     if config.learn == "imitation":

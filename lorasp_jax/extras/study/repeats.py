@@ -116,7 +116,9 @@ def _with_repeats(
 
 def _differences(again: Mapping[str, Any], first: Mapping[str, Any]) -> Iterator[str]:
     """Yield the paired difference of success by task and, of tasks of one size, of the mean."""
-    parts = {task: {"outcomes": {task: first["outcomes"][task]}} for task in first["outcomes"]}
+    parts: dict[str, Any] = {
+        task: {"outcomes": {task: first["outcomes"][task]}} for task in first["outcomes"]
+    }
     if len(parts) > 1 and _is_even(first):
         parts["mean"] = first
     for label, part in parts.items():
