@@ -36,7 +36,7 @@ from tests.runs import (
 from tests.training.test_early import Hall
 
 OPTIM = dataclasses.replace(CONFIG.optim, weight_decay=0.5, learning_rate=0.01, accumulate=2)
-PEFT = LoRASP(rank=8, hidden_width=8)
+PEFT = LoRASP(rank=8, hidden_width=8, energy_target=0.5)
 
 
 def some(model, seed=0):

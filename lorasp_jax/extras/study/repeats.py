@@ -103,15 +103,19 @@ def _fixed(cell: Cell | Derived, statuses: Mapping[str, Status]) -> Cell | Deriv
 def _with_repeats(
     name: str, result: Mapping[str, Any], earlier: Mapping[str, Any] | None, folder: Path
 ) -> dict[str, Any]:
-    is_same = lambda other: not changed_settings(other["config"], result["config"])  # noqa: E731
-    kept = list(earlier.get(KEY, [])) if earlier and is_same(earlier) else []
+    kept = list(earlier.get(KEY, [])) if earlier and _is_alike(earlier, result) else []
     files = (folder / FOLDER).glob(f"*/{name}/{CELL_FILE}")
     for file in sorted(files, key=lambda path: int(path.relative_to(folder).parts[1])):
         again = read_json(file, progress.SCHEMA)
-        if is_same(again):
+        if _is_alike(again, result):
             del again["config"]
             kept += [again] * (again not in kept)
     return {**result, KEY: kept} if kept else {**result}
+
+
+def _is_alike(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
+    """Say whether two results have the same settings; either may be of an older version."""
+    return any(not changed_settings(x["config"], y["config"]) for x, y in ((a, b), (b, a)))
 
 
 def _differences(again: Mapping[str, Any], first: Mapping[str, Any]) -> Iterator[str]:
