@@ -22,7 +22,7 @@ from lorasp_jax.config import Config, ModelConfig, OptimConfig
 from lorasp_jax.dense import Dense
 from lorasp_jax.models import flow_matching
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.peft import LoRA, LoRASP
+from lorasp_jax.peft import LoRA, LoRASP, Method
 from lorasp_jax.policies import tokenizer
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.prompt_table import PromptTable
@@ -173,15 +173,15 @@ def finish(folder: Path) -> Path:
     return folder
 
 
-def finish_with_weights(folder: Path) -> Path:
-    """Write a finished run of one task with plain LoRA, whose base is saved beside it."""
+def finish_with_weights(folder: Path, peft: Method = LoRA(rank=4)) -> Path:  # noqa: B008
+    """Write a finished run of one task, by default with LoRA, whose base is saved beside it."""
     base = folder.parent / "base"
     model = ModelConfig(size="dummy", checkpoint=str(base))
-    config = dataclasses.replace(CONFIG, peft=LoRA(rank=4), model=model, tasks=("press",))
+    config = dataclasses.replace(CONFIG, peft=peft, model=model, tasks=("press",))
     run = make_run(folder, config)
+    models.save(base, random_backbone(Pi0Config.dummy()))
     graphdef, adapters, frozen = adaptation.split(run.policy.model)
-    none, some = jax.tree.map(lambda x: 0 * x, adapters), with_noise(adapters, 0.03)
-    models.save(base, adaptation.merge(nnx.merge(graphdef, none, frozen)))
+    some = with_noise(adapters, 0.03)
     run.policy = dataclasses.replace(run.policy, model=nnx.merge(graphdef, some, frozen))
     write_json(folder / "config.json", to_json(config))
     write_json(folder / "results.json", RESULTS)

@@ -79,6 +79,7 @@ def _resolved(command: "Command") -> "Command":
     import jax
 
     others = {"dry_run": command.dry_run, "fit": command.fit, "wandb": command.wandb}
+    others["protect"] = bool(command.config.protect)
     others["distributed"] = jax.distributed.is_initialized()
     for name in (name for name, value in others.items() if value):
         raise ValueError(f"--{name.replace('_', '-')} is not for {kind.KIND}: drop it")

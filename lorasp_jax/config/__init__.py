@@ -278,6 +278,9 @@ class Config:
     as language=lora:16, with one target and a method or none; or a recipe (paper, openpi-lora,
     vlm-lora+expert-full, expert-only). Rules of the method in peft have its settings, others the
     defaults."""
+    protect: str = ""
+    """Folder of a finished LoRA-SP run to start from; the directions that it uses stay as they
+    are. Empty: start from the base."""
     image_size: int = 64
     """Height and width of simulated camera images [pixels]; the backbone resizes them."""
     scene: Randomization = field(default_factory=Randomization)

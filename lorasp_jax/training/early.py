@@ -16,7 +16,7 @@ from lorasp_jax.data.batches import flatten, nbytes
 from lorasp_jax.data.joined import parts_of
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor
-from lorasp_jax.training import program, setup
+from lorasp_jax.training import program, protect, setup
 from lorasp_jax.training.batches import DrawnBatches
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.optim import make_optimizer
@@ -102,7 +102,8 @@ def _first_episode(config: Config, built: setup.RunSetup) -> Episodes:
 def _lower(run: Run, built: setup.RunSetup, batches: Any) -> Any:
     """Lower the steps that `loop.train` compiles first, from shapes alone."""
     config, model = run.config, built.model
-    optimizer = make_optimizer(config.optim, adaptation.methods(model).values())
+    fixed = protect.fixed(model) if config.protect else None
+    optimizer = make_optimizer(config.optim, adaptation.methods(model).values(), fixed)
     mesh = meshes.make_mesh(config.fsdp, run.devices)
     graphdef, adapters, frozen = adaptation.split(model)
     state = jax.eval_shape(

@@ -92,7 +92,7 @@ def _split(
     """
     graphdef, adapters, parameters = run.split()
     methods = adaptation.methods(run.policy.model).values()
-    optimizer = make_optimizer(run.config.optim, methods)
+    optimizer = make_optimizer(run.config.optim, methods, run.fixed)
     init = functools.partial(init_state, optimizer=optimizer, ema=run.config.optim.ema > 0)
     shapes = jax.eval_shape(init, adapters)
     mesh = meshes.make_mesh(run.config.fsdp, run.devices)

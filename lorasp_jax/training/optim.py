@@ -1,7 +1,10 @@
 """Optimizer and learning-rate schedule."""
 
 from collections.abc import Collection
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import optax
 
 from lorasp_jax.config import AuxiliaryConfig, OptimConfig
@@ -11,11 +14,12 @@ from lorasp_jax.peft.auxiliary import AUXILIARY_WEIGHTS
 
 
 def make_optimizer(
-    config: OptimConfig, methods: Collection[Method] = ()
+    config: OptimConfig, methods: Collection[Method] = (), fixed: Any = None
 ) -> optax.GradientTransformation:
     """Create AdamW with gradient clipping and the transformations of the adapter methods.
 
     The learning rate rises linearly from zero and decays by a cosine to `final_learning_rate`.
+    `fixed` are the parameters that stay, from `protect.fixed`, if any do.
 
     Raises:
         ValueError: AdaLoRA layers, which share one rank budget, have different settings.
@@ -36,7 +40,28 @@ def make_optimizer(
         )
     for method in dict.fromkeys(methods):
         optimizer = method.transform(optimizer, config.steps)
-    return optax.chain(optax.clip_by_global_norm(config.clip_norm), optimizer)
+    optimizer = optax.chain(optax.clip_by_global_norm(config.clip_norm), optimizer)
+    return optimizer if fixed is None else _leaving(optimizer, fixed)
+
+
+def _leaving(optimizer: optax.GradientTransformation, fixed: Any) -> optax.GradientTransformation:
+    """Return the optimizer of all but the fixed parameters, which keep every bit.
+
+    The state holds `fixed`, so that the program does not depend on it.
+    """
+
+    def init(params: Any) -> Any:
+        return jax.tree.map(jnp.array, fixed), optimizer.init(params)
+
+    def update(updates: Any, state: Any, params: Any = None) -> Any:
+        kept, state = state
+        with_value = lambda value, tree: jax.tree.map(  # noqa: E731
+            lambda keep, x: jnp.where(keep, jnp.asarray(value, x.dtype), x), kept, tree
+        )
+        updates, state = optimizer.update(with_value(0.0, updates), state, params)
+        return with_value(-0.0, updates), (kept, state)  # adding +0 would change -0
+
+    return optax.GradientTransformation(init, update)
 
 
 def flow_times(config: OptimConfig) -> Times:

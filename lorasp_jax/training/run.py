@@ -44,6 +44,7 @@ class Run:
         objective: what to learn in place of the demonstrated actions.
         trained: pattern of the paths of the adapters that the run trains; "": all.
         layer_ranks: the active ranks `[L]` of the last log interval, by name as logged.
+        fixed: which parameters of the adapters training leaves as they are; None: it changes all.
         programs: jitted training programs by their inputs; see `program.jit_steps`.
         policy: the current policy; read it in callbacks or after training, since each step donates
             its buffers.
@@ -68,6 +69,7 @@ class Run:
     objective: Objective | None = None
     trained: str = ""
     layer_ranks: dict[str, np.ndarray] = field(default_factory=dict)
+    fixed: Any = None
     programs: dict[Any, Callable[..., Any]] = field(default_factory=dict)
     policy: Policy = field(init=False)
     seconds: dict[str, float] = field(init=False)

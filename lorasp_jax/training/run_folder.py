@@ -74,7 +74,7 @@ def to_json(config: Config) -> dict[str, Any]:
         data["augment"] = {"preset": augment.preset, **augment.given}
     if config.data.validation == ("0",) or not config.data.source:  # likewise
         del data["validation"], fields["keep"], fields["evaluation"]["validate_every"]
-    for name in ("adapt", "plan"):
+    for name in ("adapt", "plan", "protect"):
         if not fields[name]:
             del fields[name]
     if "ranks" in fields["peft"]:  # those of the plan

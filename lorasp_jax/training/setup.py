@@ -1,7 +1,6 @@
 """Build a run from a config: base, adapters, demonstrations and processor."""
 
 import dataclasses
-import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -16,14 +15,12 @@ import envs
 from envs.env import Env
 from lorasp_jax import peft
 from lorasp_jax.adapters import adaptation, paths, summary
-from lorasp_jax.adapters.compress import calibration
+from lorasp_jax.adapters.io import native
 from lorasp_jax.base import hub
 from lorasp_jax.base.bars import bars
 from lorasp_jax.config import Config
 from lorasp_jax.data.augmentation import on_wrist
-from lorasp_jax.data.batches import Batch, encode, sample_batch
 from lorasp_jax.data.source import Source, describe_left_out
-from lorasp_jax.data.stream import Stream
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.policies import prompts
@@ -31,7 +28,8 @@ from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor, robot_slots
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Offline, Tokenizer, load_tokenizer
-from lorasp_jax.training import advantage, dataset, rules
+from lorasp_jax.training import advantage, dataset, protect, rules
+from lorasp_jax.training.activations import input_moments
 from lorasp_jax.training.base import base_model, quantized, with_config
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.demonstrations import Demonstrations, Progress, demonstrations, in_thread
@@ -42,9 +40,6 @@ from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.relative import for_robot
 from lorasp_jax.training.replay import replayed_tasks
 from lorasp_jax.training.run import Run
-
-STATISTICS_BATCHES = 8
-"""Number of batches used for data-driven initialization."""
 
 Collect = Callable[[Config, Path, Progress], Demonstrations]
 """Signature of `demonstrations`."""
@@ -94,6 +89,8 @@ def build(
         ValueError: an unknown task, robot, backbone or size, an incompatible base or tokenizer, a
             target that matches no layer, or an invalid batch size or number of steps to execute.
     """
+    if config.protect:
+        protect.check(config)
     sizes = {"image_size": config.image_size, "control_dt": config.control_dt}
     tasks = () if config.data.source else (*config.tasks, *replayed_tasks(config))
     environments = [envs.make(task, robot=config.robot, **sizes) for task in tasks]
@@ -101,6 +98,7 @@ def build(
     tokenizer = load_tokenizer("" if use_bundled else config.model.tokenizer)
     base, base_hash = base_model(config, abstract=abstract)
     rules.check_plan(config, base)
+    spoken = protect.processor(config).prompts.instructions if config.protect else ()
     chosen = {name: getattr(config.model, name) for name in ("max_tokens", "chunk")}
     base = with_config(base, **{name: value for name, value in chosen.items() if value})
     source = dataset.open_dataset(config, base.config, folder) if config.data.source else None
@@ -110,7 +108,9 @@ def build(
     if config.learn == "recap":
         short = isinstance(tokenizer, Offline)
         endings = prompts.ADVANTAGE_SHORT if short else prompts.ADVANTAGE
-    table, joints = _prompts_and_joints(source, environments, tokenizer, base.config, endings)
+    table, joints = _prompts_and_joints(
+        source, environments, tokenizer, base.config, endings, spoken
+    )
     check_sizes(config, base.config.chunk)
     if not source:
         robot_slots(joints, base.config.inputs)
@@ -170,6 +170,9 @@ def prepare(
         assert run.dataset is not None
         rows = advantage.prompt_rows(run, model, inputs)
         run.dataset = dataclasses.replace(run.dataset, instruction=rows)
+    if config.protect:
+        inputs = protect.with_statistics(config, inputs)
+        run.fixed = protect.fixed(model, protect.directions(run, model, collect))
     if any(method.needs_statistics for method in rules.methods(config)):
         moments = input_moments(run, quantized(base, config.model.base_dtype), inputs)
         model = _adapt(config, base, rules.rules(config), moments)
@@ -205,7 +208,8 @@ def _load_or_collect(
         if built.source:
             dataset.load(run, built.source, built.free_bytes)
         else:
-            run.episodes = _collect(run, built.prompts.instructions, collect)
+            phrases = [phrase for env in built.environments for phrase in env.instructions]
+            run.episodes = _collect(run, phrases, collect)
         for future in futures:
             future.result()
     run.streams = processes.any_process(run.streams)  # all or none: they share batches
@@ -230,17 +234,20 @@ def _prompts_and_joints(
     tokenizer: Tokenizer,
     model: BackboneConfig,
     endings: Sequence[str] = ("",),
+    more: Sequence[str] = (),
 ) -> tuple[PromptTable, int]:
-    """Return the prompts for all instructions, and the robot's number of joints."""
+    """Return the prompts for all instructions, then more, and the robot's number of joints."""
     if source is None:
         joints = environments[0].robot.num_joints
-        instructions = [phrase for env in environments for phrase in env.instructions]
-        return PromptTable.of(tokenizer, instructions, model, num_joints=joints), joints
+        phrases = [phrase for env in environments for phrase in env.instructions]
+        phrases += [phrase for phrase in more if phrase not in phrases]
+        return PromptTable.of(tokenizer, phrases, model, num_joints=joints), joints
     first = source.episode(0, ())
     joints = first.state.shape[-1] - 1
     try:
-        more: Any = {"num_joints": joints, "endings": endings}
-        table = PromptTable.of(tokenizer, first.instructions, model, **more)
+        phrases = [*first.instructions, *(x for x in more if x not in first.instructions)]
+        options: Any = {"num_joints": joints, "endings": endings}
+        table = PromptTable.of(tokenizer, phrases, model, **options)
     except ValueError as error:
         need = "need a different --model.tokenizer or --model.max-tokens"
         raise ValueError(f"the dataset's instructions {need}: {error}") from error
@@ -280,47 +287,14 @@ def _adapt(
     adapter_rules: paths.Rules,
     statistics: Mapping[str, jax.Array] = MappingProxyType({}),
 ) -> Backbone:
-    """Add adapters by rule, initialized from the run's seed, and quantize the base."""
+    """Add adapters, by rule from the run's seed or the start run's, and quantize the base."""
+    if config.protect:
+        return quantized(native.load_adapters(config.protect, model), config.model.base_dtype)
     rngs = nnx.Rngs(RandomStream.ADAPTERS.key(config.seed))
     # No variable holds the adapted model, whose memory `quantized` frees.
     return quantized(
         adaptation.adapt(model, adapter_rules, rngs=rngs, statistics=statistics),
         config.model.base_dtype,
-    )
-
-
-def input_moments(run: Run, model: Backbone, processor: Processor) -> dict[str, jax.Array]:
-    """Return `calibration.input_moments` of the layers that need them, over training batches."""
-    config, sample = run.config, _batch_sampler(run, processor, model.config.chunk)
-
-    def forward(model: Backbone, sampled: tuple[jax.Array, Batch]) -> Any:
-        key, batch = sampled
-        return model.loss(key, batch.observation, batch.actions, action_mask=batch.action_mask)
-
-    pairs = rules.rules(config)
-
-    def needs(path: str) -> bool:
-        method = None if (i := paths.find_rule(pairs, path)) is None else pairs[i][1]
-        return method is not None and method.needs_statistics
-
-    keys = jax.random.split(RandomStream.STATISTICS.key(config.seed), STATISTICS_BATCHES)
-    layers = [layer.path for layer in paths.locate_matmul_layers(nnx.List([model]))]
-    pattern = "|".join(f"^{re.escape(path)}$" for path in layers if needs(path))
-    batches = ((key, sample(key)) for key in keys)
-    return calibration.input_moments(model, batches, pattern, forward)
-
-
-def _batch_sampler(run: Run, processor: Processor, chunk: int) -> Callable[[jax.Array], Batch]:
-    """Return a function from a random key to a training batch."""
-    size, noise = run.config.optim.batch_size, run.config.optim.state_noise
-    if run.streams:
-        stream = Stream(run.steps, batch_size=size, chunk=chunk, seed=run.config.seed)
-        return lambda key: encode(key, next(stream), processor, state_noise=noise)
-    steps = jax.device_put(run.steps)
-    return jax.jit(
-        lambda key: sample_batch(
-            key, steps, processor, batch_size=size, chunk=chunk, state_noise=noise
-        )
     )
 
 

@@ -28,7 +28,7 @@ from lorasp_jax.peft import FullFineTuning, LoRA
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Offline
-from lorasp_jax.training import base, export, rules, setup
+from lorasp_jax.training import activations, base, export, rules, setup
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.overrides import override
@@ -333,9 +333,9 @@ def test_eva_measures_only_the_layers_of_its_rules(config, tmp_path, monkeypatch
 def test_eva_uses_a_streamed_dataset(config, tmp_path):
     run = prepare(override(config, ["--peft.initialization", "kaiming"]), tmp_path)
     table = run.policy.processor
-    on_device = setup._batch_sampler(run, table, 4)(jax.random.key(0))
+    on_device = activations.batch_sampler(run, table, 4)(jax.random.key(0))
     run.dataset, run.streams = jax.tree.map(np.asarray, run.steps), True
-    sample = setup._batch_sampler(run, table, 4)
+    sample = activations.batch_sampler(run, table, 4)
     first, second = sample(jax.random.key(0)), sample(jax.random.key(0))
     assert jax.tree.map(np.shape, first) == jax.tree.map(np.shape, on_device)
     assert (first.actions != second.actions).any()

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import nnx
 
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.compress import calibration, compaction
@@ -54,20 +55,33 @@ def prune(
     if not 0 <= tolerance < 1 or not is_rank or (rank is not None and tolerance):
         raise ValueError(f"set a tolerance in [0, 1) or a rank > 0, got {tolerance} and {rank}")
     layers = compaction.lora_sp_layers(model)
-    sums = calibration.observe(model, batches, dict.fromkeys(layers, _usage), forward)
+    shares = usage(model, batches, forward)
     replacements: compaction.Replacements = {}
     ranks = {}
     for path, layer in layers.items():
-        usage = np.asarray(sums[path]["usage"] / jnp.maximum(sums[path]["tokens"][..., None], 1))
-        in_use = np.asarray((usage > tolerance).sum(-1))
+        in_use = np.asarray((shares[path] > tolerance).sum(-1))
         fixed = rank if rank is None or rank >= 1 else rank * layer.method.rank
         kept = max(int(in_use.max() if fixed is None else fixed), 1)
         if for_kernel:
             kept = supported_size(kept)
         kept = min(kept, layer.method.rank)
         ranks[path] = in_use if rank is None else np.full(in_use.shape, kept)
-        replacements[path] = _pruned(layer, usage, kept)
+        replacements[path] = _pruned(layer, shares[path], kept)
     return compaction.replace_adapters(model, batches, replacements, ranks, forward)
+
+
+def usage(
+    model: nnx.Module, batches: Sequence[Any], forward: Forward = calibration.call
+) -> dict[str, np.ndarray]:
+    """Return the fraction of valid tokens for which each direction is active, `[..., R]` by path.
+
+    Raises:
+        ValueError: the model has no LoRA-SP layers; see also `calibration.observe`.
+    """
+    reports = dict.fromkeys(compaction.lora_sp_layers(model), _usage)
+    sums = calibration.observe(model, batches, reports, forward)
+    each = ((path, x["usage"], x["tokens"]) for path, x in sums.items())
+    return {path: np.asarray(x / jnp.maximum(n[..., None], 1)) for path, x, n in each}
 
 
 def _usage(layer: Layer) -> Sums:

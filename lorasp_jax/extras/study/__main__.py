@@ -5,16 +5,16 @@ import functools
 import os
 import sys
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
 
 from lorasp_jax.base.arguments import positive
 from lorasp_jax.base.errors import REFUSED, run_command
-from lorasp_jax.extras.study import page, progress, results
+from lorasp_jax.extras.study import page, progress, repeats, results
 from lorasp_jax.extras.study.progress import BROKEN, CellState, Status
-from lorasp_jax.extras.study.study import Study, select
+from lorasp_jax.extras.study.study import Results, Study, select
 
 SCALES = ("smoke", "accelerator")
 _SHARED_MEMORY = 0.9
@@ -40,8 +40,11 @@ def parser(program: str) -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--config", type=Path, required=True, help="study file with get_study(scale)")
     add("--scale", choices=SCALES, default="accelerator", help="size preset (default: accelerator)")
+    which = parser.add_mutually_exclusive_group().add_argument
     text = "cells to run, such as 'pi0/multi/*'"
-    add("--only", metavar="PATTERN", nargs="+", default=["*"], help=text)
+    which("--only", metavar="PATTERN", nargs="+", default=["*"], help=text)
+    text = "finished cells to run again, beside their results"
+    which("--rerun", metavar="PATTERN", nargs="+", help=text)
     add("--jobs", type=positive, default=1, metavar="N", help="processes that share the device")
     add("--shard", type=_shard, default=(1, 1), metavar="I/N", help="run the I-th of N parts")
     add("--dry-run", action="store_true", help="list the cells, then exit")
@@ -59,8 +62,15 @@ def parser(program: str) -> argparse.ArgumentParser:
 
 def _execute(options: argparse.Namespace, console: Console) -> int:
     """List or run the selected cells, then write the results of all finished ones."""
-    study = results.load_study(options.config, options.scale, options.results)
-    folder, names = options.out / study.name, select(study, options.only, options.shard)
+    load = functools.partial(results.load_study, options.config, options.scale, options.results)
+    study = whole = load()
+    folder = home = options.out / study.name
+    names = select(study, options.rerun or options.only, options.shard)
+    if options.rerun:
+        load = functools.partial(repeats.load, load, home)
+        study = load()
+        names = repeats.with_sources(study, names)
+        folder = repeats.next_round(home, names)
     if options.dry_run:
         statuses = progress.read(study, folder)
         for name in names:
@@ -68,25 +78,32 @@ def _execute(options: argparse.Namespace, console: Console) -> int:
         _print(console, _totals(study, names, statuses))
         return 0
     if not options.no_run:
-        _run(options, study, folder, names)
+        _run(load, study, folder, names, options.jobs)
     statuses = progress.read(study, folder)
     # Only after a run is it news that a cell still waits.
     reported = BROKEN if options.no_run else {*BROKEN, CellState.WAITING}
     for name in names:
         if statuses[name].state in reported:
             _print(console, f"{name}: {statuses[name].state} {statuses[name].reason}")
-    _write(study, options.results or folder / results.RESULTS_FILE, statuses, console)
+    found = _write(whole, home, options.results or home / results.RESULTS_FILE, console)
+    if options.rerun:
+        for line in repeats.compare({name: found[name] for name in names}):
+            _print(console, line)
     _print(console, _totals(study, names, statuses))
     return REFUSED if any(statuses[name].state in BROKEN for name in names) else 0
 
 
-def _write(study: Study, path: Path, statuses: dict[str, Status], console: Console) -> None:
+def _write(study: Study, folder: Path, path: Path, console: Console) -> Results:
     """Write the results of all finished cells and, if they suffice, the README.md beside the file.
+
+    Returns:
+        The results.
 
     Raises:
         ValueError: results that the study started from would be lost.
     """
-    found = progress.results_of(statuses, statuses)
+    statuses = progress.read(study, folder)
+    found = repeats.collect(progress.results_of(statuses, statuses), study.finished, folder)
     for name in sorted(study.finished.keys() - found.keys()):
         why = f"is {statuses[name].state}" if name in statuses else "is not in the study"
         raise ValueError(f"{path} is left as it is: it has results of {name}, which {why}")
@@ -98,6 +115,7 @@ def _write(study: Study, path: Path, statuses: dict[str, Status], console: Conso
     if study.page and readme.exists() and suffices:
         page.fill(readme, study.page(study, results.load(path), path.parent))
         _print(console, f"written: {readme}")
+    return found
 
 
 def _totals(study: Study, names: Collection[str], statuses: Mapping[str, Status]) -> str:
@@ -111,7 +129,9 @@ def _print(console: Console, line: str) -> None:
     console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
-def _run(options: argparse.Namespace, study: Study, folder: Path, names: list[str]) -> None:
+def _run(
+    load: Callable[[], Study], study: Study, folder: Path, names: list[str], jobs: int
+) -> None:
     """Run cells in worker processes, failed ones once more."""
     for name in names:
         progress.clear_failure(folder / name)
@@ -120,13 +140,9 @@ def _run(options: argparse.Namespace, study: Study, folder: Path, names: list[st
         return
     from lorasp_jax.extras.study.workers import run_workers
 
-    if options.jobs > 1:  # by default, the first process takes most of the device's memory
-        share = f"{_SHARED_MEMORY / options.jobs:.3f}"
-        os.environ.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", share)
-    load_study = functools.partial(
-        results.load_study, options.config, options.scale, options.results
-    )
-    run_workers(load_study, folder, names, options.jobs)
+    if jobs > 1:  # by default, the first process takes most of the device's memory
+        os.environ.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", f"{_SHARED_MEMORY / jobs:.3f}")
+    run_workers(load, folder, names, jobs)
 
 
 def _shard(text: str) -> tuple[int, int]:

@@ -18,8 +18,9 @@ from lorasp_jax.training.finished_run import recorded_config
 from lorasp_jax.training.run_folder import CONFIG_FILE, changed_settings, read_json, to_json
 
 CELL_FILE, FAILED_FILE = "cell.json", "failed.txt"
-SCHEMA: records.Schema = {
-    "config": records.CONFIG,
+EVALUATED_FILE = "evaluated.json"
+"""What cell.json begins with, written before the policy is measured."""
+_RUN: records.Schema = {
     "provenance?": {str: str},
     "outcomes": {str: str},
     "before?": {str: str},
@@ -30,7 +31,8 @@ SCHEMA: records.Schema = {
     "total_parameters?": int,
     "seconds?": records.TIMES,
 }
-"""Schema of cell.json; the entries that a study's `measure` adds are not checked."""
+SCHEMA: records.Schema = {"config": records.CONFIG, **_RUN, "repeats?": [_RUN]}
+"""Schema of cell.json, and of results with repeats; what `measure` adds is not checked."""
 
 
 class CellState(enum.StrEnum):
@@ -177,7 +179,8 @@ def clear_failure(folder: Path) -> None:
 
 
 def tidy(folder: Path) -> None:
-    """Delete what a finished cell no longer needs: checkpoints and TensorBoard's events."""
+    """Delete what a finished cell no longer needs, such as checkpoints."""
+    (folder / EVALUATED_FILE).unlink(missing_ok=True)
     for name in ("checkpoints", "tensorboard"):
         shutil.rmtree(folder / name, ignore_errors=True)
 

@@ -13,6 +13,7 @@ import lorasp_jax
 from lorasp_jax.base import compilation_cache as cache
 from lorasp_jax.evaluation import metrics
 from lorasp_jax.evaluation.callback import Evaluation
+from lorasp_jax.extras.study import progress
 from lorasp_jax.extras.study.held_out import held_out_demonstrations, shared_demonstrations
 from lorasp_jax.extras.study.provenance import provenance
 from lorasp_jax.extras.study.runner import Job
@@ -20,7 +21,7 @@ from lorasp_jax.extras.study.study import Cell, Derived
 from lorasp_jax.training import loop, records, setup
 from lorasp_jax.training.export import Export, load_policy
 from lorasp_jax.training.run import Run
-from lorasp_jax.training.run_folder import open_run, read_json
+from lorasp_jax.training.run_folder import changed_settings, open_run, read_json, write_json
 
 WIDTH = 120
 """Line length of logs."""
@@ -53,6 +54,7 @@ def _train(job: Job) -> dict[str, Any]:
     console, started = Console(width=WIDTH), time.perf_counter()
     collect = functools.partial(shared_demonstrations, job.study_folder, job.cell.pool)
     callbacks = [Export()] if job.cell.evaluate else [Export(), Evaluation(media=False)]
+    callbacks = [] if _evaluated(job) else callbacks
     with open_run(job.config, job.folder.parent, resume="auto"):
         run = setup.prepare(job.config, job.folder, console, started, collect=collect)
         run.programs = _programs
@@ -71,20 +73,31 @@ def _derive(job: Job) -> dict[str, Any]:
         if job.cell.transform:
             episodes = held_out_demonstrations(job.study_folder, job.config)
             run.policy = job.cell.transform(source, job.results, episodes)
-    if not job.cell.evaluate:
+    if not (job.cell.evaluate or _evaluated(job)):
         Evaluation(media=False).on_end(run)
     return _finish(job, run, source)
 
 
 def _finish(job: Job, run: Run, source: lorasp_jax.policies.Policy | None) -> dict[str, Any]:
     """Return what cell.json records about a run, whose policy simulation may have evaluated."""
-    with run.timed("evaluate"):
-        found = (job.cell.evaluate or simulated)(run)
+    if not (found := _evaluated(job)):
+        with run.timed("evaluate"):
+            found = (job.cell.evaluate or simulated)(run) | {"provenance": provenance()}
+        settings = progress.describe_config(job.cell, job.config)
+        write_json(job.folder / progress.EVALUATED_FILE, {"config": settings, **found})
     if job.measure:
         with run.timed("measure"):
             episodes = held_out_demonstrations(job.study_folder, run.config)
             found |= job.measure(run, episodes, source)
-    return {**found, "provenance": provenance(), "seconds": dict(run.seconds)}
+    return {**found, "seconds": dict(run.seconds)}
+
+
+def _evaluated(job: Job) -> dict[str, Any]:
+    """Return what was evaluated before the process was killed in `measure`; else {}."""
+    found = read_json(job.folder / progress.EVALUATED_FILE, progress.SCHEMA)
+    settings = progress.describe_config(job.cell, job.config)
+    same = found and not changed_settings(found.pop("config"), settings)
+    return found if same else {}
 
 
 def simulated(run: Run) -> dict[str, Any]:

@@ -18,6 +18,7 @@ do not differ, in 88 % if they differ by a standard deviation of 2 points, and i
 """
 
 import functools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -32,6 +33,18 @@ class Estimate(NamedTuple):
     value: float
     low: float
     high: float
+
+
+class Spread(NamedTuple):
+    """How much success varies between runs of one cell, beyond the noise of its episodes.
+
+    Attributes:
+        deviation: standard deviation of the success rate.
+        degrees: its degrees of freedom.
+    """
+
+    deviation: float
+    degrees: int
 
 
 def outcomes(seeds: Sequence[Sequence[Mapping[str, Any]]]) -> np.ndarray:
@@ -98,6 +111,52 @@ def success(method: np.ndarray) -> Estimate:
 def difference(a: np.ndarray, b: np.ndarray) -> Estimate:
     """Estimate the paired difference of success rates, a - b, averaged over tasks."""
     return bootstrap(minus, a, b)
+
+
+def between_runs(cells: Sequence[np.ndarray]) -> Spread:
+    """Estimate how much a cell's success rate, averaged over tasks, varies when it runs again.
+
+    This is the method of moments for runs that cross layouts (Searle, Casella and McCulloch,
+    Variance Components, 1992, chapter 4): the variance of a run's rate is the mean covariance of
+    two of its episodes, from which the difficulty of layouts cancels.
+
+    Args:
+        cells: outcomes `[R, T, N]` of R > 1 runs of each cell, on the same layouts.
+    """
+    degrees = sum(len(runs) - 1 for runs in cells)
+    total = sum((len(runs) - 1) * _covariance(runs.reshape(len(runs), -1)) for runs in cells)
+    return Spread(math.sqrt(max(total / degrees, 0.0)), degrees)
+
+
+def widened(estimate: Estimate, spread: Spread, weight: float = 1.0) -> Estimate:
+    """Widen an interval that holds for the runs at hand, so that it holds for others, too.
+
+    Half its width and that of the variation between runs, from Student's t, add in quadrature. An
+    interval over seeds has part of that variation already.
+
+    Args:
+        weight: variance of the estimate over that of one run's rate: 1 / S for a mean over S runs,
+            2 / S for a difference of two.
+    """
+    more = math.sqrt(weight) * spread.deviation * _student(spread.degrees)
+    value, low, high = estimate
+    return Estimate(
+        value, value - math.hypot(value - low, more), value + math.hypot(high - value, more)
+    )
+
+
+def _covariance(runs: np.ndarray) -> float:
+    """Return the covariance over runs of two episodes, averaged over all pairs; runs `[R, E]`."""
+    episodes = runs.shape[1]
+    independent = runs.var(0, ddof=1).mean() / episodes
+    return (runs.mean(1).var(ddof=1) - independent) * episodes / (episodes - 1)
+
+
+def _student(degrees: int) -> float:
+    """Return the end of the 95 % interval of Student's t, which is √ν tan θ with θ ~ cos^(ν-1)."""
+    angles = np.linspace(0, np.pi / 2, 100_001)
+    cumulative = np.cumsum(np.cos(angles) ** (degrees - 1))
+    return math.sqrt(degrees) * math.tan(np.interp(LEVEL * cumulative[-1], cumulative, angles))
 
 
 def _resampled(methods: np.ndarray) -> np.ndarray:

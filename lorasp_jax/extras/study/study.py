@@ -28,7 +28,7 @@ Transform: TypeAlias = Callable[
     ["lorasp_jax.policies.Policy", Results, "Demonstrations"], "lorasp_jax.policies.Policy"
 ]
 """Maps the source's policy, the results and held-out demonstrations to a derived cell's policy."""
-RESERVED = ("demonstrations", "held_out", "locks", "logs", "results.json")
+RESERVED = ("demonstrations", "held_out", "locks", "logs", "repeats", "results.json")
 """What a study's folder contains besides the folders of cells."""
 _PART = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._+=-]*")
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from lorasp_jax.config import Config, OptimConfig
 from lorasp_jax.extras.study import Cell, Derived, Study, progress
+from lorasp_jax.extras.study import results as files
 from lorasp_jax.peft import LoRA, LoRASP
 from lorasp_jax.training.run_folder import to_json, write_json
 
@@ -120,3 +121,20 @@ def run_and_interrupt(job) -> dict:
 
 def no_study() -> Study:
     raise ValueError("no study today")
+
+
+def failing(name):
+    """Return a function that runs all cells but one."""
+
+    def run_others(job):
+        if job.cell.name == name:
+            raise RuntimeError("boom")
+        return run(job)
+
+    return run_others
+
+
+def without(file, *names):
+    """Remove cells from a file of files."""
+    found = files.load(file)
+    files.write(file, "fake", {n: r for n, r in found.items() if n not in names})

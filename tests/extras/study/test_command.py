@@ -6,43 +6,12 @@ import sys
 
 import pytest
 
-from lorasp_jax.extras.study import __main__ as command
-from lorasp_jax.extras.study import results, runner, workers
+from lorasp_jax.extras.study import results
 from lorasp_jax.extras.study.study import select
 from tests import ROOT
 from tests.extras.study import fakes
-from tests.extras.study.fakes import NAMES, ran, study
-
-FILE = "from tests.extras.study.fakes import study\n\ndef get_study(scale):\n    return study()\n"
-
-
-class InProcess:
-    """Run the cells in this process."""
-
-    run_cell = staticmethod(fakes.run)
-
-    @classmethod
-    def run(cls, load, folder, names, count):
-        runner.work(load(), folder, names, cls.run_cell)
-
-
-@pytest.fixture
-def start(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(workers, "run_workers", InProcess.run)
-    (tmp_path / "study.py").write_text(FILE)
-
-    def start(*options):
-        arguments = ["--config", str(tmp_path / "study.py"), "--out", str(tmp_path / "runs")]
-        code = command.main([*arguments, *options])
-        output = capsys.readouterr()
-        return code, re.sub(r"\s+", " ", output.out + output.err)
-
-    return start
-
-
-@pytest.fixture
-def folder(tmp_path):
-    return tmp_path / "runs/fake"
+from tests.extras.study.conftest import FILE, InProcess
+from tests.extras.study.fakes import NAMES, failing, ran, study, without
 
 
 def test_a_study_runs_once(start, folder):
@@ -78,17 +47,6 @@ def test_a_failed_cell_is_reported_and_tried_again(start, folder, monkeypatch):
     monkeypatch.setattr(InProcess, "run_cell", staticmethod(fakes.run))
     assert start()[0] == 0
     assert sorted(ran(folder)) == sorted(NAMES)
-
-
-def failing(name):
-    """Return a function that runs all cells but one."""
-
-    def run(job):
-        if job.cell.name == name:
-            raise RuntimeError("boom")
-        return fakes.run(job)
-
-    return run
 
 
 def test_a_damaged_cell_is_reported(start, folder):
@@ -159,23 +117,6 @@ def test_a_finished_study_loads_no_model_and_no_simulation(start, tmp_path):
         check=True,
     )
     assert json.loads(process.stdout.splitlines()[-1]) == [0, []]
-
-
-@pytest.fixture
-def committed(start, folder, tmp_path):
-    """Results of a finished study whose folder is gone."""
-    start()
-    file = tmp_path / "docs/study.json"
-    file.parent.mkdir()
-    (folder / "results.json").rename(file)
-    shutil.rmtree(folder)
-    return file
-
-
-def without(file, *names):
-    """Remove cells from a file of results."""
-    found = results.load(file)
-    results.write(file, "fake", {n: r for n, r in found.items() if n not in names})
 
 
 def test_a_study_starts_from_a_file_of_results(start, folder, committed):

@@ -65,6 +65,7 @@ def test_cells_share_demonstrations(tmp_path, collected):
 @pytest.mark.parametrize("measured", [True, False])
 def test_what_a_study_measures_and_how_a_cell_is_evaluated(tmp_path, monkeypatch, measured):
     run, callbacks = Run(CONFIG, tmp_path, Console(quiet=True), ""), []
+    (tmp_path / "a").mkdir()
     monkeypatch.setattr(run_cell.setup, "prepare", lambda *_, **__: run)
     monkeypatch.setattr(run_cell.loop, "train", lambda _, used, **__: callbacks.extend(used))
     monkeypatch.setattr(run_cell, "held_out_demonstrations", lambda *_: {"press": 1})
@@ -76,6 +77,34 @@ def test_what_a_study_measures_and_how_a_cell_is_evaluated(tmp_path, monkeypatch
     expected = {"measures": [{"press": 1}, None]} if measured else {}
     assert found == {"outcomes": {"press": "01"}} | expected
     assert [type(callback).__name__ for callback in callbacks] == ["Export"]
+
+
+def test_only_the_measure_runs_after_it_was_killed(tmp_path, monkeypatch):
+    (tmp_path / "a").mkdir()
+    run, calls = Run(CONFIG, tmp_path / "a", Console(quiet=True), ""), []
+    monkeypatch.setattr(run_cell.setup, "prepare", lambda *_, **__: run)
+    monkeypatch.setattr(run_cell.loop, "train", lambda _, used, **__: calls.append(len(used)))
+    monkeypatch.setattr(run_cell, "held_out_demonstrations", lambda *_: {})
+
+    def evaluate(run):
+        calls.append("evaluate")
+        return {"outcomes": {"press": "01"}}
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    cell = Cell("a", CONFIG, evaluate=evaluate)
+    job = Job(cell, dataclasses.replace(CONFIG, name="a"), tmp_path, {}, killed)
+    with pytest.raises(KeyboardInterrupt):
+        run_cell.run_cell(job)
+    assert calls == [1, "evaluate"]
+    job = dataclasses.replace(job, measure=lambda *_: {"speed": 3})
+    found = run_cell.run_cell(job)
+    assert calls == [1, "evaluate", 0]
+    assert (found["outcomes"], found["speed"]) == ({"press": "01"}, 3)
+    other = dataclasses.replace(job, config=dataclasses.replace(job.config, seed=1))
+    assert run_cell._evaluated(job)
+    assert not run_cell._evaluated(other)
 
 
 def test_rows_that_the_device_computes_wrongly_fail_the_cell(tmp_path):

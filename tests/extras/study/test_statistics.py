@@ -79,3 +79,49 @@ def test_unequal_cells_are_errors():
         statistics.outcomes([[{"outcomes": {"press": "10"}}], [{"outcomes": {"press": "1"}}]])
     with pytest.raises(ValueError, match="methods need the same seeds"):
         statistics.difference(np.ones((3, 2, 4), bool), np.ones((2, 2, 4), bool))
+
+
+def runs_of_cells(cells, *, spread, runs=3, tasks=2, layouts=100, seed=0):
+    """Return the outcomes `[R, T, N]` of cells whose layouts differ in difficulty."""
+    rng = np.random.default_rng(seed)
+    layout = rng.uniform(0.3, 0.7, (cells, 1, tasks, layouts))
+    run = spread * rng.standard_normal((cells, runs, 1, 1))
+    return list(rng.random((cells, runs, tasks, layouts)) < layout + run)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.03, 0.08])
+def test_variance_between_runs_is_recovered(spread):
+    found = statistics.between_runs(runs_of_cells(600, spread=spread))
+    assert found.degrees == 1200
+    assert found.deviation == pytest.approx(spread, abs=0.012 if spread == 0 else 0.004)
+
+
+def test_variance_between_runs_is_unbiased_in_small_studies():
+    squares = [
+        statistics.between_runs(runs_of_cells(3, spread=0.08, runs=2, seed=seed)).deviation ** 2
+        for seed in range(400)
+    ]
+    assert np.mean(squares) == pytest.approx(0.08**2, rel=0.12)
+
+
+def test_widened_intervals_cover_the_rate_of_another_run():
+    covered = [0, 0]
+    for seed in range(300):
+        cells = runs_of_cells(8, spread=0.08, runs=2, seed=seed)
+        spread = statistics.between_runs(cells)
+        rng = np.random.default_rng([seed, 1])
+        (one,) = (rng.random((1, 2, 100)) < 0.5 + 0.08 * rng.standard_normal() for _ in range(1))
+        alone = statistics.success(one)
+        for i, estimate in enumerate((alone, statistics.widened(alone, spread))):
+            covered[i] += estimate.low <= 0.5 <= estimate.high
+    assert covered[0] < 0.75 * 300
+    assert covered[1] >= 0.92 * 300
+
+
+def test_intervals_widen_in_quadrature():
+    estimate, spread = statistics.Estimate(0.5, 0.4, 0.55), statistics.Spread(0.1, 1)
+    wide = statistics.widened(estimate, spread, 0.5)
+    more = 12.7062 * 0.1 / 2**0.5
+    assert wide.value - wide.low == pytest.approx((0.1**2 + more**2) ** 0.5, rel=1e-3)
+    assert wide.high - wide.value == pytest.approx((0.05**2 + more**2) ** 0.5, rel=1e-3)
+    assert statistics.widened(estimate, statistics.Spread(0.0, 3)) == pytest.approx(estimate)

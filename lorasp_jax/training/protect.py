@@ -1,0 +1,169 @@
+"""Train on from a LoRA-SP run, and leave the directions that it uses as they are.
+
+A direction is used if it is active for at least `LEAST` of the valid tokens of the run's own data.
+Its rows of U, V and the router's outputs stay, and so does the router's hidden layer, which all
+directions share. The rest trains, and the energy gate chooses among all. What the start run has
+itself protected stays, too.
+"""
+
+import dataclasses
+import operator
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from flax import nnx
+from rich.console import Console
+from rich.table import Table
+
+from lorasp_jax.adapters import adaptation, paths
+from lorasp_jax.adapters.compress import pruning
+from lorasp_jax.config import Config
+from lorasp_jax.dense import AdaptedLayer, AdapterParam
+from lorasp_jax.models.backbone import Backbone
+from lorasp_jax.peft.lora_sp.bank import BankMethod
+from lorasp_jax.peft.method import Params
+from lorasp_jax.policies.processor import Processor
+from lorasp_jax.training import activations, dataset, rules, start
+from lorasp_jax.training.demonstrations import Demonstrations
+from lorasp_jax.training.distributed import processes
+from lorasp_jax.training.export import RecordedPolicy
+from lorasp_jax.training.finished_run import recorded_config
+from lorasp_jax.training.run import Run
+from lorasp_jax.training.run_folder import read_json, write_json
+
+FILE = "protected.json"
+"""Protected directions in a run's folder: "1" or "0" for each, by path and layer of the stack."""
+LEAST = 0.05
+_SAME = ("model.backbone", "model.size", "robot", "peft", "targets", "adapt")
+
+Protected = Mapping[str, np.ndarray]
+"""Path of an adapted layer -> bool `[..., R]`, with the leading axes of its kernel."""
+
+
+def check(config: Config) -> None:
+    """Raise ValueError if a run cannot protect the directions of the one that it names.
+
+    That one is not finished, has adapters other than LoRA-SP's or different settings, or trained on
+    several datasets; or the run averages its adapters or has several datasets itself.
+    """
+    folder = Path(config.protect)
+    recorded = recorded_config(folder, simulated=False)
+    start.with_kept(config, folder, recorded, (), ())
+    others = [x.name for x in rules.methods(recorded) if not isinstance(x, BankMethod)]
+    if others:
+        raise ValueError(f"{folder} has {others[0]} adapters: only LoRA-SP's can be protected")
+    for name in _SAME:
+        own, theirs = map(operator.attrgetter(name), (config, recorded))
+        # The robot of a dataset is known later.
+        if own != theirs and not (name == "robot" and config.data.source):
+            raise ValueError(
+                f"{name} must be that of {folder}, whose directions are protected: {theirs}, got "
+                f"{own}"
+            )
+    if config.optim.ema:
+        raise ValueError("--optim.ema cannot be combined with --protect: averaging rounds")
+    if len(config.data.source) > 1:
+        raise ValueError("--protect takes one dataset: name one in --data.source")
+
+
+def processor(config: Config) -> Processor:
+    """Return that of the start run's policy."""
+    return RecordedPolicy.read(config.protect).processor()
+
+
+def with_statistics(config: Config, inputs: Processor) -> Processor:
+    """Return the processor with the statistics of the start run, whose directions know no others.
+
+    Raises:
+        ValueError: its robot has other joints.
+    """
+    known = processor(config)
+    slots = ((x.state_slots, x.action_slots) for x in (inputs, known))
+    if len({*slots}) > 1:
+        raise ValueError(f"the robot of the data has other joints than that of {config.protect}")
+    return dataclasses.replace(inputs, statistics=known.statistics)
+
+
+def directions(run: Run, model: Backbone, collect: Callable[..., Demonstrations]) -> Protected:
+    """Return the directions that a run protects; they are counted when it begins.
+
+    `model` is the start run's, and `collect` loads or collects its demonstrations.
+    """
+    with processes.first_process_first("protected"):
+        if not (run.folder / FILE).exists():
+            folder, lines = Path(run.config.protect), {}
+            of_start = _with_data(folder, run.base_hash, model, collect)
+            batches = activations.sampled(of_start, processor(run.config), model.config.chunk)
+            used, earlier = pruning.usage(model, [*batches], activations.loss), read(folder, model)
+            free = Table("free directions", "all layers", "fullest layer", box=None)
+            for path, shares in used.items():
+                stay = (shares >= LEAST) | earlier.get(path, False)
+                rows = stay.reshape(-1, stay.shape[-1]).astype(int)
+                lines[path] = ["".join(map(str, row)) for row in rows]
+                share = 1 - rows.mean(1)
+                free.add_row(path, f"{share.mean():.0%}", f"{share.min():.0%}")
+            run.console.print(free)
+            write_json(run.folder / FILE, lines)
+    return read(run.folder, model)
+
+
+def _with_data(
+    folder: Path, base_hash: str, model: Backbone, collect: Callable[..., Demonstrations]
+) -> Run:
+    """Return a finished run with its data; a dataset stays on the disk."""
+    config = recorded_config(folder, simulated=False)
+    run = Run(config, folder, Console(quiet=True), base_hash)
+    if config.data.source:
+        dataset.load(run, dataset.open_dataset(config, model.config, folder), free_bytes=0.0)
+        return run
+    data = dataclasses.replace(config.data, replay=0.0)  # replayed tasks are the base's
+    run.config = dataclasses.replace(config, data=data)
+    run.episodes = collect(run.config, folder, lambda *_: None)
+    return run
+
+
+def read(folder: Path, model: nnx.Module) -> Protected:
+    """Read a run's protected directions, {} if it has none; raise ValueError if damaged."""
+    lines, like = read_json(folder / FILE, {str: [str]}), _nothing(model)
+    rows = {path: [[x == "1" for x in line] for line in each] for path, each in lines.items()}
+    return {path: np.array(each).reshape(like[path].shape) for path, each in rows.items()}
+
+
+def fixed(model: nnx.Module, protected: Protected | None = None) -> Any:
+    """Return which parameters stay: a tree like the adapters, of arrays that broadcast to theirs.
+
+    Without protected directions, it has the same shapes.
+    """
+    model = nnx.clone(model)
+    layers = _layers(model)
+    for path, rows in (protected or _nothing(model)).items():
+        layer = layers[path]
+        layer.adapter = AdapterParam(_fixed(layer.method, layer.adapter.get_value(), rows))
+    return adaptation.split(model)[1]
+
+
+def _nothing(model: nnx.Module) -> dict[str, np.ndarray]:
+    """Return no direction of any layer; pruned ones, which still have a score, count, too."""
+    found = {}
+    for path, layer in _layers(model).items():
+        scores = layer.adapter.get_value()["router"][layer.method.score_arrays[0]]
+        found[path] = np.zeros((*layer.stack_shape(), scores.shape[-1]), bool)
+    return found
+
+
+def _layers(model: nnx.Module) -> dict[str, Any]:
+    """Return the adapted layers of a model, or of its shapes, by path; all have LoRA-SP."""
+    found = paths.locate(nnx.List([model]), AdaptedLayer)
+    return {path: layer for path, _, _, layer in found if layer.adapter is not None}
+
+
+def _fixed(method: BankMethod, params: Params, rows: np.ndarray) -> Params:
+    """Return which parameters of a layer stay, given its protected directions `[..., R]`."""
+    bank = rows[..., : method.rank]
+    router = {name: np.ones((1,) * x.ndim, bool) for name, x in params["router"].items()}
+    for name in method.score_arrays:
+        if name in router:
+            router[name] = rows if router[name].ndim == rows.ndim else rows[..., None, :]
+    return {"bank": {"u": bank[..., None], "v": bank[..., None, :]}, "router": router}
