@@ -35,7 +35,7 @@ class Estimate(NamedTuple):
     high: float
 
 
-class Spread(NamedTuple):
+class Variation(NamedTuple):
     """How much success varies between runs of one cell, beyond the noise of its episodes.
 
     Attributes:
@@ -113,7 +113,7 @@ def difference(a: np.ndarray, b: np.ndarray) -> Estimate:
     return bootstrap(minus, a, b)
 
 
-def between_runs(cells: Sequence[np.ndarray]) -> Spread:
+def between_runs(cells: Sequence[np.ndarray]) -> Variation:
     """Estimate how much a cell's success rate, averaged over tasks, varies when it runs again.
 
     This is the method of moments for runs that cross layouts (Searle, Casella and McCulloch,
@@ -125,10 +125,10 @@ def between_runs(cells: Sequence[np.ndarray]) -> Spread:
     """
     degrees = sum(len(runs) - 1 for runs in cells)
     total = sum((len(runs) - 1) * _covariance(runs.reshape(len(runs), -1)) for runs in cells)
-    return Spread(math.sqrt(max(total / degrees, 0.0)), degrees)
+    return Variation(math.sqrt(max(total / degrees, 0.0)), degrees)
 
 
-def widened(estimate: Estimate, spread: Spread, weight: float = 1.0) -> Estimate:
+def widened(estimate: Estimate, spread: Variation, weight: float = 1.0) -> Estimate:
     """Widen an interval that holds for the runs at hand, so that it holds for others, too.
 
     Half its width and that of the variation between runs, from Student's t, add in quadrature. An

@@ -119,9 +119,9 @@ def test_widened_intervals_cover_the_rate_of_another_run():
 
 
 def test_intervals_widen_in_quadrature():
-    estimate, spread = statistics.Estimate(0.5, 0.4, 0.55), statistics.Spread(0.1, 1)
+    estimate, spread = statistics.Estimate(0.5, 0.4, 0.55), statistics.Variation(0.1, 1)
     wide = statistics.widened(estimate, spread, 0.5)
     more = 12.7062 * 0.1 / 2**0.5
     assert wide.value - wide.low == pytest.approx((0.1**2 + more**2) ** 0.5, rel=1e-3)
     assert wide.high - wide.value == pytest.approx((0.05**2 + more**2) ** 0.5, rel=1e-3)
-    assert statistics.widened(estimate, statistics.Spread(0.0, 3)) == pytest.approx(estimate)
+    assert statistics.widened(estimate, statistics.Variation(0.0, 3)) == pytest.approx(estimate)
