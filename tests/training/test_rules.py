@@ -1,6 +1,8 @@
 """Methods by rule: how rules are parsed, what they train, and a mixed run from start to report."""
 
 import dataclasses
+import shutil
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -289,9 +291,10 @@ def test_a_mixed_run_is_merged_pruned_and_deployed(trained, tmp_path):
     assert not adaptation.methods(distilled)
     with pytest.raises(ValueError, match="lora_sp, which Hugging Face PEFT does not support"):
         lorasp_jax.save_peft(tmp_path / "peft", model, names=lambda path, i: f"{path}{i}")
-    write_json(tmp_path / "config.json", to_json(run.config))
-    write_json(tmp_path / "results.json", RESULTS)
-    variants.check_run(tmp_path)
+    finished = Path(shutil.copytree(run.folder, tmp_path / "finished"))
+    write_json(finished / "config.json", to_json(run.config))
+    write_json(finished / "results.json", RESULTS)
+    variants.check_run(finished)
     for form in ("half", "pruned"):
         policy = variants.in_form(run.policy, form, {"press": random_episodes("press", 0)})
         methods = adaptation.methods(policy.model)
