@@ -48,6 +48,8 @@ class Trial:
         for setting in ("scene", "tasks"):
             if not getattr(self, setting):
                 del found[setting]  # as in results from before there was one
+        if not (found["method"] or {}).get("ranks", True):  # likewise
+            del found["method"]["ranks"]
         if self.learning.exploration == "actions":  # likewise
             del found["learning"]["exploration"], found["learning"]["noise_level"]
         return {"trial": found | name}

@@ -60,6 +60,7 @@ def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
         "success": _success_table(results, seeds),
         "tasks": _task_table(results, seeds),
         "ranks": _rank_table(results),
+        "active": _active_table(results),
         "scenes": _scene_table(results),
         "forgetting": _forgetting_table(results),
         "owner": _owner_table(results),
@@ -166,6 +167,20 @@ def _rank_table(results: Results) -> str:
         for what in ("seeds", "four tasks", " and ".join(HARD))
     ]
     return page.table([f"new adapters, N = {COUNTS[0]}", *heads], rows)
+
+
+def _active_table(results: Results) -> str:
+    """Return LoRA-SP's mean active rank by module in the first and the last iteration."""
+    rows = []
+    for backbone in BACKBONES:
+        own = _seeds(results, backbone, COUNTS[0], "lora_sp")
+        runs = [results[cell(backbone, COUNTS[0], "lora_sp", s)]["progress"] for s in own]
+        row = [BACKBONES[backbone], str(len(own))]
+        for module in ("vision", "language", "action"):
+            ends = [np.mean([run[i][f"active_rank/{module}"] for run in runs]) for i in (0, -1)]
+            row.append(f"{ends[0]:.1f} → {ends[1]:.1f}" if runs else page.NONE)
+        rows.append(row)
+    return page.table(["active rank of 64", "seeds", "vision", "language", "action"], rows)
 
 
 def _scene_table(results: Results) -> str:
