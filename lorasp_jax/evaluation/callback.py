@@ -194,7 +194,9 @@ def success(result: Result) -> dict[str, Any]:
 def summarize(run: Run, after: dict[str, Result]) -> dict[str, Any]:
     """Return the content of results.json."""
     before = read_json(run.folder / "before.json", records.BEFORE)
-    layers = _mean([result.active_rank for result in after.values()]) if after else _training(run)
+    layers = (
+        _mean([result.active_rank for result in after.values()]) if after else training_ranks(run)
+    )
     modules = {
         tower: float(np.mean(np.concatenate(list(layers[tower].values()))))
         for tower in TOWERS
@@ -225,7 +227,7 @@ def summarize(run: Run, after: dict[str, Result]) -> dict[str, Any]:
     }
 
 
-def _training(run: Run) -> dict[str, dict[str, list[float]]]:
+def training_ranks(run: Run) -> dict[str, dict[str, list[float]]]:
     """Return the active ranks of the end of training, as `Result` has those of an evaluation."""
     layers: dict[str, dict[str, list[float]]] = {}
     for name, ranks in run.layer_ranks.items():

@@ -43,6 +43,7 @@ RANKS = {
     "full": "full",
 }
 """New adapters that learn from success after those of the start are merged."""
+MODULES = ("vision", "language", "action")
 COLORS = {16: "#4269d0", 32: "#ff725c", 64: "#3ca951"}
 
 
@@ -175,12 +176,14 @@ def _active_table(results: Results) -> str:
     for backbone in BACKBONES:
         own = _seeds(results, backbone, COUNTS[0], "lora_sp")
         runs = [results[cell(backbone, COUNTS[0], "lora_sp", s)]["progress"] for s in own]
-        row = [BACKBONES[backbone], str(len(own))]
-        for module in ("vision", "language", "action"):
-            ends = [np.mean([run[i][f"active_rank/{module}"] for run in runs]) for i in (0, -1)]
-            row.append(f"{ends[0]:.1f} → {ends[1]:.1f}" if runs else page.NONE)
+        row = [BACKBONES[backbone], str(len(own)), *[page.NONE] * (0 if own else len(MODULES))]
+        for name in MODULES if own else ():
+            first, last = (
+                np.mean([run[i][f"active_rank/{name}"] for run in runs]) for i in (0, -1)
+            )
+            row.append(f"{first:.1f} → {last:.1f}")
         rows.append(row)
-    return page.table(["active rank of 64", "seeds", "vision", "language", "action"], rows)
+    return page.table(["active rank of 64", "seeds", *MODULES], rows)
 
 
 def _scene_table(results: Results) -> str:

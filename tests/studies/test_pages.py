@@ -50,6 +50,10 @@ def test_reinforce(tmp_path):
     rebuild("reinforce", tmp_path)
 
 
+def test_where_it_pays(tmp_path):
+    rebuild("where_it_pays", tmp_path)
+
+
 def test_latency(tmp_path):
     rebuild("latency", tmp_path)
 
@@ -60,4 +64,4 @@ def test_deployment(tmp_path):
 
 def test_all_files_of_results_can_be_read():
     for path in STUDIES.glob("*/results.json"):
-        assert results.load(path, path.parent.name)
+        results.load(path, path.parent.name)

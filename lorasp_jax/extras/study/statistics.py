@@ -23,6 +23,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import special
 
 DRAWS, LEVEL = 10_000, 0.95
 
@@ -138,7 +139,7 @@ def widened(estimate: Estimate, spread: Variation, weight: float = 1.0) -> Estim
         weight: variance of the estimate over that of one run's rate: 1 / S for a mean over S runs,
             2 / S for a difference of two.
     """
-    more = math.sqrt(weight) * spread.deviation * _student(spread.degrees)
+    more = math.sqrt(weight) * spread.deviation * special.stdtrit(spread.degrees, (1 + LEVEL) / 2)
     value, low, high = estimate
     return Estimate(
         value, value - math.hypot(value - low, more), value + math.hypot(high - value, more)
@@ -150,13 +151,6 @@ def _covariance(runs: np.ndarray) -> float:
     episodes = runs.shape[1]
     independent = runs.var(0, ddof=1).mean() / episodes
     return (runs.mean(1).var(ddof=1) - independent) * episodes / (episodes - 1)
-
-
-def _student(degrees: int) -> float:
-    """Return the end of the 95 % interval of Student's t, which is √ν tan θ with θ ~ cos^(ν-1)."""
-    angles = np.linspace(0, np.pi / 2, 100_001)
-    cumulative = np.cumsum(np.cos(angles) ** (degrees - 1))
-    return math.sqrt(degrees) * math.tan(np.interp(LEVEL * cumulative[-1], cumulative, angles))
 
 
 def _resampled(methods: np.ndarray) -> np.ndarray:

@@ -28,6 +28,7 @@ def result(cell):
     rows = [
         {"step": i, "minutes": 2.0 * i, "environment_steps": 1e6 * i}
         | {f"success/{task}": 0.5 for task in page.TASKS}
+        | {f"active_rank/{module}": 8.0 * i for module in ("vision", "language", "action")}
         for i in (1, 2)
     ]
     shifted = {f"{when}/{task}": "0111" * 10 for when in ("before", "after") for task in page.TASKS}

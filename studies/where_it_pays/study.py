@@ -1,0 +1,239 @@
+"""Where does adaptive rank pay? LoRA-SP and LoRA of every rank, and LoRA with ranks by layer.
+
+    lorasp-jax study --config studies/where_it_pays/study.py \\
+        --results studies/where_it_pays/results.json --jobs 8
+
+Policies learn four tasks as in studies/few, from 120 demonstrations of each. Every method and rank
+has the better of two learning rates, chosen with a seed that no table uses; LoRA with ranks by
+layer takes that of LoRA with their mean.
+"""
+
+import functools
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+from flax import nnx
+
+from lorasp_jax import models
+from lorasp_jax.config import (
+    AugmentConfig,
+    Config,
+    DataConfig,
+    EvaluationConfig,
+    ModelConfig,
+    OptimConfig,
+)
+from lorasp_jax.extras.study import Cell, Derived, Study
+from lorasp_jax.extras.study.study import Results
+from lorasp_jax.models import presets
+from lorasp_jax.peft import AdaLoRA, LoRA, LoRASP, Method, plan
+from lorasp_jax.training import rules
+from studies.few.judge import judge as judge_scenes
+from studies.paper.transforms import cut
+from studies.where_it_pays import page
+from studies.where_it_pays.judge import judge
+
+RATES = (1e-3, 3e-3)
+"""Learning rates, of which pilots choose one per backbone, method and rank."""
+PILOT_SEED = 1000
+MAKE: Mapping[str, Callable[[int], Method]] = {
+    "lora": lambda rank: LoRA(rank=rank),
+    "lora_sp": lambda rank: LoRASP(rank=rank),
+    "ada_lora": lambda rank: AdaLoRA(rank=page.WIDE, target_rank=rank),
+    "eva": lambda rank: LoRA(rank=rank, initialization="eva"),
+}
+"""Method by its (mean) rank."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What the policies of a scale share.
+
+    Attributes:
+        config: everything but method, rank, rate and seed.
+        pool: demonstrations per task, of which each seed takes its own.
+        ranks: R of LoRA and LoRA-SP.
+        budgets: mean ranks of plans.
+        seeds: seeds of the tables.
+    """
+
+    config: Config
+    pool: int = 512
+    ranks: tuple[int, ...] = page.RANKS
+    budgets: tuple[int, ...] = page.BUDGETS
+    seeds: tuple[int, ...] = page.SEEDS
+
+
+_ACCELERATOR = Scale(
+    Config(
+        name="where_it_pays",
+        scale="accelerator",
+        peft=LoRASP(),
+        model=ModelConfig(size="small", dtype="bfloat16"),
+        data=DataConfig(episodes=120, num_envs=256, augment=AugmentConfig("none")),
+        optim=OptimConfig(steps=2000, batch_size=64, warmup_steps=100),
+        evaluation=EvaluationConfig(episodes=256, num_envs=256, before=False),
+        log_every=250,
+        checkpoint_every=10_000,
+    )
+)
+_SMOKE = Scale(
+    replace(
+        _ACCELERATOR.config,
+        scale="smoke",
+        model=ModelConfig(),
+        tasks=("press", "pick_place"),
+        data=DataConfig(episodes=2, num_envs=4, augment=AugmentConfig("none")),
+        optim=OptimConfig(steps=2, batch_size=4, warmup_steps=1),
+        evaluation=replace(_ACCELERATOR.config.evaluation, episodes=4, num_envs=4),
+        log_every=2,
+    ),
+    pool=3,
+    ranks=(8, page.WIDE),
+    budgets=(8,),
+    seeds=(0, 1),
+)
+
+
+def get_study(scale: str) -> Study:
+    """Return the study; scale smoke only shows that all of it runs."""
+    chosen = {"accelerator": _ACCELERATOR, "smoke": _SMOKE}[scale]
+    cells = [cell for backbone in page.BACKBONES for cell in _cells(chosen, backbone)]
+    return Study("where_it_pays", tuple(cells), page=page.blocks, partial=True)
+
+
+def _cells(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
+    """Yield all policies of a backbone: the pilots, then seed by seed."""
+    pilot = functools.partial(judge_scenes, scenes=("recorded",))
+    for method, rank in _ranked(scale):
+        for name in _pilots(backbone, method, rank):
+            rate = float(name.rpartition("/")[2])
+            config = _config(scale, backbone, MAKE[method](rank), PILOT_SEED, rate)
+            group = f"{backbone}/{method}_r{rank}"
+            yield Cell(name, config, (), group, evaluate=pilot, pool=scale.pool)
+    for seed in scale.seeds:
+        for method, rank in _ranked(scale):
+            yield _cell(scale, backbone, method, rank, seed)
+    for seed in scale.seeds:
+        yield from _allocated(scale, backbone, seed)
+
+
+def _ranked(scale: Scale) -> Iterator[tuple[str, int]]:
+    for rank in scale.ranks:
+        for method in page.METHODS:
+            yield method, rank
+
+
+def _allocated(scale: Scale, backbone: str, seed: int) -> Iterator[Cell | Derived]:
+    """Yield the policies of a seed whose layers differ in rank, and their rivals."""
+    own = page.cell(backbone, "lora_sp", page.WIDE, seed)
+    following = scale.seeds[(scale.seeds.index(seed) + 1) % len(scale.seeds)]
+    other = page.cell(backbone, "lora_sp", page.WIDE, following)
+    for rank in scale.budgets:
+        for kind, source in (("planned", own), ("shuffled", own), ("other_seed", other)):
+            yield _cell(scale, backbone, kind, rank, seed, source)
+        for kind in ("dropped", "dropped_random"):
+            yield _cell(scale, backbone, kind, rank, seed, own)
+        for method in ("ada_lora", "eva"):
+            yield _cell(scale, backbone, method, rank, seed)
+        yield Derived(
+            page.cell(backbone, "cut", rank, seed),
+            page.cell(backbone, "lora", page.WIDE, seed),
+            lambda policy, _, __, rank=rank: cut(policy, rank),
+            settings={"rank": rank},
+            evaluate=judge_scenes,
+        )
+
+
+def _cell(scale: Scale, backbone: str, method: str, rank: int, seed: int, source: str = "") -> Cell:
+    """Return a policy; the active ranks of `source` decide the ranks of its layers, if given."""
+    tuned = method if method in page.METHODS else "lora"
+    pilots = _pilots(backbone, tuned, rank)
+
+    def config(results: Results) -> Config:
+        best = max(pilots, key=lambda name: page.success(results[name]))
+        made = MAKE.get(method, MAKE["lora"])(rank)
+        found = _config(scale, backbone, made, seed, float(best.rpartition("/")[2]))
+        if not source:
+            return found
+        active = results[source]["layer_active_rank"]
+        return replace(found, plan=make_plan(method, backbone, scale, active, rank, seed))
+
+    after = (*pilots, source) if source else pilots
+    group = f"{backbone}/{method}_r{rank}" if not source else ""  # a plan is a program of its own
+    name = page.cell(backbone, method, rank, seed)
+    return Cell(name, config, after, group, evaluate=judge, pool=scale.pool)
+
+
+def make_plan(
+    kind: str,
+    backbone: str,
+    scale: Scale,
+    active: Mapping[str, Mapping[str, list[float]]],
+    rank: int,
+    seed: int,
+) -> plan.RankPlan:
+    """Return ranks by layer, with as many parameters as `rank` in every layer.
+
+    Args:
+        kind: "planned" and "other_seed" are in proportion to the active ranks, "shuffled" permutes
+            them among layers of one size. "dropped" gives the kinds of layers with the lowest
+            active rank no adapter, until half of the parameters are left, "dropped_random" others.
+        backbone: name.
+        scale: whose model has the layers.
+        active: mean active ranks by tower and layer, as in results.json.
+        rank: of the budget; with "dropped", that of the other layers.
+        seed: of "shuffled" and "dropped_random".
+    """
+    shapes = _shapes(backbone, scale.config.model.size, scale.config.targets)
+    ranks = {path: tuple(active[rules.tower(path)][rules.short_name(path)]) for path in shapes}
+    if kind.startswith("dropped"):
+        return plan.RankPlan(backbone, _without_half(kind, shapes, ranks, rank, seed), rule=kind)
+    budget = rank * sum(layers * (d_in + d_out) for layers, d_in, d_out in shapes.values())
+    found = plan.allocate(ranks, shapes, budget, most=page.WIDE)
+    made = plan.RankPlan(backbone, found, rule=kind, budget=budget)
+    return plan.shuffled(made, shapes, jax.random.key(seed)) if kind == "shuffled" else made
+
+
+def _without_half(
+    kind: str,
+    shapes: plan.Shapes,
+    ranks: Mapping[str, tuple[float, ...]],
+    rank: int,
+    seed: int,
+) -> dict[str, tuple[int, ...]]:
+    """Drop whole stacks, in ascending order of active rank or in random order."""
+    paths = sorted(shapes, key=lambda path: np.mean(ranks[path]))
+    if kind == "dropped_random":
+        paths = [paths[i] for i in np.random.default_rng(seed).permutation(len(paths))]
+    sizes = {path: layers * (d_in + d_out) for path, (layers, d_in, d_out) in shapes.items()}
+    kept, left = dict.fromkeys(shapes, rank), sum(sizes.values())
+    for path in paths:
+        if left - sizes[path] >= sum(sizes.values()) / 2:
+            kept[path], left = 0, left - sizes[path]
+    return {path: (min(each, *shapes[path][1:]),) * shapes[path][0] for path, each in kept.items()}
+
+
+@functools.cache
+def _shapes(backbone: str, size: str, targets: tuple[str, ...]) -> plan.Shapes:
+    """Return the shapes of the adapted layers of a backbone, without its weights."""
+    config = getattr(models.backbone.find(backbone), size)()
+    model = nnx.eval_shape(lambda: config.create(nnx.Rngs(0)))
+    return rules.shapes(model, presets.patterns(targets))
+
+
+def _pilots(backbone: str, method: str, rank: int) -> tuple[str, ...]:
+    return tuple(f"{backbone}/pilot/{method}_r{rank}/{rate}" for rate in RATES)
+
+
+def _config(scale: Scale, backbone: str, method: Method, seed: int, rate: float) -> Config:
+    config = scale.config
+    return replace(
+        config,
+        peft=method,
+        model=replace(config.model, backbone=backbone),
+        optim=replace(config.optim, learning_rate=rate),
+        seed=seed,
+    )

@@ -1,0 +1,1 @@
+"""Tests of studies/where_it_pays."""
