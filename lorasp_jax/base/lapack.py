@@ -2,7 +2,8 @@
 
 There, a call with many matrices shares them out among XLA's threads and waits for the results, on
 one of these threads itself. When all threads wait, none is left to compute. A step of MJX makes two
-such calls at once, so that pick_place hangs from 220 worlds on two cores, pour from 77.
+such calls at once, so that pick_place hangs from 220 worlds on two cores, pour from 77. Programs of
+symbolic shapes or for several devices stay as they are.
 """
 
 import math
@@ -30,6 +31,10 @@ def _split(primitive: Any) -> None:
     whole = _compat.cpu_lowering(primitive)
 
     def lower(context: Any, *operands: Any, **parameters: Any) -> Any:
+        sizes = [size for aval in context.avals_in for size in aval.shape]
+        devices = getattr(context.module_context.axis_context, "num_devices", 1)
+        if devices > 1 or not all(isinstance(size, int) and size for size in sizes):
+            return whole(context, *operands, **parameters)
         *batch, rows, columns = context.avals_in[0].shape
         longest = max(context.avals_in[-1].shape[-2:])
         limit = math.ceil(_SHARED / (rows * columns * longest // _DIVISORS[primitive] or 1))

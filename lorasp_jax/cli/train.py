@@ -65,7 +65,7 @@ def _with_plan(command: "Command") -> "Command":
     from lorasp_jax.training import finished_run, records, run_folder
 
     config = command.config
-    if not command.resume or config.plan:
+    if not command.resume or config.plan or _kind(config):
         return command
     path = RUNS / config.name / run_folder.CONFIG_FILE
     plan = finished_run.recorded_plan(run_folder.read_json(path, records.CONFIG))

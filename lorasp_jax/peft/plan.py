@@ -76,10 +76,12 @@ class RankPlan:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the plan to a file, with one line per layer."""
-        fields = {"format": FORMAT, "version": VERSION, **dataclasses.asdict(self)}
-        text = json.dumps(fields, indent=2)
-        text = re.sub(r"\[\s([^]]*)\]", lambda m: f"[{' '.join(m[1].split())}]", text)
-        write_text(Path(path), f"{text}\n")
+        fields = {x.name: getattr(self, x.name) for x in dataclasses.fields(self)}
+        entry = lambda name, value: f"{json.dumps(name)}: {json.dumps(value)}"  # noqa: E731
+        layers = ",\n    ".join(entry(*each) for each in fields.pop("ranks").items())
+        head = {"format": FORMAT, "version": VERSION, **fields}
+        lines = [*(entry(*each) for each in head.items()), f'"ranks": {{\n    {layers}\n  }}']
+        write_text(Path(path), "{\n  " + ",\n  ".join(lines) + "\n}\n")
 
     def check(self, shapes: Shapes) -> None:
         """Raise ValueError unless the plan is one for exactly these layers."""
@@ -169,8 +171,12 @@ def allocate(
         drop: how many of the least important layers get rank 0 instead.
 
     Raises:
-        ValueError: the budget is too small, or all layers are to be dropped.
+        ValueError: a layer has no importance, the budget is too small, or all layers are to be
+            dropped.
     """
+    for path, (layers, _, _) in shapes.items():
+        if len(importance.get(path, ())) != layers:
+            raise ValueError(f"importance must have {layers} numbers for {path}")
     values = np.concatenate([np.asarray(importance[path], float) for path in shapes])
     counts = [layers for layers, _, _ in shapes.values()]
     spread = lambda each: np.repeat(np.array(each), counts)  # noqa: E731

@@ -30,7 +30,7 @@ def from_run(run: Path, *, rank: float | None = None, least: int = 1, drop: int 
 
     Raises:
         ValueError: the run is not finished, has another method, or recorded no ranks; or `rank` is
-            below `least` or above the run's own.
+            above the run's own or too small for `least`.
     """
     recorded = export.RecordedPolicy.read(run)
     saved = {} if recorded.is_full else native.read_description(run)
@@ -51,8 +51,8 @@ def from_run(run: Path, *, rank: float | None = None, least: int = 1, drop: int 
     shapes = rules.shapes(model, [f"^{re.escape(path)}$" for path in methods])
     most = max(settings["rank"] for settings in methods.values())
     mean = results["active_rank"]["mean"] if rank is None else rank
-    if not least <= mean <= most:
-        raise ValueError(f"the mean rank must be from {least} to the run's {most}, got {mean:g}")
+    if mean > most:
+        raise ValueError(f"the mean rank must be at most the run's {most}, got {mean:g}")
     budget = int(mean * sum(layers * (d_in + d_out) for layers, d_in, d_out in shapes.values()))
     planned = allocate(ranks, shapes, budget, most=most, least=least, drop=drop)
     rule = f"active rank, least {least}, drop {drop}"

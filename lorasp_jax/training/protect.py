@@ -25,18 +25,22 @@ from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.peft.lora_sp.bank import BankMethod
 from lorasp_jax.peft.method import Params
 from lorasp_jax.policies.processor import Processor
-from lorasp_jax.training import activations, dataset, rules, start
+from lorasp_jax.training import activations, dataset, records, rules, start
 from lorasp_jax.training.demonstrations import Demonstrations
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.export import RecordedPolicy
 from lorasp_jax.training.finished_run import recorded_config
 from lorasp_jax.training.run import Run
-from lorasp_jax.training.run_folder import read_json, write_json
+from lorasp_jax.training.run_folder import CONFIG_FILE, read_json, write_json
 
 FILE = "protected.json"
 """Protected directions in a run's folder: "1" or "0" for each, by path and layer of the stack."""
 LEAST = 0.05
-_SAME = ("model.backbone", "model.size", "robot", "peft", "targets", "adapt")
+_SAME = (
+    *("model.backbone", "model.size", "model.relative_actions", "model.chunk", "model.max_tokens"),
+    *("model.tokenizer", "robot", "image_size", "control_dt", "peft", "targets", "adapt"),
+)
+"""Settings that both runs share."""
 
 Protected = Mapping[str, np.ndarray]
 """Path of an adapted layer -> bool `[..., R]`, with the leading axes of its kernel."""
@@ -62,6 +66,14 @@ def check(config: Config) -> None:
                 f"{name} must be that of {folder}, whose directions are protected: {theirs}, got "
                 f"{own}"
             )
+    if config.learn == "recap":
+        raise ValueError("--learn recap cannot be combined with --protect: its prompts differ")
+    learned = read_json(folder / CONFIG_FILE, records.CONFIG).keys() & {"online", "distill"}
+    if learned:
+        raise ValueError(
+            f"{folder} has learned without data of its own ({learned.pop()}), which would show the "
+            "directions that it uses: protect the run that it started from"
+        )
     if config.optim.ema:
         raise ValueError("--optim.ema cannot be combined with --protect: averaging rounds")
     if len(config.data.source) > 1:
@@ -81,8 +93,10 @@ def with_statistics(config: Config, inputs: Processor) -> Processor:
     """
     known = processor(config)
     slots = ((x.state_slots, x.action_slots) for x in (inputs, known))
-    if len({*slots}) > 1:
-        raise ValueError(f"the robot of the data has other joints than that of {config.protect}")
+    if len({*slots}) > 1 or inputs.inputs != known.inputs:
+        raise ValueError(
+            f"the data have other joints, cameras or actions than those of {config.protect}"
+        )
     return dataclasses.replace(inputs, statistics=known.statistics)
 
 
@@ -94,7 +108,7 @@ def directions(run: Run, model: Backbone, collect: Callable[..., Demonstrations]
     with processes.first_process_first("protected"):
         if not (run.folder / FILE).exists():
             folder, lines = Path(run.config.protect), {}
-            of_start = _with_data(folder, run.base_hash, model, collect)
+            of_start = _with_data(folder, run.folder / "start", run.base_hash, model, collect)
             batches = activations.sampled(of_start, processor(run.config), model.config.chunk)
             used, earlier = pruning.usage(model, [*batches], activations.loss), read(folder, model)
             free = Table("free directions", "all layers", "fullest layer", box=None)
@@ -110,9 +124,10 @@ def directions(run: Run, model: Backbone, collect: Callable[..., Demonstrations]
 
 
 def _with_data(
-    folder: Path, base_hash: str, model: Backbone, collect: Callable[..., Demonstrations]
+    folder: Path, out: Path, base_hash: str, model: Backbone, collect: Callable[..., Demonstrations]
 ) -> Run:
-    """Return a finished run with its data; a dataset stays on the disk."""
+    """Return a finished run with its data; a dataset stays on the disk, and demonstrations that are
+    gone are collected again, into `out`."""
     config = recorded_config(folder, simulated=False)
     run = Run(config, folder, Console(quiet=True), base_hash)
     if config.data.source:
@@ -120,13 +135,17 @@ def _with_data(
         return run
     data = dataclasses.replace(config.data, replay=0.0)  # replayed tasks are the base's
     run.config = dataclasses.replace(config, data=data)
-    run.episodes = collect(run.config, folder, lambda *_: None)
+    there = all((folder / "cache" / f"{task}.npz").exists() for task in run.config.tasks)
+    where = folder if there else out
+    run.episodes = collect(run.config, where, lambda *_: None)
     return run
 
 
 def read(folder: Path, model: nnx.Module) -> Protected:
     """Read a run's protected directions, {} if it has none; raise ValueError if damaged."""
     lines, like = read_json(folder / FILE, {str: [str]}), _nothing(model)
+    if unknown := lines.keys() - like.keys():
+        raise ValueError(f"{folder / FILE} is damaged: it has {min(unknown)}, which is no layer")
     rows = {path: [[x == "1" for x in line] for line in each] for path, each in lines.items()}
     return {path: np.array(each).reshape(like[path].shape) for path, each in rows.items()}
 

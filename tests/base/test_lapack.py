@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import jax
+import jax.export
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -38,6 +39,14 @@ def test_split_calls_compute_the_same(batch):
     factor = jax.scipy.linalg.cho_factor(matrices)
     for solved in (jnp.linalg.solve(matrices, right), jax.scipy.linalg.cho_solve(factor, right)):
         assert np.allclose(solved, np.linalg.solve(matrices, right), atol=1e-5)
+
+
+def test_calls_that_are_not_split():
+    (worlds,) = jax.export.symbolic_shape("worlds")
+    matrices = jax.ShapeDtypeStruct((worlds, 16, 16), jnp.float32)
+    assert jax.export.export(jax.jit(jnp.linalg.cholesky))(matrices).out_avals[0].shape[0] == worlds
+    identities = jnp.broadcast_to(jnp.eye(16), (4096, 16, 16))
+    assert jnp.linalg.solve(identities, jnp.zeros((4096, 16, 0))).shape == (4096, 16, 0)
 
 
 def test_a_call_is_split_only_if_jax_would_share_it_out():

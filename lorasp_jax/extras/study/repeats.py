@@ -114,7 +114,9 @@ def _with_repeats(
 
 
 def _is_alike(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
-    """Say whether two results have the same settings; either may be of an older version."""
+    """Say whether two results have the same tasks and settings, either of an older version."""
+    if a["outcomes"].keys() != b["outcomes"].keys():
+        return False
     return any(not changed_settings(x["config"], y["config"]) for x, y in ((a, b), (b, a)))
 
 

@@ -97,6 +97,7 @@ def _evaluated(job: Job) -> dict[str, Any]:
     found = read_json(job.folder / progress.EVALUATED_FILE, progress.SCHEMA)
     settings = progress.describe_config(job.cell, job.config)
     same = found and not changed_settings(found.pop("config"), settings)
+    same = same and found["provenance"]["code"] == provenance()["code"]
     return found if same else {}
 
 
