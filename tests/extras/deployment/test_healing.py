@@ -7,8 +7,10 @@ import jax
 import numpy as np
 import pytest
 
+from envs.datasets import rlds
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.data import cache
+from lorasp_jax.data.opening import open_source
 from lorasp_jax.extras.deployment import __main__ as command
 from lorasp_jax.extras.deployment import healing, measurement, variants
 from lorasp_jax.extras.serving import loading
@@ -109,7 +111,8 @@ def test_a_healed_variant_is_saved_and_served(run, tmp_path, capsys, monkeypatch
 @pytest.mark.slow
 def test_a_run_of_a_dataset_is_healed_on_it(run, tmp_path):
     where = tmp_path / "recorded"
-    cache.write([held_out.AllTasks(OWN)], where, lambda *_: None)
+    rlds.write(OWN["press"], tmp_path / "rlds")
+    cache.write([open_source(tmp_path / "rlds")], where, lambda *_: None)
     changed = shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
     config = recorded_config(changed)
     data = dataclasses.replace(config.data, source=(str(where),), validation=("0",))
