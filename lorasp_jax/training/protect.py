@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from flax import nnx
-from rich.console import Console
 from rich.table import Table
 
 from lorasp_jax.adapters import adaptation, paths
@@ -25,7 +24,7 @@ from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.peft.lora_sp.bank import BankMethod
 from lorasp_jax.peft.method import Params
 from lorasp_jax.policies.processor import Processor
-from lorasp_jax.training import activations, dataset, records, rules, start
+from lorasp_jax.training import activations, records, rules, start
 from lorasp_jax.training.demonstrations import Demonstrations
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.export import RecordedPolicy
@@ -108,7 +107,14 @@ def directions(run: Run, model: Backbone, collect: Callable[..., Demonstrations]
     with processes.first_process_first("protected"):
         if not (run.folder / FILE).exists():
             folder, lines = Path(run.config.protect), {}
-            of_start = _with_data(folder, run.folder / "start", run.base_hash, model, collect)
+            recorded = recorded_config(folder, simulated=False)
+            where, cached = folder, (folder / "cache" / f"{task}.npz" for task in recorded.tasks)
+            if not recorded.data.source:  # replayed tasks are the base's
+                data = dataclasses.replace(recorded.data, replay=0.0)
+                recorded = dataclasses.replace(recorded, data=data)
+                if not all(path.exists() for path in cached):  # collect what is gone here
+                    where = run.folder / "start"
+            of_start = start.with_data(recorded, where, model.config, collect)
             batches = activations.sampled(of_start, processor(run.config), model.config.chunk)
             used, earlier = pruning.usage(model, [*batches], activations.loss), read(folder, model)
             free = Table("free directions", "all layers", "fullest layer", box=None)
@@ -121,24 +127,6 @@ def directions(run: Run, model: Backbone, collect: Callable[..., Demonstrations]
             run.console.print(free)
             write_json(run.folder / FILE, lines)
     return read(run.folder, model)
-
-
-def _with_data(
-    folder: Path, out: Path, base_hash: str, model: Backbone, collect: Callable[..., Demonstrations]
-) -> Run:
-    """Return a finished run with its data; a dataset stays on the disk, and demonstrations that are
-    gone are collected again, into `out`."""
-    config = recorded_config(folder, simulated=False)
-    run = Run(config, folder, Console(quiet=True), base_hash)
-    if config.data.source:
-        dataset.load(run, dataset.open_dataset(config, model.config, folder), free_bytes=0.0)
-        return run
-    data = dataclasses.replace(config.data, replay=0.0)  # replayed tasks are the base's
-    run.config = dataclasses.replace(config, data=data)
-    there = all((folder / "cache" / f"{task}.npz").exists() for task in run.config.tasks)
-    where = folder if there else out
-    run.episodes = collect(run.config, where, lambda *_: None)
-    return run
 
 
 def read(folder: Path, model: nnx.Module) -> Protected:

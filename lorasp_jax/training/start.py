@@ -1,15 +1,20 @@
 """Start from a finished run: what it decides, and the export of the later one."""
 
 import dataclasses
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from rich.console import Console
+
 from lorasp_jax.adapters.io import native
 from lorasp_jax.config import Config
+from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.noise_actor import PATH
-from lorasp_jax.training import export
+from lorasp_jax.training import dataset, export
+from lorasp_jax.training.demonstrations import Demonstrations
 from lorasp_jax.training.export import BASE, describe
+from lorasp_jax.training.replay import replayed_tasks
 from lorasp_jax.training.run import Run
 
 C = TypeVar("C", bound=Config)
@@ -56,6 +61,27 @@ def refuse_actor(run: Path, remedy: str) -> None:
     """Raise ValueError if the policy of a run has an actor that chooses its noise."""
     if PATH in describe(run):
         raise ValueError(f"the policy of {run} has learned its initial noise: {remedy}")
+
+
+def with_data(
+    config: Config, folder: Path, model: BackboneConfig, collect: Callable[..., Demonstrations]
+) -> Run:
+    """Return a finished run with its data; a dataset stays on the disk.
+
+    Args:
+        config: the run's.
+        folder: the run's.
+        model: config of its backbone.
+        collect: loads or collects its demonstrations.
+    """
+    run = Run(config, folder, Console(quiet=True), base_hash="")
+    if config.data.source:
+        dataset.load(run, dataset.open_dataset(config, model, folder), free_bytes=0.0)
+        return run
+    tasks = (*config.tasks, *replayed_tasks(config))
+    every = dataclasses.replace(config, tasks=tasks)
+    run.episodes = collect(every, folder, lambda *_: None)
+    return run
 
 
 def write(run: Run, start: Path, **changes: Any) -> None:

@@ -21,7 +21,7 @@ from lorasp_jax.evaluation.held_out import episodes_of, measure, sample, windows
 from lorasp_jax.extras.serving.loading import load_run
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.report.html import write_report
-from lorasp_jax.training import dataset, early, export, setup
+from lorasp_jax.training import dataset, early, export, setup, start
 from lorasp_jax.training.batches import DrawnBatches
 from lorasp_jax.training.cost import fit
 from lorasp_jax.training.distributed import mesh as meshes
@@ -326,6 +326,9 @@ def test_tasks_of_a_base_are_replayed(tmp_path):
     assert tuple(seen) == ("press", *others)
     bounds, shares = run.steps.mixture
     assert (bounds.tolist(), shares.tolist()) == ([0, 21, 84], pytest.approx([0.9, 0.1]))
+    again = start.with_data(REPLAY, tmp_path, Pi0Config.dummy(), collect)
+    assert [*again.episodes] == ["press", *others]
+    assert again.steps.mixture.bounds.tolist() == bounds.tolist()
 
 
 @pytest.mark.parametrize(

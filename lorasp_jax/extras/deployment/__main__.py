@@ -32,6 +32,8 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--episodes", type=int, default=0, metavar="N", help=text)
     add("--save", default="", metavar="VARIANT", help="write this variant instead of measuring")
     add("--out", type=Path, metavar="DIR", help="folder to write, which the policy server serves")
+    text = "train the form on for this many steps, on the run's data, before it is written"
+    add("--heal", type=int, metavar="STEPS", help=text)
     return parser
 
 
@@ -42,9 +44,13 @@ def _run(options: argparse.Namespace) -> None:
         raise ValueError("--save and --out must be given together")
     if options.save and (options.variants or options.episodes):
         raise ValueError("--variants and --episodes are for measuring: leave out --save")
+    if options.heal is not None and not options.save:
+        raise ValueError("--heal changes what --save writes: add --save and --out")
+    if options.heal is not None and options.heal < 1:
+        raise ValueError(f"--heal must be at least 1 step, got {options.heal}")
     variants.check_run(options.run)
     if options.save:
-        variants.save(options.run, options.save, options.out)
+        variants.save(options.run, options.save, options.out, options.heal or 0)
         print(f"written: {options.out}")
         return
     from lorasp_jax.extras.study import Study

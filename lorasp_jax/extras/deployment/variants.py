@@ -1,6 +1,7 @@
 """Make and save the deployment variants of a LoRA-SP policy: forms of adapters times bases."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -10,6 +11,7 @@ from flax import nnx
 import lorasp_jax
 from lorasp_jax.base import compilation_cache as cache
 from lorasp_jax.base.files import check_local
+from lorasp_jax.extras.deployment import healing
 from lorasp_jax.extras.study.held_out import held_out_demonstrations
 from lorasp_jax.training import export, rules, start
 from lorasp_jax.training.base import in_bf16, quantized
@@ -37,18 +39,18 @@ def _half(model: nnx.Module, batches: Batches) -> nnx.Module:
     return lorasp_jax.prune(model, batches, rank=0.5, forward=forward)[0]
 
 
-def _merged(model: nnx.Module, batches: Batches) -> nnx.Module:
-    return in_bf16(lorasp_jax.merge(lorasp_jax.distill(model, batches, forward=forward)[0]))
+def _distilled(model: nnx.Module, batches: Batches) -> nnx.Module:
+    return lorasp_jax.distill(model, batches, forward=forward)[0]
 
 
 FORMS: dict[str, Callable[[nnx.Module, Batches], nnx.Module]] = {
     "whole": _whole,
     "pruned": _pruned,
     "half": _half,
-    "merged": _merged,
+    "merged": _distilled,
 }
 """Forms by name: as trained; pruned to the directions in use on calibration data, and those more
-that a kernel needs; pruned to the most used half of the bank; distilled to LoRA and merged."""
+that a kernel needs; pruned to the most used half of the bank; distilled to LoRA, then merged."""
 BASES: dict[str, Literal["int8", "nf4"] | None] = {"bf16": None, "int8": "int8", "nf4": "nf4"}
 """How the base is stored."""
 
@@ -83,7 +85,10 @@ def is_bank(method: Any) -> bool:
 
 
 def in_form(
-    policy: lorasp_jax.policies.Policy, form: str, episodes: Demonstrations
+    policy: lorasp_jax.policies.Policy,
+    form: str,
+    episodes: Demonstrations,
+    heal: Callable[[lorasp_jax.policies.Policy], lorasp_jax.policies.Policy] | None = None,
 ) -> lorasp_jax.policies.Policy:
     """Return a policy whose adapters have another form, and whose frozen weights are in bf16.
 
@@ -91,12 +96,19 @@ def in_form(
         policy: a LoRA-SP policy; not modified.
         form: one of `FORMS`.
         episodes: calibration data by task; all tasks count alike.
+        heal: trains the adapters before they are merged, such as `healing.heal`; None: do not.
     """
     model = in_bf16(policy.model)
     policy = dataclasses.replace(policy, model=model)
     by_task = keyed_batches(policy, episodes, BATCH_SIZE, BATCHES)
     together = [pair for pairs in by_task.values() for pair in pairs]
-    return dataclasses.replace(policy, model=FORMS[form](model, together))
+    policy = dataclasses.replace(policy, model=FORMS[form](model, together))
+    if heal:
+        del by_task, together  # training needs their memory
+        policy = heal(policy)
+    if form == "merged":
+        policy = dataclasses.replace(policy, model=in_bf16(lorasp_jax.merge(policy.model)))
+    return policy
 
 
 def on_base(policy: lorasp_jax.policies.Policy, base: str) -> lorasp_jax.policies.Policy:
@@ -116,22 +128,26 @@ def check_run(run: Path) -> None:
         raise ValueError(f"{run} was trained with {name}: only LoRA-SP runs have variants")
 
 
-def save(run: Path, name: str, out: Path) -> None:
+def save(run: Path, name: str, out: Path, heal: int = 0) -> None:
     """Make one variant of a run and write it to a new folder.
 
     The folder has the adapters and refers to the run's base, or has the merged weights. A base in
-    int8 or nf4 is quantized whenever the folder is loaded.
+    int8 or nf4 is quantized whenever the folder is loaded. `heal` is the number of steps by which
+    the adapters of the form train on, see `healing.heal`.
 
     Raises:
-        ValueError: the variant is unknown, or the folder exists.
+        ValueError: the variant is unknown, the folder exists, or the run cannot be healed.
     """
     form, base = check(name).split("-")
     check_local(out)
     if out.exists():
         raise ValueError(f"{out} exists already: choose another --out")
+    if heal:
+        healing.check(run)
     cache.enable()
     policy = export.load_policy(run)
     # Those on which `measurement` calibrates.
     episodes = held_out_demonstrations(run / "deployment", recorded_config(run))
-    deployed = in_form(policy, form, episodes)
+    train = functools.partial(healing.heal, run=run, steps=heal) if heal else None
+    deployed = in_form(policy, form, episodes, train)
     export.write_variant(out, deployed, run, quantized=BASES[base])

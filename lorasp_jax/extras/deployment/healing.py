@@ -1,0 +1,100 @@
+"""Heal a form of a run's policy: its adapters train on, with the run's objective and data."""
+
+import dataclasses
+import tempfile
+from pathlib import Path
+
+import jax
+from rich.console import Console
+
+import lorasp_jax
+from lorasp_jax.config import Config
+from lorasp_jax.peft import AdaLoRA
+from lorasp_jax.training import loop, rules, start
+from lorasp_jax.training.demonstrations import demonstrations
+from lorasp_jax.training.finished_run import recorded_config
+from lorasp_jax.training.run_folder import CONFIG_FILE, read_json
+from lorasp_jax.training.setup import Collect
+
+RATE = 0.2
+"""Learning rate relative to the run's; our choice. LoRA-Squeeze (arXiv 2602.10993), too, tunes for
+a few steps what it has compressed."""
+WARMUP = 0.1
+"""Largest share of the steps in which the learning rate rises; the optimizer starts anew."""
+
+
+def check(run: Path, *, has_data: bool = False) -> Config:
+    """Return the config of a finished run that can be healed; `has_data`: its data are elsewhere.
+
+    Raises:
+        ValueError: it is not finished, has learned something other than its data, has adapters that
+            cannot train on, or its demonstrations are gone; see also `start.with_kept`.
+    """
+    config, recorded = recorded_config(run, simulated=False), read_json(run / CONFIG_FILE)
+    reasons = {
+        "it has learned from its own success, not from data": "online" in recorded,
+        "it is distilled to few flow steps, which its data do not teach": "distill" in recorded,
+        "its prompts say which actions are good (--learn recap)": config.learn == "recap",
+        "its protected directions would not stay": bool(config.protect),
+        "ada_lora has spent its rank budget": any(
+            isinstance(method, AdaLoRA) for method in rules.methods(config)
+        ),
+        "its demonstrations are gone": not (
+            has_data or config.data.source or (run / "cache").is_dir()
+        ),
+    }
+    if reason := next((text for text, applies in reasons.items() if applies), ""):
+        raise ValueError(f"{run} cannot be healed: {reason}")
+    return start.with_kept(config, run, config, (), ())
+
+
+def heal(
+    policy: lorasp_jax.policies.Policy, run: Path, steps: int, collect: Collect | None = None
+) -> lorasp_jax.policies.Policy:
+    """Return a policy whose adapters have trained on, on one device; the rest stays as it is.
+
+    The optimizer is the run's, with new moments, without an average, and with a learning rate that
+    decays from `RATE` times the run's to its final one.
+
+    Args:
+        policy: one with adapters, made from the run's; not modified.
+        run: folder of the finished run.
+        steps: number of gradient steps, at least 1.
+        collect: loads the run's demonstrations, as in `setup.prepare`, if they are not in its
+            folder: cells of a study share theirs.
+
+    Raises:
+        ValueError: see `check` and `loop.train`; or the data are gone or have other instructions.
+    """
+    config = check(run, has_data=collect is not None)
+    data = start.with_data(config, run, policy.model.config, collect or demonstrations)
+    if not data.recordings:
+        spoken = [phrase for group in data.episodes.values() for phrase in group.instructions]
+        if spoken != [*policy.processor.prompts.instructions]:
+            raise ValueError(f"the demonstrations of {run} have other instructions than its policy")
+    console = Console(stderr=True)
+    with tempfile.TemporaryDirectory() as folder:
+        config = _config(data.config, steps)
+        healed = dataclasses.replace(data, config=config, folder=Path(folder), console=console)
+        healed.policy, healed.devices = policy, jax.devices()[:1]
+        loop.train(healed)
+    return healed.policy
+
+
+def _config(config: Config, steps: int) -> Config:
+    """Return the config of healing a run on the data that it started with."""
+    optim, rate = config.optim, RATE * config.optim.learning_rate
+    settings = {
+        "steps": steps,
+        "learning_rate": rate,
+        "final_learning_rate": min(optim.final_learning_rate, rate),
+        "warmup_steps": min(optim.warmup_steps, int(WARMUP * steps)),
+        "ema": 0.0,  # it would remember what was not healed
+    }
+    return dataclasses.replace(
+        config,
+        optim=dataclasses.replace(optim, **settings),
+        data=dataclasses.replace(config.data, fresh_every=0),
+        fsdp=1,
+        checkpoint_every=steps,
+    )
