@@ -23,7 +23,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import special
 
 DRAWS, LEVEL = 10_000, 0.95
 
@@ -140,6 +139,8 @@ def widened(estimate: Estimate, spread: Variation, weight: float = 1.0) -> Estim
         weight: variance of the estimate over that of one run's rate: 1 / S for a mean over S runs,
             2 / S for a difference of two.
     """
+    from scipy import special  # slow to import, and finished studies do without
+
     more = math.sqrt(weight) * spread.deviation * special.stdtrit(spread.degrees, (1 + LEVEL) / 2)
     value, low, high = estimate
     return Estimate(
