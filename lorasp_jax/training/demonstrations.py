@@ -21,10 +21,19 @@ Progress = Callable[[str, int, int], None]
 
 def demonstrations(config: Config, folder: Path, progress: Progress) -> Demonstrations:
     """Load the episodes of every task from `folder`/cache, or collect and cache them there."""
-    paths = [folder / "cache" / f"{task}.npz" for task in config.tasks]
+    paths = _paths(config, folder)
     load = functools.partial(_load_or_collect, config, progress=progress)
     episodes = map_threads(load, paths, config.tasks, _keys(config))
     return dict(zip(config.tasks, episodes, strict=True))
+
+
+def are_cached(config: Config, folder: Path) -> bool:
+    """Say whether `demonstrations` would collect nothing."""
+    return all(path.exists() for path in _paths(config, folder))
+
+
+def _paths(config: Config, folder: Path) -> list[Path]:
+    return [folder / "cache" / f"{task}.npz" for task in config.tasks]
 
 
 def fresh_demonstrations(config: Config, generation: int) -> Demonstrations:

@@ -25,7 +25,7 @@ from lorasp_jax.peft.lora_sp.bank import BankMethod
 from lorasp_jax.peft.method import Params
 from lorasp_jax.policies.processor import Processor
 from lorasp_jax.training import activations, records, rules, start
-from lorasp_jax.training.demonstrations import Demonstrations
+from lorasp_jax.training.demonstrations import Demonstrations, are_cached
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.export import RecordedPolicy
 from lorasp_jax.training.finished_run import recorded_config
@@ -108,11 +108,11 @@ def directions(run: Run, model: Backbone, collect: Callable[..., Demonstrations]
         if not (run.folder / FILE).exists():
             folder, lines = Path(run.config.protect), {}
             recorded = recorded_config(folder, simulated=False)
-            where, cached = folder, (folder / "cache" / f"{task}.npz" for task in recorded.tasks)
+            where = folder
             if not recorded.data.source:  # replayed tasks are the base's
                 data = dataclasses.replace(recorded.data, replay=0.0)
                 recorded = dataclasses.replace(recorded, data=data)
-                if not all(path.exists() for path in cached):  # collect what is gone here
+                if not are_cached(recorded, folder):  # collect here what is gone
                     where = run.folder / "start"
             of_start = start.with_data(recorded, where, model.config, collect)
             batches = activations.sampled(of_start, processor(run.config), model.config.chunk)

@@ -57,7 +57,7 @@ def kind(augment: str, steps: int) -> str:
 
 def success(result: Mapping[str, Any], scene: str = "recorded") -> float:
     """Return the success rate of a policy over all tasks of a scene."""
-    return float(_outcomes([result], scene).mean())
+    return float(outcomes([result], scene).mean())
 
 
 def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
@@ -119,7 +119,7 @@ def _difference_table(results: Results, backbone: str) -> str:
             both = [[cell(backbone, m, "none", n, s) for m in (method, STEPPED)] for s in SEEDS]
             ran = [pair for pair in both if all(name in results for name in pair)]
             columns = zip(*ran, strict=True)
-            pair = [_outcomes([results[name] for name in names], "recorded") for names in columns]
+            pair = [outcomes([results[name] for name in names], "recorded") for names in columns]
             cells.append(statistics.bootstrap(lambda x, y: (x - y).mean(-1), *pair))
         rows.append([label, *map(page.points, cells)])
     head = [f"{BACKBONES[backbone]}, points", *(f"N = {n}" for n in COUNTS)]
@@ -133,7 +133,7 @@ def _parts_table(results: Results) -> str:
         cells = []
         for backbone, scene in itertools.product(BACKBONES, SCENES):
             result = results.get(cell(backbone, STEPPED, part, COUNTS[-1], SEEDS[0]))
-            rate = statistics.success(_outcomes([result], scene)) if result else None
+            rate = statistics.success(outcomes([result], scene)) if result else None
             cells.append(page.percent(rate) if rate else page.NONE)
         rows.append([label, *cells])
     head = [f"{name}, {scene}" for name in BACKBONES.values() for scene in SCENES.values()]
@@ -198,10 +198,10 @@ def _estimate(
     results: Results, backbone: str, method: str, kind: str, count: int, scene: str
 ) -> Estimate:
     found = [results[name] for name in _names(results, backbone, method, kind, count)]
-    return statistics.success(_outcomes(found, scene))
+    return statistics.success(outcomes(found, scene))
 
 
-def _outcomes(found: Iterable[Mapping[str, Any]], scene: str) -> np.ndarray:
+def outcomes(found: Iterable[Mapping[str, Any]], scene: str) -> np.ndarray:
     """Stack the episodes of some policies in a scene, bool `[S, T, N]`."""
     texts = [
         {case: text for case, text in result["outcomes"].items() if case.startswith(f"{scene}/")}

@@ -75,7 +75,7 @@ class Scale:
     seeds: tuple[int, ...] = page.SEEDS
 
 
-_ACCELERATOR = Scale(
+ACCELERATOR = Scale(
     Config(
         name="few",
         scale="accelerator",
@@ -88,15 +88,15 @@ _ACCELERATOR = Scale(
         checkpoint_every=10_000,
     )
 )
-_SMOKE = Scale(
+SMOKE = Scale(
     replace(
-        _ACCELERATOR.config,
+        ACCELERATOR.config,
         scale="smoke",
         model=ModelConfig(),
         tasks=("press", "pick_place"),
         data=DataConfig(num_envs=4),
         optim=OptimConfig(steps=2, batch_size=4, warmup_steps=1),
-        evaluation=replace(_ACCELERATOR.config.evaluation, episodes=4, num_envs=4),
+        evaluation=replace(ACCELERATOR.config.evaluation, episodes=4, num_envs=4),
         log_every=2,
     ),
     counts=(2, 3),
@@ -111,7 +111,7 @@ _pilot = functools.partial(judge, scenes=("recorded",))
 
 def get_study(scale: str) -> Study:
     """Return the study; scale smoke only shows that all of it runs."""
-    chosen = {"accelerator": _ACCELERATOR, "smoke": _SMOKE}[scale]
+    chosen = {"accelerator": ACCELERATOR, "smoke": SMOKE}[scale]
     cells = [cell for backbone in page.BACKBONES for cell in _cells(chosen, backbone)]
     return Study("few", tuple(cells), measure=measure, page=page.blocks, partial=True)
 

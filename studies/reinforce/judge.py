@@ -13,6 +13,7 @@ from lorasp_jax.extras.study import Derived
 from lorasp_jax.extras.study.run_cell import simulated
 from lorasp_jax.extras.study.study import Evaluate
 from lorasp_jax.peft import Method
+from lorasp_jax.peft.settings import to_settings
 from lorasp_jax.reinforce import loop, start
 from lorasp_jax.reinforce.config import Learning, ReinforceConfig
 from lorasp_jax.training.run import Run
@@ -43,13 +44,12 @@ class Trial:
 
     def describe(self) -> dict[str, Any]:
         """Return all settings as JSON values."""
-        name = {"name": self.method.name} if self.method else {}
-        found = json.loads(json.dumps(dataclasses.asdict(self)))
+        method = to_settings(self.method) if self.method else None
+        name = {"name": method.pop("method")} if method else {}
+        found = json.loads(json.dumps(dataclasses.asdict(self) | {"method": method}))
         for setting in ("scene", "tasks"):
             if not getattr(self, setting):
                 del found[setting]  # as in results from before there was one
-        if not (found["method"] or {}).get("ranks", True):  # likewise
-            del found["method"]["ranks"]
         if self.learning.exploration == "actions":  # likewise
             del found["learning"]["exploration"], found["learning"]["noise_level"]
         return {"trial": found | name}

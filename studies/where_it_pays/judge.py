@@ -8,5 +8,5 @@ from studies.few import judge as scenes
 
 
 def judge(run: Run) -> dict[str, Any]:
-    """Return what `few.judge` does, with the active ranks of `adapter.json`'s layers."""
+    """Return what `few.judge` does, and the active ranks by tower and layer."""
     return {**scenes.judge(run), "layer_active_rank": training_ranks(run)}

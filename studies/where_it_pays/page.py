@@ -1,20 +1,18 @@
 """The tables and the figure of README.md, from the results of all policies alone."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-import numpy as np
 from matplotlib.figure import Figure
 
 from lorasp_jax.evaluation.figure_style import STYLE
 from lorasp_jax.extras.study import Study, page, statistics
 from lorasp_jax.extras.study import figure as figures
 from lorasp_jax.extras.study.page import BACKBONES
-from lorasp_jax.extras.study.statistics import Estimate
 from lorasp_jax.extras.study.study import Results
-from studies.few.page import SCENES
+from studies.few.page import SCENES, outcomes
 
 METHODS = {"lora": "LoRA", "lora_sp": "LoRA-SP"}
 COLORS = {"lora": "#4269d0", "lora_sp": "#ff725c"}
@@ -23,6 +21,8 @@ WIDE = 64
 """R of the policies whose ranks by layer plans have, and that are cut."""
 BUDGETS = (8, 16, 32)
 """Mean ranks of plans and their rivals."""
+PARAMETERS = (0.3, 1, 3, 10)
+"""Ticks of the figure [M]."""
 SEEDS = (0, 1, 2)
 ALLOCATED = {
     "planned": "ranks in proportion to LoRA-SP's active ranks",
@@ -42,11 +42,6 @@ def cell(backbone: str, method: str, rank: int, seed: int) -> str:
     return f"{backbone}/{method}/r{rank}/s{seed}"
 
 
-def success(result: Mapping[str, Any]) -> float:
-    """Return the success rate of a policy over all tasks as recorded."""
-    return float(_outcomes([result], "recorded").mean())
-
-
 def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
     """Write the figure into `folder`; return the tables, with the seeds that have run."""
     _figure(results, folder / "ranks.svg")
@@ -62,7 +57,7 @@ def _rank_table(results: Results, backbone: str) -> str:
         row = [str(rank)]
         both = _pair(results, backbone, ("lora_sp", rank), ("lora", rank))
         for scene in SCENES:
-            stacked = [_outcomes(found, scene) for found in both] if both[0] else []
+            stacked = [outcomes(found, scene) for found in both] if both[0] else []
             row += [page.percent(statistics.success(x)) for x in reversed(stacked)]
             row += [page.points(statistics.difference(*stacked))] if stacked else []
             row += [page.NONE] * (0 if stacked else 3)
@@ -84,7 +79,7 @@ def _layer_table(results: Results, backbone: str) -> str:
         row = [label]
         for rank in BUDGETS:
             both = _pair(results, backbone, (method, rank), ("lora", rank))
-            stacked = [_outcomes(found, "recorded") for found in both] if both[0] else []
+            stacked = [outcomes(found, "recorded") for found in both] if both[0] else []
             row.append(page.points(statistics.difference(*stacked)) if stacked else page.NONE)
         rows.append(row)
     heads = [f"mean r = {rank}" for rank in BUDGETS]
@@ -100,15 +95,6 @@ def _pair(
     return [list(column) for column in zip(*ran, strict=True)] or [[] for _ in cases]
 
 
-def _outcomes(found: Sequence[Mapping[str, Any]], scene: str) -> np.ndarray:
-    """Stack the episodes of some policies in a scene, bool `[S, T, N]`."""
-    texts = [
-        {case: text for case, text in result["outcomes"].items() if case.startswith(f"{scene}/")}
-        for result in found
-    ]
-    return statistics.outcomes([[{"outcomes": text}] for text in texts])
-
-
 @mpl.rc_context(STYLE)
 def _figure(results: Results, path: Path) -> None:
     """Draw success by rank and by parameters, a row per backbone."""
@@ -119,12 +105,13 @@ def _figure(results: Results, path: Path) -> None:
             found = {rank: _ran(results, backbone, method, rank) for rank in RANKS}
             if not (found := {rank: each for rank, each in found.items() if each}):
                 continue
-            rates = [statistics.success(_outcomes(each, "recorded")) for each in found.values()]
+            rates = [statistics.success(outcomes(each, "recorded")) for each in found.values()]
             counts = [each[0]["trainable_parameters"] / 1e6 for each in found.values()]
             for axis, at in zip(row, ([*found], counts), strict=True):
-                _curve(axis, at, rates, COLORS[method], name)
+                figures.panel(axis, at, {name: (COLORS[method], rates)})
         row[0].set_title(label, loc="left")
         row[0].set_xticks(RANKS, [str(rank) for rank in RANKS])
+        row[1].set_xticks(PARAMETERS, [str(count) for count in PARAMETERS])
         row[0].set_ylabel("success [%]")
     axes[-1, 0].set_xlabel("R")
     axes[-1, 1].set_xlabel("trained parameters [M]")
@@ -134,15 +121,3 @@ def _figure(results: Results, path: Path) -> None:
 def _ran(results: Results, backbone: str, method: str, rank: int) -> list[Mapping[str, Any]]:
     names = [cell(backbone, method, rank, seed) for seed in SEEDS]
     return [results[name] for name in names if name in results]
-
-
-def _curve(
-    axis: Any, at: Sequence[float], rates: Sequence[Estimate], color: str, name: str
-) -> None:
-    """Draw success [%] with its intervals, on a log scale."""
-    values = 100 * np.array(rates).reshape(-1, 3)
-    axis.plot(at, values[:, 0], color=color, marker="o", ms=3, label=name)
-    axis.fill_between(at, values[:, 1], values[:, 2], color=color, alpha=0.12, lw=0)
-    axis.set_xscale("log")
-    axis.minorticks_off()
-    axis.set_ylim(0, 100)

@@ -17,19 +17,13 @@ import numpy as np
 from flax import nnx
 
 from lorasp_jax import models
-from lorasp_jax.config import (
-    AugmentConfig,
-    Config,
-    DataConfig,
-    EvaluationConfig,
-    ModelConfig,
-    OptimConfig,
-)
+from lorasp_jax.config import AugmentConfig, Config, EvaluationConfig
 from lorasp_jax.extras.study import Cell, Derived, Study
 from lorasp_jax.extras.study.study import Results
 from lorasp_jax.models import presets
 from lorasp_jax.peft import AdaLoRA, LoRA, LoRASP, Method, plan
 from lorasp_jax.training import rules
+from studies.few import study as few
 from studies.few.judge import judge as judge_scenes
 from studies.paper.transforms import cut
 from studies.where_it_pays import page
@@ -66,35 +60,15 @@ class Scale:
     seeds: tuple[int, ...] = page.SEEDS
 
 
-_ACCELERATOR = Scale(
-    Config(
-        name="where_it_pays",
-        scale="accelerator",
-        peft=LoRASP(),
-        model=ModelConfig(size="small", dtype="bfloat16"),
-        data=DataConfig(episodes=120, num_envs=256, augment=AugmentConfig("none")),
-        optim=OptimConfig(steps=2000, batch_size=64, warmup_steps=100),
-        evaluation=EvaluationConfig(episodes=256, num_envs=256, before=False),
-        log_every=250,
-        checkpoint_every=10_000,
-    )
-)
-_SMOKE = Scale(
-    replace(
-        _ACCELERATOR.config,
-        scale="smoke",
-        model=ModelConfig(),
-        tasks=("press", "pick_place"),
-        data=DataConfig(episodes=2, num_envs=4, augment=AugmentConfig("none")),
-        optim=OptimConfig(steps=2, batch_size=4, warmup_steps=1),
-        evaluation=replace(_ACCELERATOR.config.evaluation, episodes=4, num_envs=4),
-        log_every=2,
-    ),
-    pool=3,
-    ranks=(8, page.WIDE),
-    budgets=(8,),
-    seeds=(0, 1),
-)
+def _own(shared: Config, episodes: int) -> Config:
+    """Return the config of studies/few with this study's demonstrations and flow steps."""
+    data = replace(shared.data, episodes=episodes, augment=AugmentConfig("none"))
+    evaluation = replace(shared.evaluation, denoise_steps=EvaluationConfig.denoise_steps)
+    return replace(shared, name="where_it_pays", data=data, evaluation=evaluation)
+
+
+_ACCELERATOR = Scale(_own(few.ACCELERATOR.config, 120))
+_SMOKE = Scale(_own(few.SMOKE.config, 2), pool=3, ranks=(8, page.WIDE), budgets=(8,), seeds=(0, 1))
 
 
 def get_study(scale: str) -> Study:
@@ -153,7 +127,7 @@ def _cell(scale: Scale, backbone: str, method: str, rank: int, seed: int, source
     pilots = _pilots(backbone, tuned, rank)
 
     def config(results: Results) -> Config:
-        best = max(pilots, key=lambda name: page.success(results[name]))
+        best = max(pilots, key=lambda name: few.page.success(results[name]))
         made = MAKE.get(method, MAKE["lora"])(rank)
         found = _config(scale, backbone, made, seed, float(best.rpartition("/")[2]))
         if not source:

@@ -15,7 +15,7 @@ Curves = Mapping[str, tuple[str, Sequence[Estimate]]]
 """Label -> color, and an estimate for each value of the setting."""
 
 
-def panel(axes: Any, values: Sequence[int], curves: Curves) -> None:
+def panel(axes: Any, values: Sequence[float], curves: Curves) -> None:
     """Draw success [%] with its intervals against the values of a setting, on a log scale."""
     for label, (color, estimates) in curves.items():
         mean, low, high = ([100 * x for x in column] for column in zip(*estimates, strict=True))

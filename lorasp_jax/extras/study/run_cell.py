@@ -54,12 +54,12 @@ def _train(job: Job) -> dict[str, Any]:
     console, started = Console(width=WIDTH), time.perf_counter()
     collect = functools.partial(shared_demonstrations, job.study_folder, job.cell.pool)
     callbacks = [Export()] if job.cell.evaluate else [Export(), Evaluation(media=False)]
-    callbacks = [] if _evaluated(job) else callbacks
+    callbacks = [] if (found := _evaluated(job)) else callbacks
     with open_run(job.config, job.folder.parent, resume="auto"):
         run = setup.prepare(job.config, job.folder, console, started, collect=collect)
         run.programs = _programs
         loop.train(run, callbacks, resume=True)
-        return _finish(job, run, None)
+        return _finish(job, run, None, found)
 
 
 def _derive(job: Job) -> dict[str, Any]:
@@ -73,14 +73,19 @@ def _derive(job: Job) -> dict[str, Any]:
         if job.cell.transform:
             episodes = held_out_demonstrations(job.study_folder, job.config)
             run.policy = job.cell.transform(source, job.results, episodes)
-    if not (job.cell.evaluate or _evaluated(job)):
+    if not ((found := _evaluated(job)) or job.cell.evaluate):
         Evaluation(media=False).on_end(run)
-    return _finish(job, run, source)
+    return _finish(job, run, source, found)
 
 
-def _finish(job: Job, run: Run, source: lorasp_jax.policies.Policy | None) -> dict[str, Any]:
-    """Return what cell.json records about a run, whose policy simulation may have evaluated."""
-    if not (found := _evaluated(job)):
+def _finish(
+    job: Job, run: Run, source: lorasp_jax.policies.Policy | None, found: dict[str, Any]
+) -> dict[str, Any]:
+    """Return what cell.json records about a run, whose policy simulation may have evaluated.
+
+    `found` was evaluated before, if anything; see `_evaluated`.
+    """
+    if not found:
         with run.timed("evaluate"):
             found = (job.cell.evaluate or simulated)(run) | {"provenance": provenance()}
         settings = progress.describe_config(job.cell, job.config)
