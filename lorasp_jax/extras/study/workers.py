@@ -76,7 +76,7 @@ def run_workers(
 
 
 class _Worker:
-    """A process that runs cells, and the name of the cell that it runs or has run last."""
+    """A process that runs cells, and the name of the cell that it runs, "" between cells."""
 
     def __init__(self, arguments: tuple[Any, ...]) -> None:
         self.cell = _SPAWN.RawArray(ctypes.c_char, _LONGEST_NAME)
@@ -84,13 +84,18 @@ class _Worker:
         self.process.start()
 
     def fail_cell(self, folder: Path) -> None:
-        """Record that the process has died in a cell; for errors see `run_workers`."""
+        """Record that the process has died in a cell; for errors see `run_workers`.
+
+        Another worker may have claimed the cell since and have ended it.
+        """
         code, name = self.process.exitcode or 0, self.cell.value.decode()
         if code == INTERRUPTED:
             raise KeyboardInterrupt
         how = f"with exit code {code}" if code >= 0 else f"by {signal.Signals(-code).name}"
-        if not name or progress.has_ended(folder / name):
+        if not name:
             raise ValueError(f"a worker stopped {how} outside of a cell")
+        if progress.has_ended(folder / name):
+            return
         progress.record_failure(folder / name, f"the worker stopped {how}", "")
         print(f"{name}: failed: the worker stopped {how}", flush=True)
 
@@ -108,8 +113,11 @@ def _work(
 
     def run(job: Job) -> dict[str, Any]:
         cell.value = job.cell.name.encode()
-        with _output_to(folder / "logs" / f"{job.cell.name}.txt"):
-            return run_cell(job)
+        try:
+            with _output_to(folder / "logs" / f"{job.cell.name}.txt"):
+                return run_cell(job)
+        finally:
+            cell.value = b""
 
     try:
         with sigterm_as_interrupt():

@@ -39,6 +39,19 @@ def test_a_worker_that_dies_fails_its_cell_and_is_replaced(folder, start):
 
 
 @pytest.mark.slow
+def test_two_workers_die_in_one_cell(folder, start):
+    start(folder, fakes.run_beside_another)
+    assert states(folder) == {**dict.fromkeys(NAMES, "finished"), "lr": "failed"}
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_between_cells_ends_the_study(folder, start):
+    with pytest.raises(ValueError, match="a worker stopped by SIGKILL outside of a cell"):
+        start(folder, fakes.run_and_die_late)
+    assert set(states(folder).values()) == {"finished"}
+
+
+@pytest.mark.slow
 def test_two_workers_share_the_cells(folder, start):
     text = start(folder, fakes.run_slowly, count=2)
     assert sorted(ran(folder)) == sorted(NAMES)
