@@ -115,11 +115,9 @@ def directions(run: Run, model: Backbone, collect: Callable[..., Demonstrations]
                 if not are_cached(recorded, folder):  # collect here what is gone
                     where = run.folder / "start"
             of_start = start.with_data(recorded, where, model.config, collect)
-            batches = activations.sampled(of_start, processor(run.config), model.config.chunk)
-            used, earlier = pruning.usage(model, [*batches], activations.loss), read(folder, model)
+            found = in_use(of_start, model, processor(run.config), read(folder, model))
             free = Table("free directions", "all layers", "fullest layer", box=None)
-            for path, shares in used.items():
-                stay = (shares >= LEAST) | earlier.get(path, False)
+            for path, stay in found.items():
                 rows = stay.reshape(-1, stay.shape[-1]).astype(int)
                 lines[path] = ["".join(map(str, row)) for row in rows]
                 share = 1 - rows.mean(1)
@@ -127,6 +125,13 @@ def directions(run: Run, model: Backbone, collect: Callable[..., Demonstrations]
             run.console.print(free)
             write_json(run.folder / FILE, lines)
     return read(run.folder, model)
+
+
+def in_use(run: Run, model: Backbone, inputs: Processor, earlier: Protected) -> Protected:
+    """Return the directions that a model uses on the data of a run, and those of `earlier`."""
+    batches = activations.sampled(run, inputs, model.config.chunk)
+    used = pruning.usage(model, [*batches], activations.loss)
+    return {path: (shares >= LEAST) | earlier.get(path, False) for path, shares in used.items()}
 
 
 def read(folder: Path, model: nnx.Module) -> Protected:

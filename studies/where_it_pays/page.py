@@ -13,17 +13,15 @@ from lorasp_jax.extras.study import figure as figures
 from lorasp_jax.extras.study.page import BACKBONES
 from lorasp_jax.extras.study.study import Results
 from studies.few.page import SCENES, outcomes
+from studies.where_it_pays import names, sequence_page
+from studies.where_it_pays.names import METHODS, SEEDS, WIDE, cell
 
-METHODS = {"lora": "LoRA", "lora_sp": "LoRA-SP"}
 COLORS = {"lora": "#4269d0", "lora_sp": "#ff725c"}
 RANKS = (4, 8, 16, 32, 64, 128)
-WIDE = 64
-"""R of the policies whose ranks by layer plans have, and that are cut."""
 BUDGETS = (8, 16, 32)
 """Mean ranks of plans and their rivals."""
 PARAMETERS = (0.3, 1, 3, 10)
 """Ticks of the figure [M]."""
-SEEDS = (0, 1, 2)
 ALLOCATED = {
     "planned": "ranks in proportion to LoRA-SP's active ranks",
     "other_seed": "the same, of another seed",
@@ -36,10 +34,21 @@ ALLOCATED = {
 }
 """What is compared with LoRA of one rank for all layers."""
 
-
-def cell(backbone: str, method: str, rank: int, seed: int) -> str:
-    """Return the name of a policy."""
-    return f"{backbone}/{method}/r{rank}/s{seed}"
+FORMS = {
+    "whole": ("lora_sp", "whole"),
+    "pruned": ("lora_sp", "pruned to the directions in use"),
+    "half": ("lora_sp", "half of the bank"),
+    "merged": ("lora_sp", "one LoRA, merged"),
+    "merged_int8": ("lora_sp", "the same, base in int8"),
+    "taught": ("lora_sp", "one LoRA, merged, taught by the whole policy"),
+    "by_task": ("lora_sp", "one LoRA per task, merged"),
+    "lora": ("lora", "plain LoRA, merged"),
+}
+"""Form of a policy with R = `WIDE` -> its method, and its label; see docs/deployment.md."""
+HEAL = 400
+"""Steps by which forms train on."""
+HEALED = ("whole", "taught")
+"""Forms that exist only after training on."""
 
 
 def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
@@ -47,6 +56,10 @@ def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
     _figure(results, folder / "ranks.svg")
     made = {f"{backbone} ranks": _rank_table(results, backbone) for backbone in BACKBONES}
     made |= {f"{backbone} layers": _layer_table(results, backbone) for backbone in BACKBONES}
+    made |= {f"{backbone} forms": _form_table(results, backbone) for backbone in BACKBONES}
+    made |= {
+        f"{backbone} sequences": sequence_page.table(results, backbone) for backbone in BACKBONES
+    }
     return made
 
 
@@ -86,13 +99,39 @@ def _layer_table(results: Results, backbone: str) -> str:
     return page.table([f"{BACKBONES[backbone]}, points over one rank", *heads], rows)
 
 
+def _form_table(results: Results, backbone: str) -> str:
+    """Return success of forms as made and trained on, also minus the whole policy's, and sizes."""
+    rows = []
+    for name, (_, label) in FORMS.items():
+        row, size, count = [label], page.NONE, 0
+        for healed in (False, True):
+            policies = [
+                [_formed(backbone, x, healed, seed) for seed in SEEDS] for x in (name, "whole")
+            ]
+            both = names.ran(results, *policies)
+            stacked = [outcomes(each, "recorded") for each in both] if both[0] else []
+            row += [page.percent(statistics.success(stacked[0]))] if stacked else [page.NONE]
+            paired = stacked and name != "whole"
+            row += [page.points(statistics.difference(*stacked))] if paired else [page.NONE]
+        if both[0]:
+            size, count = f"{both[0][0]['bytes'] / 1e6:.1f} MB", len(both[0])
+        rows.append([*row, size, str(count)])
+    heads = ["as made", "minus whole", f"after {HEAL} steps", "minus whole", "weights", "seeds"]
+    return page.table([BACKBONES[backbone], *heads], rows)
+
+
+def _formed(backbone: str, name: str, healed: bool, seed: int) -> str:
+    """Return the name of a form's policy; that of the whole policy as made is its own."""
+    if name == "whole" and not healed:
+        return cell(backbone, "lora_sp", WIDE, seed)
+    return names.form(backbone, name, healed, seed)
+
+
 def _pair(
     results: Results, backbone: str, *cases: tuple[str, int]
 ) -> list[list[Mapping[str, Any]]]:
     """Return the results of two methods for the seeds that have run with both."""
-    names = [[cell(backbone, *case, seed) for case in cases] for seed in SEEDS]
-    ran = [[results[name] for name in pair] for pair in names if all(n in results for n in pair)]
-    return [list(column) for column in zip(*ran, strict=True)] or [[] for _ in cases]
+    return names.ran(results, *([cell(backbone, *case, seed) for seed in SEEDS] for case in cases))
 
 
 @mpl.rc_context(STYLE)
@@ -102,7 +141,7 @@ def _figure(results: Results, path: Path) -> None:
     axes = figure.subplots(len(BACKBONES), 2, sharey=True)
     for row, (backbone, label) in zip(axes, BACKBONES.items(), strict=True):
         for method, name in METHODS.items():
-            found = {rank: _ran(results, backbone, method, rank) for rank in RANKS}
+            found = {rank: _pair(results, backbone, (method, rank))[0] for rank in RANKS}
             if not (found := {rank: each for rank, each in found.items() if each}):
                 continue
             rates = [statistics.success(outcomes(each, "recorded")) for each in found.values()]
@@ -116,8 +155,3 @@ def _figure(results: Results, path: Path) -> None:
     axes[-1, 0].set_xlabel("R")
     axes[-1, 1].set_xlabel("trained parameters [M]")
     figures.write(figure, path, "where_it_pays")
-
-
-def _ran(results: Results, backbone: str, method: str, rank: int) -> list[Mapping[str, Any]]:
-    names = [cell(backbone, method, rank, seed) for seed in SEEDS]
-    return [results[name] for name in names if name in results]

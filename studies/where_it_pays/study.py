@@ -26,7 +26,7 @@ from lorasp_jax.training import rules
 from studies.few import study as few
 from studies.few.judge import judge as judge_scenes
 from studies.paper.transforms import cut
-from studies.where_it_pays import page
+from studies.where_it_pays import forms, names, page, sequences
 from studies.where_it_pays.judge import judge
 
 RATES = (1e-3, 3e-3)
@@ -35,7 +35,7 @@ PILOT_SEED = 1000
 MAKE: Mapping[str, Callable[[int], Method]] = {
     "lora": lambda rank: LoRA(rank=rank),
     "lora_sp": lambda rank: LoRASP(rank=rank),
-    "ada_lora": lambda rank: AdaLoRA(rank=page.WIDE, target_rank=rank),
+    "ada_lora": lambda rank: AdaLoRA(rank=names.WIDE, target_rank=rank),
     "eva": lambda rank: LoRA(rank=rank, initialization="eva"),
 }
 """Method by its (mean) rank."""
@@ -50,6 +50,7 @@ class Scale:
         pool: demonstrations per task, of which each seed takes its own.
         ranks: R of LoRA and LoRA-SP.
         budgets: mean ranks of plans.
+        heal: steps by which forms train on.
         seeds: seeds of the tables.
     """
 
@@ -57,7 +58,8 @@ class Scale:
     pool: int = 512
     ranks: tuple[int, ...] = page.RANKS
     budgets: tuple[int, ...] = page.BUDGETS
-    seeds: tuple[int, ...] = page.SEEDS
+    heal: int = page.HEAL
+    seeds: tuple[int, ...] = names.SEEDS
 
 
 def _own(shared: Config, episodes: int) -> Config:
@@ -68,7 +70,9 @@ def _own(shared: Config, episodes: int) -> Config:
 
 
 _ACCELERATOR = Scale(_own(few.ACCELERATOR.config, 120))
-_SMOKE = Scale(_own(few.SMOKE.config, 2), pool=3, ranks=(8, page.WIDE), budgets=(8,), seeds=(0, 1))
+_SMOKE = Scale(
+    _own(few.SMOKE.config, 2), pool=3, ranks=(8, names.WIDE), budgets=(8,), heal=1, seeds=(0, 1)
+)
 
 
 def get_study(scale: str) -> Study:
@@ -92,19 +96,21 @@ def _cells(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
             yield _cell(scale, backbone, method, rank, seed)
     for seed in scale.seeds:
         yield from _allocated(scale, backbone, seed)
+        yield from forms.cells(backbone, seed, scale.pool, scale.heal)
+        yield from sequences.cells(backbone, seed, scale.pool, scale.ranks)
 
 
 def _ranked(scale: Scale) -> Iterator[tuple[str, int]]:
     for rank in scale.ranks:
-        for method in page.METHODS:
+        for method in names.METHODS:
             yield method, rank
 
 
 def _allocated(scale: Scale, backbone: str, seed: int) -> Iterator[Cell | Derived]:
     """Yield the policies of a seed whose layers differ in rank, and their rivals."""
-    own = page.cell(backbone, "lora_sp", page.WIDE, seed)
+    own = names.cell(backbone, "lora_sp", names.WIDE, seed)
     following = scale.seeds[(scale.seeds.index(seed) + 1) % len(scale.seeds)]
-    other = page.cell(backbone, "lora_sp", page.WIDE, following)
+    other = names.cell(backbone, "lora_sp", names.WIDE, following)
     for rank in scale.budgets:
         for kind, source in (("planned", own), ("shuffled", own), ("other_seed", other)):
             yield _cell(scale, backbone, kind, rank, seed, source)
@@ -113,8 +119,8 @@ def _allocated(scale: Scale, backbone: str, seed: int) -> Iterator[Cell | Derive
         for method in ("ada_lora", "eva"):
             yield _cell(scale, backbone, method, rank, seed)
         yield Derived(
-            page.cell(backbone, "cut", rank, seed),
-            page.cell(backbone, "lora", page.WIDE, seed),
+            names.cell(backbone, "cut", rank, seed),
+            names.cell(backbone, "lora", names.WIDE, seed),
             lambda policy, _, __, rank=rank: cut(policy, rank),
             settings={"rank": rank},
             evaluate=judge_scenes,
@@ -123,7 +129,7 @@ def _allocated(scale: Scale, backbone: str, seed: int) -> Iterator[Cell | Derive
 
 def _cell(scale: Scale, backbone: str, method: str, rank: int, seed: int, source: str = "") -> Cell:
     """Return a policy; the active ranks of `source` decide the ranks of its layers, if given."""
-    tuned = method if method in page.METHODS else "lora"
+    tuned = method if method in names.METHODS else "lora"
     pilots = _pilots(backbone, tuned, rank)
 
     def config(results: Results) -> Config:
@@ -137,7 +143,7 @@ def _cell(scale: Scale, backbone: str, method: str, rank: int, seed: int, source
 
     after = (*pilots, source) if source else pilots
     group = f"{backbone}/{method}_r{rank}" if not source else ""  # a plan is a program of its own
-    name = page.cell(backbone, method, rank, seed)
+    name = names.cell(backbone, method, rank, seed)
     return Cell(name, config, after, group, evaluate=judge, pool=scale.pool)
 
 
@@ -166,7 +172,7 @@ def make_plan(
     if kind.startswith("dropped"):
         return plan.RankPlan(backbone, _without_half(kind, shapes, ranks, rank, seed), rule=kind)
     budget = rank * sum(layers * (d_in + d_out) for layers, d_in, d_out in shapes.values())
-    found = plan.allocate(ranks, shapes, budget, most=page.WIDE)
+    found = plan.allocate(ranks, shapes, budget, most=names.WIDE)
     made = plan.RankPlan(backbone, found, rule=kind, budget=budget)
     return plan.shuffled(made, shapes, jax.random.key(seed)) if kind == "shuffled" else made
 

@@ -15,6 +15,7 @@ from lorasp_jax.training.demonstrations import demonstrations
 from lorasp_jax.training.finished_run import recorded_config
 from lorasp_jax.training.run_folder import CONFIG_FILE, read_json
 from lorasp_jax.training.setup import Collect
+from lorasp_jax.training.step import Objective
 
 RATE = 0.2
 """Learning rate relative to the run's; our choice. LoRA-Squeeze (arXiv 2602.10993), too, tunes for
@@ -49,7 +50,11 @@ def check(run: Path, *, has_data: bool = False) -> Config:
 
 
 def heal(
-    policy: lorasp_jax.policies.Policy, run: Path, steps: int, collect: Collect | None = None
+    policy: lorasp_jax.policies.Policy,
+    run: Path,
+    steps: int,
+    collect: Collect | None = None,
+    objective: Objective | None = None,
 ) -> lorasp_jax.policies.Policy:
     """Return a policy whose adapters have trained on, on one device; the rest stays as it is.
 
@@ -62,6 +67,7 @@ def heal(
         steps: number of gradient steps, at least 1.
         collect: loads the run's demonstrations, as in `setup.prepare`, if they are not in its
             folder: cells of a study share theirs.
+        objective: what to learn in place of the demonstrated actions.
 
     Raises:
         ValueError: see `check` and `loop.train`; or the data are gone or have other instructions.
@@ -76,7 +82,7 @@ def heal(
     with tempfile.TemporaryDirectory() as folder:
         config = _config(data.config, steps)
         healed = dataclasses.replace(data, config=config, folder=Path(folder), console=console)
-        healed.policy, healed.devices = policy, jax.devices()[:1]
+        healed.policy, healed.devices, healed.objective = policy, jax.devices()[:1], objective
         loop.train(healed)
     return healed.policy
 

@@ -1,0 +1,112 @@
+"""Forms of trained policies, as they are and trained on for a few steps."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import lorasp_jax
+from lorasp_jax.config import Config
+from lorasp_jax.data.batches import Batch
+from lorasp_jax.extras.deployment import healing, measurement, variants
+from lorasp_jax.extras.study import Derived
+from lorasp_jax.extras.study.held_out import held_out_demonstrations, shared_demonstrations
+from lorasp_jax.models import flow_matching
+from lorasp_jax.models.backbone import Backbone
+from lorasp_jax.models.transformer.layers import ModelAux, merge_action_aux
+from lorasp_jax.policies.policy import Policy
+from lorasp_jax.training.base import in_bf16
+from lorasp_jax.training.demonstrations import Demonstrations
+from lorasp_jax.training.run import Run
+from studies.few.judge import judge as judge_scenes
+from studies.where_it_pays import names, page
+
+Heal = Callable[[Policy], Policy]
+_FORMS = {"taught": "merged", "by_task": "merged"}
+"""How forms are made that are not `variants.FORMS`."""
+
+
+def cells(backbone: str, seed: int, pool: int, steps: int) -> Iterator[Derived]:
+    """Yield the forms of a seed; healed ones have trained on for some steps."""
+    for form, (method, _) in page.FORMS.items():
+        for healed in (0, steps):
+            if not healed and form in page.HEALED:
+                continue
+            evaluate = functools.partial(judge, form=form, steps=healed, pool=pool)
+            source = names.cell(backbone, method, names.WIDE, seed)
+            name = names.form(backbone, form, healed > 0, seed)
+            settings = {"form": form, "steps": healed}
+            yield Derived(name, source, settings=settings, evaluate=evaluate)
+
+
+def judge(run: Run, form: str, steps: int, pool: int) -> dict[str, Any]:
+    """Return the outcomes of a form of the run's policy, and the `bytes` of its weights.
+
+    "taught" is merged after the policy's own velocities have taught it in place of demonstrations.
+    "by_task" is a policy for each task, of which `bytes` is the sum.
+    """
+    folder, settings = run.folder.parents[3], run.config
+    name = names.cell(settings.model.backbone, page.FORMS[form][0], names.WIDE, settings.seed)
+    held_out = held_out_demonstrations(folder, settings)
+    objective = Taught(run.policy.model) if form == "taught" else None
+
+    def made(tasks: Sequence[str]) -> Run:
+        """Return a run of some tasks, whose policy has the form for these."""
+        collect = functools.partial(_only, tasks, folder, pool)
+        options = {"run": folder / name, "steps": steps, "collect": collect, "objective": objective}
+        heal = functools.partial(healing.heal, **options) if steps else None
+        found = dataclasses.replace(run, config=dataclasses.replace(settings, tasks=tuple(tasks)))
+        found.policy = _in_form(run.policy, form, {task: held_out[task] for task in tasks}, heal)
+        return found
+
+    groups = [(task,) for task in settings.tasks] if form == "by_task" else [settings.tasks]
+    outcomes, size = {}, 0
+    for tasks in groups:
+        shown = made(tasks)
+        outcomes |= judge_scenes(shown)["outcomes"]
+        size += measurement.weight_bytes(shown.policy)
+    return {"outcomes": outcomes, "bytes": size}
+
+
+def _only(
+    tasks: Sequence[str], study_folder: Path, pool: int, config: Config, *where: Any
+) -> Demonstrations:
+    """Return the demonstrations of a study; tasks other than the given ones have no episodes."""
+    every = shared_demonstrations(study_folder, pool, config, *where)
+    return {
+        task: group.select(np.arange(group.num_episodes if task in tasks else 0))
+        for task, group in every.items()
+    }
+
+
+def _in_form(policy: Policy, form: str, held_out: Demonstrations, heal: Heal | None) -> Policy:
+    if form == "lora":
+        policy = heal(policy) if heal else policy
+        return dataclasses.replace(policy, model=in_bf16(lorasp_jax.merge(policy.model)))
+    kind, _, base = (_FORMS.get(form) or form).partition("_")
+    return variants.on_base(variants.in_form(policy, kind, held_out, heal), base or "bf16")
+
+
+@dataclass(frozen=True, eq=False)
+class Taught:
+    """The objective (F(x_t, t) - sg F'(x_t, t))², where F' is the velocity of a teacher."""
+
+    teacher: Backbone
+
+    def __call__(
+        self, student: Backbone, _: Backbone, batch: Batch, noise: jax.Array, flow_time: jax.Array
+    ) -> tuple[jax.Array, ModelAux]:
+        """Return errors `[B, C, A]` and the adapters' aux, see `training.step.Objective`."""
+        obs, mask = batch.observation, batch.action_mask
+        x_t, _velocity = flow_matching.interpolate(noise, batch.actions, flow_time)
+        x_t = jnp.where(mask.any(axis=1, keepdims=True), x_t, 0)
+        target = jax.lax.stop_gradient(self.teacher.velocity(obs, x_t, flow_time))
+        prefix, aux = student.run_prefix(obs)
+        velocity, action_aux = student.run_suffix(prefix, obs, x_t, flow_time, mask.any(axis=2))
+        return jnp.square(velocity - target), merge_action_aux(aux, action_aux)

@@ -1,0 +1,32 @@
+"""Names of the policies that are compared, and the results of those that have run."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from lorasp_jax.extras.study.study import Results
+
+METHODS = {"lora": "LoRA", "lora_sp": "LoRA-SP"}
+WIDE = 64
+"""R of the policies whose ranks by layer plans have, and that other cells start from."""
+SEEDS = (0, 1, 2)
+
+
+def cell(backbone: str, method: str, rank: int, seed: int) -> str:
+    """Return the name of a policy."""
+    return f"{backbone}/{method}/r{rank}/s{seed}"
+
+
+def form(backbone: str, name: str, healed: bool, seed: int) -> str:
+    """Return the name of a policy in one of `page.FORMS`."""
+    return f"{backbone}/form_{name}/{'healed' if healed else 'made'}/s{seed}"
+
+
+def sequence(backbone: str, kind: str, order: int, seed: int) -> str:
+    """Return the name of a policy of one of `sequence_page.KINDS`."""
+    return f"{backbone}/{kind}/o{order}/s{seed}"
+
+
+def ran(results: Results, *policies: Sequence[str]) -> list[list[Mapping[str, Any]]]:
+    """Return the results of policies, given their names by seed, for seeds that all have run."""
+    whole = [names for names in zip(*policies, strict=True) if all(n in results for n in names)]
+    return [[results[names[i]] for names in whole] for i in range(len(policies))]

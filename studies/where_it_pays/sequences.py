@@ -1,0 +1,134 @@
+"""Tasks learned one after another by one policy: what does it forget?"""
+
+import dataclasses
+import functools
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from flax import nnx
+
+import lorasp_jax
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.config import Config
+from lorasp_jax.extras.study import Derived
+from lorasp_jax.extras.study.held_out import shared_demonstrations
+from lorasp_jax.models.backbone import Backbone
+from lorasp_jax.training import loop, protect, rules, setup
+from lorasp_jax.training.demonstrations import Demonstrations
+from lorasp_jax.training.random_streams import RandomStream
+from lorasp_jax.training.run import Run
+from studies.few import judge as scenes
+from studies.where_it_pays import names, sequence_page
+from studies.where_it_pays.sequence_page import ORDERS, SINGLE
+
+REPLAYED = 0.02
+"""Share of the demonstrations of earlier tasks that `replay` trains on, too."""
+KEPT = 0.5
+"""α of `retain`: W ← (1 - α) W_before + α W_after, after each task (RETAIN, arXiv 2512.08333)."""
+
+
+def cells(backbone: str, seed: int, pool: int, ranks: Sequence[int]) -> Iterator[Derived]:
+    """Yield the policies of a seed that learn one task after another; see `study.Scale`."""
+    for kind, (method, rank, _) in sequence_page.KINDS.items():
+        if rank not in ranks:
+            continue
+        source = names.cell(backbone, method, rank, seed)
+        for order in range(1 if kind in SINGLE else len(ORDERS)):
+            evaluate = functools.partial(judge, kind=kind, order=order, pool=pool)
+            name = names.sequence(backbone, kind, order, seed)
+            settings = {"kind": kind, "order": order}
+            yield Derived(name, source, settings=settings, evaluate=evaluate)
+
+
+def judge(run: Run, kind: str, order: int, pool: int) -> dict[str, Any]:
+    """Learn the tasks one after another, each with an equal part of the run's steps.
+
+    The policy begins with new adapters on the base, its processor is that of the run, which learned
+    all tasks together. `SINGLE` kinds have new adapters for each task.
+
+    Returns:
+        `outcomes` by number of tasks learned and task, such as "2/pour", in scenes as recorded; of
+        `SINGLE` kinds of each task after itself alone. `protected`: the share of directions that
+        stay after each task.
+    """
+    config, tasks = run.config, [task for task in ORDERS[order] if task in run.config.tasks]
+    study_folder = run.folder.parents[3]
+    every = shared_demonstrations(study_folder, pool, config, run.folder, lambda *_: None)
+    start = setup.build(config, run.folder).model
+    policy = dataclasses.replace(run.policy, model=start)
+    single = kind in SINGLE
+    outcomes = {} if single else _outcomes(run, policy, 0, tasks)
+    protected: protect.Protected = {}
+    shares = []
+    for number, task in enumerate(tasks, 1):
+        if single:
+            policy = dataclasses.replace(policy, model=start)
+        before = policy.model
+        stage = _stage(run, policy, _shown(every, tasks[:number], replay=kind == "replay"), tasks)
+        if kind == "protected":
+            stage.fixed = protect.fixed(before, protected)
+        policy = _learned(stage)
+        if kind == "protected":
+            protected = protect.in_use(stage, policy.model, policy.processor, protected)
+            shares.append(float(np.mean([rows.mean() for rows in protected.values()])))
+        if kind == "retain":
+            policy = dataclasses.replace(policy, model=_interpolated(policy.model, config, number))
+        outcomes |= _outcomes(run, policy, number, [task] if single else tasks)
+    found = {"outcomes": outcomes, "trainable_parameters": run.parameters[0]}
+    return found | ({"protected": shares} if shares else {})
+
+
+def _shown(every: Demonstrations, learned: list[str], *, replay: bool) -> Demonstrations:
+    """Return the demonstrations of the last task, and with `replay` some of those before it.
+
+    All tasks stay in the mapping, without episodes: steps refer to their instructions by number.
+    """
+
+    def count(task: str) -> int:
+        whole = every[task].num_episodes
+        if task == learned[-1]:
+            return whole
+        return round(np.ceil(REPLAYED * whole)) if replay and task in learned else 0
+
+    return {task: group.select(np.arange(count(task))) for task, group in every.items()}
+
+
+def _stage(run: Run, policy: Any, episodes: Demonstrations, tasks: list[str]) -> Run:
+    """Return a run that trains a policy on demonstrations, on one device."""
+    steps = run.config.optim.steps // len(tasks)
+    optim = dataclasses.replace(run.config.optim, steps=steps)
+    config = dataclasses.replace(run.config, optim=optim, checkpoint_every=steps, log_every=steps)
+    stage = Run(config, run.folder, run.console, run.base_hash, episodes=episodes)
+    stage.policy, stage.devices, stage.programs = policy, jax.devices()[:1], run.programs
+    return stage
+
+
+def _learned(stage: Run) -> Any:
+    """Train a stage; return its policy."""
+    with tempfile.TemporaryDirectory() as folder:
+        trained = dataclasses.replace(stage, folder=Path(folder))
+        trained.policy = stage.policy
+        loop.train(trained)
+    return trained.policy
+
+
+def _interpolated(model: Backbone, config: Config, number: int) -> Backbone:
+    """Merge `KEPT` of what LoRA has learned into the base, and return it with new adapters."""
+    graphdef, adapters, frozen = adaptation.split(model)
+    shrink = lambda path, x: KEPT * x if path[-1].key == "lora_b" else x  # noqa: E731
+    adapters = jax.tree_util.tree_map_with_path(shrink, adapters)
+    merged = lorasp_jax.merge(nnx.merge(graphdef, adapters, frozen))
+    key = jax.random.fold_in(RandomStream.ADAPTERS.key(config.seed), number)
+    return adaptation.adapt(merged, rules.rules(config), rngs=nnx.Rngs(key))
+
+
+def _outcomes(run: Run, policy: Any, number: int, tasks: list[str]) -> dict[str, str]:
+    """Return the outcomes of a policy after a number of tasks."""
+    shown = dataclasses.replace(run, config=dataclasses.replace(run.config, tasks=tuple(tasks)))
+    shown.policy = policy
+    found = scenes.judge(shown, ("recorded",))["outcomes"]
+    return {f"{number}/{name.partition('/')[2]}": text for name, text in found.items()}
