@@ -26,6 +26,11 @@ def sequence(backbone: str, kind: str, order: int, seed: int) -> str:
     return f"{backbone}/{kind}/o{order}/s{seed}"
 
 
+def recipe(backbone: str, name: str, seed: int) -> str:
+    """Return the name of a policy of one of `page.RECIPES`."""
+    return f"{backbone}/recipe_{name}/s{seed}"
+
+
 def ran(results: Results, *policies: Sequence[str]) -> list[list[Mapping[str, Any]]]:
     """Return the results of policies, given their names by seed, for seeds that all have run."""
     whole = [names for names in zip(*policies, strict=True) if all(n in results for n in names)]

@@ -50,6 +50,25 @@ HEAL = 400
 HEALED = ("whole", "taught")
 """Forms that exist only after training on."""
 
+RECIPES = {
+    "lora": "LoRA, r = 64",
+    "lora_sp": "LoRA-SP, R = 64",
+    "eta_0.8": "η = .8",
+    "eta_0.99": "η = .99",
+    "relu": "ReLU scores",
+    "softmax": "softmax scores",
+    "spectral_0": "no spectral loss",
+    "spectral_0.1": "spectral loss x 10",
+    "balance_0": "no balance loss",
+    "scale_1": "α = R",
+    "scale_4": "α = 4 R",
+    "eva": "EVA's initialization of the bank",
+    "expert": "LoRA on vision and language",
+    "vlm": "LoRA on the action expert",
+}
+"""Changes of LoRA-SP that pilots try, and LoRA."""
+RECIPE_SEEDS = (1001, 1002, 1003)
+
 
 def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
     """Write the figure into `folder`; return the tables, with the seeds that have run."""
@@ -125,6 +144,32 @@ def _formed(backbone: str, name: str, healed: bool, seed: int) -> str:
     if name == "whole" and not healed:
         return cell(backbone, "lora_sp", WIDE, seed)
     return names.form(backbone, name, healed, seed)
+
+
+def _recipe_table(results: Results) -> str:
+    """Return success of changed LoRA-SP, also minus that of LoRA-SP as it is."""
+    rows = []
+    for name, label in RECIPES.items():
+        row = [label]
+        for backbone in BACKBONES:
+            policies = [
+                [names.recipe(backbone, x, seed) for seed in RECIPE_SEEDS]
+                for x in (name, "lora_sp")
+            ]
+            both = names.ran(results, *policies)
+            for scene in SCENES:
+                stacked = [outcomes(found, scene) for found in both] if both[0] else []
+                row.append(page.percent(statistics.success(stacked[0])) if stacked else page.NONE)
+                paired = stacked and name != "lora_sp"
+                row.append(page.points(statistics.difference(*stacked)) if paired else page.NONE)
+        rows.append(row)
+    heads = [
+        f"{label}, {head}"
+        for label in BACKBONES.values()
+        for scene in SCENES.values()
+        for head in (scene, "minus LoRA-SP")
+    ]
+    return page.table(["pilots", *heads], rows)
 
 
 def _pair(

@@ -11,6 +11,7 @@ layer takes that of LoRA with their mean.
 import functools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import numpy as np
@@ -26,8 +27,8 @@ from lorasp_jax.training import rules
 from studies.few import study as few
 from studies.few.judge import judge as judge_scenes
 from studies.paper.transforms import cut
-from studies.where_it_pays import forms, names, page, sequences
-from studies.where_it_pays.judge import judge
+from studies.where_it_pays import forms, names, page, recipes, sequences
+from studies.where_it_pays.judge import best_rate, judge
 
 RATES = (1e-3, 3e-3)
 """Learning rates, of which pilots choose one per backbone, method and rank."""
@@ -91,6 +92,10 @@ def _cells(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
             config = _config(scale, backbone, MAKE[method](rank), PILOT_SEED, rate)
             group = f"{backbone}/{method}_r{rank}"
             yield Cell(name, config, (), group, evaluate=pilot, pool=scale.pool)
+    for seed in page.RECIPE_SEEDS[: len(scale.seeds)]:
+        make = functools.partial(_config, scale, backbone, seed=seed)
+        pilots = {method: _pilots(backbone, method, names.WIDE) for method in names.METHODS}
+        yield from recipes.cells(backbone, seed, scale.pool, make, pilots)
     for seed in scale.seeds:
         for method, rank in _ranked(scale):
             yield _cell(scale, backbone, method, rank, seed)
@@ -133,9 +138,8 @@ def _cell(scale: Scale, backbone: str, method: str, rank: int, seed: int, source
     pilots = _pilots(backbone, tuned, rank)
 
     def config(results: Results) -> Config:
-        best = max(pilots, key=lambda name: few.page.success(results[name]))
         made = MAKE.get(method, MAKE["lora"])(rank)
-        found = _config(scale, backbone, made, seed, float(best.rpartition("/")[2]))
+        found = _config(scale, backbone, made, seed, best_rate(results, pilots))
         if not source:
             return found
         active = results[source]["layer_active_rank"]
@@ -208,7 +212,9 @@ def _pilots(backbone: str, method: str, rank: int) -> tuple[str, ...]:
     return tuple(f"{backbone}/pilot/{method}_r{rank}/{rate}" for rate in RATES)
 
 
-def _config(scale: Scale, backbone: str, method: Method, seed: int, rate: float) -> Config:
+def _config(
+    scale: Scale, backbone: str, method: Method, seed: int, rate: float, **changes: Any
+) -> Config:
     config = scale.config
     return replace(
         config,
@@ -216,4 +222,5 @@ def _config(scale: Scale, backbone: str, method: Method, seed: int, rate: float)
         model=replace(config.model, backbone=backbone),
         optim=replace(config.optim, learning_rate=rate),
         seed=seed,
+        **changes,
     )
