@@ -73,13 +73,14 @@ RECIPE_SEEDS = (1001, 1002, 1003)
 def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
     """Write the figure into `folder`; return the tables, with the seeds that have run."""
     _figure(results, folder / "ranks.svg")
-    made = {f"{backbone} ranks": _rank_table(results, backbone) for backbone in BACKBONES}
-    made |= {f"{backbone} layers": _layer_table(results, backbone) for backbone in BACKBONES}
-    made |= {f"{backbone} forms": _form_table(results, backbone) for backbone in BACKBONES}
-    made |= {
-        f"{backbone} sequences": sequence_page.table(results, backbone) for backbone in BACKBONES
+    tables = {
+        "ranks": _rank_table,
+        "layers": _layer_table,
+        "forms": _form_table,
+        "sequences": sequence_page.table,
     }
-    return made
+    made = {f"{b} {name}": table(results, b) for name, table in tables.items() for b in BACKBONES}
+    return made | {"recipes": _recipe_table(results)}
 
 
 def _rank_table(results: Results, backbone: str) -> str:
@@ -164,10 +165,10 @@ def _recipe_table(results: Results) -> str:
                 row.append(page.points(statistics.difference(*stacked)) if paired else page.NONE)
         rows.append(row)
     heads = [
-        f"{label}, {head}"
+        f"{label}, {scene}{head}"
         for label in BACKBONES.values()
         for scene in SCENES.values()
-        for head in (scene, "minus LoRA-SP")
+        for head in ("", ", minus LoRA-SP")
     ]
     return page.table(["pilots", *heads], rows)
 

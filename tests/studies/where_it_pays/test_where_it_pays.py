@@ -1,14 +1,26 @@
 """The study of where adaptive rank pays: its cells, their plans, and its page."""
 
+import dataclasses
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import nnx
 
+from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.config import Config
+from lorasp_jax.dense import AdaptedLayer
 from lorasp_jax.extras.study import Derived, statistics
-from lorasp_jax.training import rules
-from studies.where_it_pays import page, study
+from lorasp_jax.models import flow_matching
+from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.peft import LoRA
+from lorasp_jax.training import activations, rules
+from studies.where_it_pays import forms, names, page, recipes, sequence_page, sequences, study
+from tests.models.random_models import random_backbone, with_noise
+from tests.runs import CONFIG, make_run, random_episodes
 
 STUDY = study.get_study("accelerator")
+STUDY_NAMES = {cell.name for cell in STUDY.cells}
 SCALE = study._ACCELERATOR
 
 
@@ -23,35 +35,62 @@ def active(backbone):
     return found
 
 
+def episodes(rate):
+    """Outcomes of forty episodes."""
+    return "1" * round(40 * rate) + "0" * (40 - round(40 * rate))
+
+
+def forgetting(kind, order):
+    """Outcomes of a policy with 10 % before, 80 % after a task, and 20 % less after each later."""
+    tasks = sequence_page.ORDERS[order]
+    if kind in sequence_page.SINGLE:
+        return {f"{k}/{task}": episodes(0.7) for k, task in enumerate(tasks, 1)}
+    found = {}
+    for learned in range(len(tasks) + 1):
+        for k, task in enumerate(tasks, 1):
+            rate = 0.8 - 0.2 * (learned - k) if learned >= k else 0.1
+            found[f"{learned}/{task}"] = episodes(rate)
+    return found
+
+
 @pytest.fixture(scope="module")
 def results():
     """Results of all policies, of which those at the higher rate are the best."""
     found = {}
     for cell in STUDY.cells:
-        rate = 0.5 + 0.2 * cell.name.endswith("0.003")
-        text = "1" * round(40 * rate) + "0" * (40 - round(40 * rate))
+        text = episodes(0.5 + 0.2 * cell.name.endswith("0.003"))
         outcomes = {f"{s}/{t}": text for s in page.SCENES for t in ("press", "pour")}
+        if (kind := cell.name.split("/")[1]) in sequence_page.KINDS:
+            outcomes = forgetting(kind, cell.settings["order"])
         backbone = cell.name.split("/")[0]
-        measures = {"trainable_parameters": 1000, "layer_active_rank": active(backbone)}
+        measures = {
+            "trainable_parameters": 1000,
+            "bytes": 2e6,
+            "layer_active_rank": active(backbone),
+        }
         found[cell.name] = {"outcomes": outcomes, **measures}
     return found
 
 
 def test_policies_differ_in_what_their_names_say(results):
     for cell in STUDY.cells:
-        backbone, method, rank, seed = cell.name.split("/")
+        backbone, method, *rank, seed = cell.name.split("/")
         if method == "pilot":
             continue
         if isinstance(cell, Derived):
-            assert cell.source == f"{backbone}/lora/r64/{seed}"
+            assert cell.source in STUDY_NAMES
+            assert (cell.source.split("/")[0], cell.source.split("/")[-1]) == (backbone, seed)
             continue
         config = cell.config if isinstance(cell.config, Config) else cell.config(results)
         assert config.model.backbone == backbone
         assert f"s{config.seed}" == seed
         assert config.optim.learning_rate == 3e-3
+        if method.startswith("recipe_"):
+            assert config.seed in page.RECIPE_SEEDS
+            continue
         assert bool(config.plan) == (method not in ("lora", "lora_sp", "ada_lora", "eva"))
         named = config.peft.target_rank if method == "ada_lora" else config.peft.rank
-        assert f"r{named}" == rank
+        assert [f"r{named}"] == rank
 
 
 @pytest.mark.parametrize("backbone", page.BACKBONES)
@@ -90,3 +129,91 @@ def test_page(results, tmp_path, monkeypatch):
         numbers = "50.0 [" in blocks["pi0 ranks"].replace("\u00a0", " ")
         assert numbers == bool(found)
         assert len(blocks["smolvla layers"].splitlines()) == 2 + len(page.ALLOCATED)
+        assert blocks["recipes"].count("50.0") == (2 * 2 * len(page.RECIPES) if found else 0)
+    rows = [line.split(" | ") for line in blocks["pi0 sequences"].splitlines()[4:]]
+    numbers = {
+        row[0].replace("\u00a0", " "): [cell.split("\u00a0")[0] for cell in row[1:]] for row in rows
+    }
+    for kind, (_, _, label) in sequence_page.KINDS.items():
+        own = ["70.0", "70.0", "–", "–"]
+        shown = own if kind in sequence_page.SINGLE else ["50.0", "80.0", "+40.0", "+0.0"]
+        assert numbers[f"| {label}"] == [*shown, "3 |"]
+    for kind in page.FORMS:
+        assert {names.form("pi0", kind, True, 0)} <= STUDY_NAMES
+
+
+def test_the_recipes_differ_in_one_thing():
+    made = [recipes.RECIPES[name] for name in recipes.RECIPES]
+    assert all(first != other for i, first in enumerate(made) for other in made[:i])
+    assert {*recipes.RECIPES, "eva"} == {*page.RECIPES}
+    plain = dataclasses.asdict(recipes.RECIPES["lora_sp"][0])
+    for name, (method, changes) in recipes.RECIPES.items():
+        if name != "lora":
+            settings = dataclasses.asdict(method)
+            assert sum(settings[x] != plain[x] for x in plain) + len(changes) == (name != "lora_sp")
+
+
+def test_a_sequence_shows_the_last_task_and_replays_a_few():
+    every = {task: random_episodes(task, 0) for task in ("press", "pour", "pick_place")}
+    shown = sequences._shown(every, ["press", "pour"], replay=False)
+    assert [group.num_episodes for group in shown.values()] == [0, 3, 0]
+    assert [group.instructions for group in shown.values()] == [
+        group.instructions for group in every.values()
+    ]
+    replayed = sequences._shown(every, ["press", "pour"], replay=True)
+    assert [group.num_episodes for group in replayed.values()] == [1, 3, 0]
+
+
+@pytest.fixture(scope="module")
+def lora():
+    config = dataclasses.replace(CONFIG, peft=LoRA(rank=2))
+    return config, with_adapters(config)
+
+
+def with_adapters(config):
+    """A tiny model with adapters that change its outputs."""
+    model = random_backbone(Pi0Config.dummy())
+    graphdef, adapters, frozen = adaptation.split(
+        adaptation.adapt(model, rules.rules(config), rngs=nnx.Rngs(0))
+    )
+    return nnx.merge(graphdef, with_noise(adapters, 0.1), frozen)
+
+
+def test_half_of_an_update_is_merged(lora):
+    config, model = lora
+    after = sequences._interpolated(model, config, 1)
+    assert {method.rank for method in adaptation.methods(after).values()} == {2}
+    kernel = lambda model: model.action.blocks.q_proj.kernel.get_value()  # noqa: E731
+    base, whole = kernel(model), kernel(adaptation.merge(model))
+    np.testing.assert_allclose(kernel(after), base / 2 + whole / 2, atol=1e-5)
+    assert np.abs(whole - base).max() > 1e-3
+
+
+def test_a_policy_that_teaches_itself_makes_no_error(lora, tmp_path):
+    config, model = lora
+    run = make_run(tmp_path, config, random_backbone(Pi0Config.dummy()))
+    key, batch = next(activations.sampled(run, run.policy.processor, model.config.chunk))
+    noise, time = flow_matching.draw(key, batch.actions)
+    drawn = batch, noise, time
+    errors, aux = forms.Taught(model)(model, model, *drawn)
+    assert float(jnp.abs(errors).max()) < 1e-8
+    assert {*aux} >= {"vision", "action"}
+    assert float(forms.Taught(with_adapters(CONFIG))(model, model, *drawn)[0].mean()) > 1e-6
+
+
+def test_leading_inputs_begin_the_bank():
+    def banks(model):
+        layers = paths.locate(nnx.List([model]), AdaptedLayer)
+        adapters = {x.path: x.child.adapter for x in layers if x.child.adapter is not None}
+        return {path: adapter.get_value()["bank"]["v"] for path, adapter in adapters.items()}
+
+    model = with_adapters(CONFIG)
+    before, third = banks(model), {}
+    for path, v in before.items():
+        third[path] = jnp.zeros((*v.shape[:-1], v.shape[-2])).at[..., 3, 3].set(1.0)
+    after = banks(recipes._with_leading_inputs(model, third))
+    for path, v in after.items():
+        lengths = [np.linalg.norm(bank[path], axis=-2) for bank in (before, after)]
+        np.testing.assert_allclose(*lengths, rtol=1e-5)
+        first = np.abs(v[..., 0]) / lengths[1][..., :1]
+        np.testing.assert_allclose(first, np.broadcast_to(np.eye(v.shape[-2])[3], first.shape))
