@@ -2,17 +2,14 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 import lorasp_jax
-from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Batch
 from lorasp_jax.extras.deployment import healing, measurement, variants
 from lorasp_jax.extras.study import Derived
@@ -25,7 +22,7 @@ from lorasp_jax.training.base import in_bf16
 from lorasp_jax.training.demonstrations import Demonstrations
 from lorasp_jax.training.run import Run
 from studies.few.judge import judge as judge_scenes
-from studies.where_it_pays import names, page
+from studies.where_it_pays import names, page, sequences
 
 Heal = Callable[[Policy], Policy]
 _FORMS = {"taught": "merged", "by_task": "merged"}
@@ -51,38 +48,21 @@ def judge(run: Run, form: str, steps: int, pool: int) -> dict[str, Any]:
     "taught" is merged after the policy's own velocities have taught it in place of demonstrations.
     "by_task" is a policy for each task, of which `bytes` is the sum.
     """
-    folder, settings = run.folder.parents[3], run.config
-    name = names.cell(settings.model.backbone, page.FORMS[form][0], names.WIDE, settings.seed)
-    held_out = held_out_demonstrations(folder, settings)
-    objective = Taught(run.policy.model) if form == "taught" else None
-
-    def made(tasks: Sequence[str]) -> Run:
-        """Return a run of some tasks, whose policy has the form for these."""
-        collect = functools.partial(_only, tasks, folder, pool)
-        options = {"run": folder / name, "steps": steps, "collect": collect, "objective": objective}
-        heal = functools.partial(healing.heal, **options) if steps else None
-        found = dataclasses.replace(run, config=dataclasses.replace(settings, tasks=tuple(tasks)))
-        found.policy = _in_form(run.policy, form, {task: held_out[task] for task in tasks}, heal)
-        return found
-
+    settings, study_folder = run.config, run.folder.parents[3]
+    held_out = held_out_demonstrations(study_folder, settings)
+    every = shared_demonstrations(study_folder, pool, settings, run.folder, lambda *_: None)
+    options = {"steps": steps, "objective": Taught(run.policy.model) if form == "taught" else None}
     groups = [(task,) for task in settings.tasks] if form == "by_task" else [settings.tasks]
     outcomes, size = {}, 0
     for tasks in groups:
-        shown = made(tasks)
+        shown = dataclasses.replace(run, config=dataclasses.replace(settings, tasks=tasks))
+        counts = {task: every[task].num_episodes for task in tasks}
+        shown.episodes = sequences.some(every, counts)
+        heal = functools.partial(healing.train_on, run=shown, **options) if steps else None
+        shown.policy = _in_form(run.policy, form, {task: held_out[task] for task in tasks}, heal)
         outcomes |= judge_scenes(shown)["outcomes"]
         size += measurement.weight_bytes(shown.policy)
     return {"outcomes": outcomes, "bytes": size}
-
-
-def _only(
-    tasks: Sequence[str], study_folder: Path, pool: int, config: Config, *where: Any
-) -> Demonstrations:
-    """Return the demonstrations of a study; tasks other than the given ones have no episodes."""
-    every = shared_demonstrations(study_folder, pool, config, *where)
-    return {
-        task: group.select(np.arange(group.num_episodes if task in tasks else 0))
-        for task, group in every.items()
-    }
 
 
 def _in_form(policy: Policy, form: str, held_out: Demonstrations, heal: Heal | None) -> Policy:

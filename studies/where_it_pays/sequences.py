@@ -2,8 +2,9 @@
 
 import dataclasses
 import functools
+import math
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +69,10 @@ def judge(run: Run, kind: str, order: int, pool: int) -> dict[str, Any]:
         if single:
             policy = dataclasses.replace(policy, model=start)
         before = policy.model
-        stage = _stage(run, policy, _shown(every, tasks[:number], replay=kind == "replay"), tasks)
+        counts = {task: every[task].num_episodes}
+        if kind == "replay":
+            counts |= {t: math.ceil(REPLAYED * every[t].num_episodes) for t in tasks[: number - 1]}
+        stage = _stage(run, policy, some(every, counts), tasks)
         if kind == "protected":
             stage.fixed = protect.fixed(before, protected)
         policy = _learned(stage)
@@ -82,19 +86,12 @@ def judge(run: Run, kind: str, order: int, pool: int) -> dict[str, Any]:
     return found | ({"protected": shares} if shares else {})
 
 
-def _shown(every: Demonstrations, learned: list[str], *, replay: bool) -> Demonstrations:
-    """Return the demonstrations of the last task, and with `replay` some of those before it.
+def some(every: Demonstrations, counts: Mapping[str, int]) -> Demonstrations:
+    """Return the first demonstrations of some tasks, given their numbers.
 
-    All tasks stay in the mapping, without episodes: steps refer to their instructions by number.
+    The others have none, but stay: steps refer to the instructions of all by number.
     """
-
-    def count(task: str) -> int:
-        whole = every[task].num_episodes
-        if task == learned[-1]:
-            return whole
-        return round(np.ceil(REPLAYED * whole)) if replay and task in learned else 0
-
-    return {task: group.select(np.arange(count(task))) for task, group in every.items()}
+    return {task: group.select(np.arange(counts.get(task, 0))) for task, group in every.items()}
 
 
 def _stage(run: Run, policy: Any, episodes: Demonstrations, tasks: list[str]) -> Run:

@@ -13,8 +13,8 @@ from lorasp_jax.peft import AdaLoRA
 from lorasp_jax.training import loop, rules, start
 from lorasp_jax.training.demonstrations import demonstrations
 from lorasp_jax.training.finished_run import recorded_config
+from lorasp_jax.training.run import Run
 from lorasp_jax.training.run_folder import CONFIG_FILE, read_json
-from lorasp_jax.training.setup import Collect
 from lorasp_jax.training.step import Objective
 
 RATE = 0.2
@@ -24,8 +24,8 @@ WARMUP = 0.1
 """Largest share of the steps in which the learning rate rises; the optimizer starts anew."""
 
 
-def check(run: Path, *, has_data: bool = False) -> Config:
-    """Return the config of a finished run that can be healed; `has_data`: its data are elsewhere.
+def check(run: Path) -> Config:
+    """Return the config of a finished run that can be healed.
 
     Raises:
         ValueError: it is not finished, has learned something other than its data, has adapters that
@@ -40,21 +40,32 @@ def check(run: Path, *, has_data: bool = False) -> Config:
         "ada_lora has spent its rank budget": any(
             isinstance(method, AdaLoRA) for method in rules.methods(config)
         ),
-        "its demonstrations are gone": not (
-            has_data or config.data.source or (run / "cache").is_dir()
-        ),
+        "its demonstrations are gone": not (config.data.source or (run / "cache").is_dir()),
     }
     if reason := next((text for text, applies in reasons.items() if applies), ""):
         raise ValueError(f"{run} cannot be healed: {reason}")
     return start.with_kept(config, run, config, (), ())
 
 
-def heal(
-    policy: lorasp_jax.policies.Policy,
-    run: Path,
-    steps: int,
-    collect: Collect | None = None,
-    objective: Objective | None = None,
+def heal(policy: lorasp_jax.policies.Policy, run: Path, steps: int) -> lorasp_jax.policies.Policy:
+    """Return a policy whose adapters have trained on with the data of a finished run.
+
+    For the arguments see `train_on`; `run` is the run's folder.
+
+    Raises:
+        ValueError: see `check` and `loop.train`; or the data are gone or have other instructions.
+    """
+    config = check(run)
+    data = start.with_data(config, run, policy.model.config, demonstrations)
+    if not data.recordings:
+        spoken = [phrase for group in data.episodes.values() for phrase in group.instructions]
+        if spoken != [*policy.processor.prompts.instructions]:
+            raise ValueError(f"the demonstrations of {run} have other instructions than its policy")
+    return train_on(policy, data, steps)
+
+
+def train_on(
+    policy: lorasp_jax.policies.Policy, run: Run, steps: int, objective: Objective | None = None
 ) -> lorasp_jax.policies.Policy:
     """Return a policy whose adapters have trained on, on one device; the rest stays as it is.
 
@@ -63,25 +74,16 @@ def heal(
 
     Args:
         policy: one with adapters, made from the run's; not modified.
-        run: folder of the finished run.
+        run: has the config and the data.
         steps: number of gradient steps, at least 1.
-        collect: loads the run's demonstrations, as in `setup.prepare`, if they are not in its
-            folder: cells of a study share theirs.
         objective: what to learn in place of the demonstrated actions.
 
     Raises:
-        ValueError: see `check` and `loop.train`; or the data are gone or have other instructions.
+        ValueError: see `loop.train`.
     """
-    config = check(run, has_data=collect is not None)
-    data = start.with_data(config, run, policy.model.config, collect or demonstrations)
-    if not data.recordings:
-        spoken = [phrase for group in data.episodes.values() for phrase in group.instructions]
-        if spoken != [*policy.processor.prompts.instructions]:
-            raise ValueError(f"the demonstrations of {run} have other instructions than its policy")
-    console = Console(stderr=True)
+    config, console = _config(run.config, steps), Console(stderr=True)
     with tempfile.TemporaryDirectory() as folder:
-        config = _config(data.config, steps)
-        healed = dataclasses.replace(data, config=config, folder=Path(folder), console=console)
+        healed = dataclasses.replace(run, config=config, folder=Path(folder), console=console)
         healed.policy, healed.devices, healed.objective = policy, jax.devices()[:1], objective
         loop.train(healed)
     return healed.policy

@@ -9,11 +9,13 @@ from flax import nnx
 
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.config import Config
+from lorasp_jax.data.batches import flatten
 from lorasp_jax.dense import AdaptedLayer
 from lorasp_jax.extras.study import Derived, statistics
 from lorasp_jax.models import flow_matching
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import LoRA
+from lorasp_jax.peft.settings import to_settings
 from lorasp_jax.training import activations, rules
 from studies.where_it_pays import forms, names, page, recipes, sequence_page, sequences, study
 from tests.models.random_models import random_backbone, with_noise
@@ -146,22 +148,20 @@ def test_the_recipes_differ_in_one_thing():
     made = [recipes.RECIPES[name] for name in recipes.RECIPES]
     assert all(first != other for i, first in enumerate(made) for other in made[:i])
     assert {*recipes.RECIPES, "eva"} == {*page.RECIPES}
-    plain = dataclasses.asdict(recipes.RECIPES["lora_sp"][0])
+    plain = to_settings(recipes.RECIPES["lora_sp"][0])
     for name, (method, changes) in recipes.RECIPES.items():
         if name != "lora":
-            settings = dataclasses.asdict(method)
+            settings = to_settings(method)
             assert sum(settings[x] != plain[x] for x in plain) + len(changes) == (name != "lora_sp")
 
 
-def test_a_sequence_shows_the_last_task_and_replays_a_few():
+def test_tasks_without_demonstrations_keep_the_numbers_of_instructions():
     every = {task: random_episodes(task, 0) for task in ("press", "pour", "pick_place")}
-    shown = sequences._shown(every, ["press", "pour"], replay=False)
-    assert [group.num_episodes for group in shown.values()] == [0, 3, 0]
-    assert [group.instructions for group in shown.values()] == [
-        group.instructions for group in every.values()
-    ]
-    replayed = sequences._shown(every, ["press", "pour"], replay=True)
-    assert [group.num_episodes for group in replayed.values()] == [1, 3, 0]
+    shown = sequences.some(every, {"pour": 2})
+    assert [group.num_episodes for group in shown.values()] == [0, 2, 0]
+    rows = flatten([*shown.values()]).instruction
+    first = len(every["press"].instructions)
+    assert {*rows.tolist()} == {*(first + every["pour"].instruction[:2]).tolist()}
 
 
 @pytest.fixture(scope="module")
