@@ -27,7 +27,7 @@ from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run_folder import read_json
 
-SIZES = ("nano", "small", "base", "nano_pi05", "base_pi05")
+SIZES = ("nano", "small", "medium", "base", "nano_pi05", "base_pi05")
 _TOWERS = "^(vision|language|action)/"
 TRAINING = "training.json"
 """File beside the base weights that describes their training, such as the control period."""

@@ -5,10 +5,12 @@ from typing import Any
 
 from lorasp_jax.extras.study.study import Results
 
+STUDY = "where_it_pays"
 METHODS = {"lora": "LoRA", "lora_sp": "LoRA-SP"}
 WIDE = 64
 """R of the policies whose ranks by layer plans have, and that other cells start from."""
 SEEDS = (0, 1, 2)
+PILOT_SEED = 1000
 
 
 def cell(backbone: str, method: str, rank: int, seed: int) -> str:
@@ -29,6 +31,16 @@ def sequence(backbone: str, kind: str, order: int, seed: int) -> str:
 def recipe(backbone: str, name: str, seed: int) -> str:
     """Return the name of a policy of one of `page.RECIPES`."""
     return f"{backbone}/recipe_{name}/s{seed}"
+
+
+def base(backbone: str, kind: str) -> str:
+    """Return the name of one of `bases.BASES`."""
+    return f"{backbone}/base_{kind}"
+
+
+def on_base(backbone: str, kind: str, method: str, name: str) -> str:
+    """Return the name of a policy on one of `bases.BASES`; `name` is its seed, or a pilot's."""
+    return f"{backbone}/{kind}/{method}/{name}"
 
 
 def ran(results: Results, *policies: Sequence[str]) -> list[list[Mapping[str, Any]]]:

@@ -22,6 +22,17 @@ BUDGETS = (8, 16, 32)
 """Mean ranks of plans and their rivals."""
 PARAMETERS = (0.3, 1, 3, 10)
 """Ticks of the figure [M]."""
+BASE_ROWS = {
+    "first": {"lora": "LoRA, r = 64", "lora_sp": "LoRA-SP, R = 64"},
+    "second": {"lora": "LoRA, r = 64", "lora_sp": "LoRA-SP, R = 64"},
+    "medium": {
+        "lora": "LoRA, r = 32",
+        "lora_sp": "LoRA-SP, R = 32",
+        "ada_lora": "AdaLoRA, 32 cut to a mean of 8",
+        "full": "full fine-tuning",
+    },
+}
+"""Base -> method -> label; see `bases.BASES`."""
 ALLOCATED = {
     "planned": "ranks in proportion to LoRA-SP's active ranks",
     "other_seed": "the same, of another seed",
@@ -78,6 +89,7 @@ def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
         "layers": _layer_table,
         "forms": _form_table,
         "sequences": sequence_page.table,
+        "bases": _base_table,
     }
     made = {f"{b} {name}": table(results, b) for name, table in tables.items() for b in BACKBONES}
     return made | {"recipes": _recipe_table(results)}
@@ -145,6 +157,30 @@ def _formed(backbone: str, name: str, healed: bool, seed: int) -> str:
     if name == "whole" and not healed:
         return cell(backbone, "lora_sp", WIDE, seed)
     return names.form(backbone, name, healed, seed)
+
+
+def _base_table(results: Results, backbone: str) -> str:
+    """Return success on three bases, also minus LoRA's."""
+    rows = []
+    for kind, methods in BASE_ROWS.items():
+        for method, label in methods.items():
+            both = names.ran(results, *(_policies_on(backbone, kind, x) for x in (method, "lora")))
+            row = [kind, label]
+            for scene in SCENES:
+                stacked = [outcomes(found, scene) for found in both] if both[0] else []
+                row.append(page.percent(statistics.success(stacked[0])) if stacked else page.NONE)
+                paired = stacked and method != "lora"
+                row.append(page.points(statistics.difference(*stacked)) if paired else page.NONE)
+            rows.append([*row, str(len(both[0]))])
+    heads = [f"{scene}{head}" for scene in SCENES.values() for head in ("", ", minus LoRA")]
+    return page.table([f"{BACKBONES[backbone]}: base", "method", *heads, "seeds"], rows)
+
+
+def _policies_on(backbone: str, kind: str, method: str) -> list[str]:
+    """Return the names of the policies of a method on a base."""
+    if kind == "first":
+        return [cell(backbone, method, WIDE, seed) for seed in SEEDS]
+    return [names.on_base(backbone, kind, method, f"s{seed}") for seed in SEEDS]
 
 
 def _recipe_table(results: Results) -> str:

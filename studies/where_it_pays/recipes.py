@@ -50,12 +50,17 @@ def cells(
     make: Callable[..., Config],
     pilots: Mapping[str, Sequence[str]],
 ) -> Iterator[Cell | Derived]:
-    """Yield the policies of a seed; `make` returns a config, `pilots` decide the rate by method."""
+    """Yield the policies of a seed.
+
+    Args:
+        make: returns a config, given method, seed, rate and other settings.
+        pilots: names of the policies that decide the rate, by method.
+    """
     for name, (method, changes) in RECIPES.items():
 
         def config(results: Results, method: Method = method, changes: Any = changes) -> Config:
             rate = best_rate(results, pilots[method.name])
-            return make(method, rate=rate, **changes)
+            return make(method, seed=seed, rate=rate, **changes)
 
         own, group = names.recipe(backbone, name, seed), f"{backbone}/{name}"
         after = tuple(pilots[method.name])

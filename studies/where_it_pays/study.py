@@ -27,12 +27,11 @@ from lorasp_jax.training import rules
 from studies.few import study as few
 from studies.few.judge import judge as judge_scenes
 from studies.paper.transforms import cut
-from studies.where_it_pays import forms, names, page, recipes, sequences
+from studies.where_it_pays import bases, forms, names, page, recipes, sequences
 from studies.where_it_pays.judge import best_rate, judge
 
 RATES = (1e-3, 3e-3)
 """Learning rates, of which pilots choose one per backbone, method and rank."""
-PILOT_SEED = 1000
 MAKE: Mapping[str, Callable[[int], Method]] = {
     "lora": lambda rank: LoRA(rank=rank),
     "lora_sp": lambda rank: LoRASP(rank=rank),
@@ -80,7 +79,7 @@ def get_study(scale: str) -> Study:
     """Return the study; scale smoke only shows that all of it runs."""
     chosen = {"accelerator": _ACCELERATOR, "smoke": _SMOKE}[scale]
     cells = [cell for backbone in page.BACKBONES for cell in _cells(chosen, backbone)]
-    return Study("where_it_pays", tuple(cells), page=page.blocks, partial=True)
+    return Study(names.STUDY, tuple(cells), page=page.blocks, partial=True)
 
 
 def _cells(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
@@ -89,12 +88,12 @@ def _cells(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
     for method, rank in _ranked(scale):
         for name in _pilots(backbone, method, rank):
             rate = float(name.rpartition("/")[2])
-            config = _config(scale, backbone, MAKE[method](rank), PILOT_SEED, rate)
+            config = _config(scale, backbone, MAKE[method](rank), names.PILOT_SEED, rate)
             group = f"{backbone}/{method}_r{rank}"
             yield Cell(name, config, (), group, evaluate=pilot, pool=scale.pool)
+    make = functools.partial(_config, scale, backbone)
+    pilots = {method: _pilots(backbone, method, names.WIDE) for method in names.METHODS}
     for seed in page.RECIPE_SEEDS[: len(scale.seeds)]:
-        make = functools.partial(_config, scale, backbone, seed=seed)
-        pilots = {method: _pilots(backbone, method, names.WIDE) for method in names.METHODS}
         yield from recipes.cells(backbone, seed, scale.pool, make, pilots)
     for seed in scale.seeds:
         for method, rank in _ranked(scale):
@@ -103,6 +102,7 @@ def _cells(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
         yield from _allocated(scale, backbone, seed)
         yield from forms.cells(backbone, seed, scale.pool, scale.heal)
         yield from sequences.cells(backbone, seed, scale.pool, scale.ranks)
+    yield from bases.cells(backbone, scale.seeds, scale.pool, make, pilots, scale.config.scale)
 
 
 def _ranked(scale: Scale) -> Iterator[tuple[str, int]]:

@@ -40,7 +40,12 @@ def model():
 
 @pytest.mark.parametrize(
     ("name", "low", "high"),
-    [("base", 3_238_048_528, 3_238_048_528), ("small", 8e6, 10e6), ("nano", 0.9e6, 1.2e6)],
+    [
+        ("base", 3_238_048_528, 3_238_048_528),
+        ("medium", 6e7, 1e8),
+        ("small", 8e6, 10e6),
+        ("nano", 0.9e6, 1.2e6),
+    ],
 )
 def test_parameter_counts(name, low, high):
     config = getattr(Pi0Config, name)()

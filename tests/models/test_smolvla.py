@@ -42,7 +42,9 @@ def base():
     return nnx.eval_shape(lambda: SmolVLAConfig.base().create(nnx.Rngs(0)))
 
 
-@pytest.mark.parametrize(("name", "low", "high"), [("small", 8e6, 10e6), ("nano", 0.9e6, 1.2e6)])
+@pytest.mark.parametrize(
+    ("name", "low", "high"), [("medium", 6e7, 1e8), ("small", 8e6, 10e6), ("nano", 0.9e6, 1.2e6)]
+)
 def test_parameter_counts(name, low, high):
     config = getattr(SmolVLAConfig, name)()
     assert low <= size(nnx.eval_shape(lambda: config.create(nnx.Rngs(0)))) <= high

@@ -70,6 +70,15 @@ class Pi0Config(BackboneConfig):
         return dataclasses.replace(cls.base(), pi05=True, max_tokens=200, inputs=OPENPI_PI05)
 
     @classmethod
+    def medium(cls) -> Pi0Config:
+        """Sizes between small and base: about 70 M parameters, 64 tokens per camera."""
+        return cls.miniature(
+            vision=VisionConfig(width=512, depth=8, mlp=1536, heads=8, patch=8),
+            language=ExpertConfig(512, 8, 1536, heads=8, kv_heads=1, head_dim=64),
+            action=ExpertConfig(512, 8, 1536, heads=8, kv_heads=1, head_dim=64),
+        )
+
+    @classmethod
     def small(cls) -> Pi0Config:
         """Sizes for one accelerator: about 9.5 M parameters, 64 tokens per camera."""
         return cls.miniature(

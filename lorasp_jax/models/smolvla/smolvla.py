@@ -72,6 +72,15 @@ class SmolVLAConfig(BackboneConfig):
         )
 
     @classmethod
+    def medium(cls) -> SmolVLAConfig:
+        """Sizes between small and base: about 66 M parameters, 16 tokens per camera."""
+        return cls.miniature(
+            vision=VisionConfig(width=512, depth=8, mlp=1536, heads=8, patch=8, shuffle=2),
+            language=ExpertConfig(512, 10, 1280, heads=8, kv_heads=2, head_dim=64),
+            action=ExpertConfig(384, 10, 1024, heads=8, kv_heads=2, head_dim=64),
+        )
+
+    @classmethod
     def small(cls) -> SmolVLAConfig:
         """Sizes for one accelerator: about 9 M parameters, 64 patches and 16 tokens per camera."""
         return cls.miniature(

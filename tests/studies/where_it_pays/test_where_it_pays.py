@@ -14,10 +14,19 @@ from lorasp_jax.dense import AdaptedLayer
 from lorasp_jax.extras.study import Derived, statistics
 from lorasp_jax.models import flow_matching
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.peft import LoRA
+from lorasp_jax.peft import FullFineTuning, LoRA
 from lorasp_jax.peft.settings import to_settings
 from lorasp_jax.training import activations, rules
-from studies.where_it_pays import forms, names, page, recipes, sequence_page, sequences, study
+from studies.where_it_pays import (
+    bases,
+    forms,
+    names,
+    page,
+    recipes,
+    sequence_page,
+    sequences,
+    study,
+)
 from tests.models.random_models import random_backbone, with_noise
 from tests.runs import CONFIG, make_run, random_episodes
 
@@ -76,9 +85,9 @@ def results():
 
 def test_policies_differ_in_what_their_names_say(results):
     for cell in STUDY.cells:
-        backbone, method, *rank, seed = cell.name.split("/")
-        if method == "pilot":
+        if "pilot" in cell.name or "base_" in cell.name:
             continue
+        backbone, method, *rank, seed = cell.name.split("/")
         if isinstance(cell, Derived):
             assert cell.source in STUDY_NAMES
             assert (cell.source.split("/")[0], cell.source.split("/")[-1]) == (backbone, seed)
@@ -86,9 +95,14 @@ def test_policies_differ_in_what_their_names_say(results):
         config = cell.config if isinstance(cell.config, Config) else cell.config(results)
         assert config.model.backbone == backbone
         assert f"s{config.seed}" == seed
-        assert config.optim.learning_rate == 3e-3
+        assert method == "medium" or config.optim.learning_rate == 3e-3
         if method.startswith("recipe_"):
             assert config.seed in page.RECIPE_SEEDS
+            continue
+        if method in bases.BASES:
+            assert config.model.checkpoint == f"runs/where_it_pays/{cell.source}/base"
+            assert config.model.size == bases.BASES[method][0]
+            assert isinstance(config.peft, FullFineTuning) == (rank == ["full"])
             continue
         assert bool(config.plan) == (method not in ("lora", "lora_sp", "ada_lora", "eva"))
         named = config.peft.target_rank if method == "ada_lora" else config.peft.rank
@@ -140,8 +154,8 @@ def test_page(results, tmp_path, monkeypatch):
         own = ["70.0", "70.0", "–", "–"]
         shown = own if kind in sequence_page.SINGLE else ["50.0", "80.0", "+40.0", "+0.0"]
         assert numbers[f"| {label}"] == [*shown, "3 |"]
-    for kind in page.FORMS:
-        assert {names.form("pi0", kind, True, 0)} <= STUDY_NAMES
+    assert {names.form("pi0", kind, True, 0) for kind in page.FORMS} <= STUDY_NAMES
+    assert blocks["pi0 bases"].replace("\u00a0", " ").count("50.0 [") == 2 * 8
 
 
 def test_the_recipes_differ_in_one_thing():

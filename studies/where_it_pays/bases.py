@@ -1,0 +1,84 @@
+"""The main contrast on other bases: a second one of the same size, and one seven times as large."""
+
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from configs.pretrain import get_config
+from lorasp_jax.config import Config
+from lorasp_jax.extras.study import Cell
+from lorasp_jax.extras.study.study import Results
+from lorasp_jax.peft import AdaLoRA, FullFineTuning, LoRA, LoRASP, Method
+from studies.few.judge import judge
+from studies.where_it_pays import names
+from studies.where_it_pays.judge import best_rate
+
+BASES = {"second": ("small", 1, 12_000), "medium": ("medium", 0, 6_000)}
+"""Kind -> size, seed and steps of pretraining, else as in configs/pretrain.py."""
+SECOND: Mapping[str, Method] = {"lora": LoRA(rank=names.WIDE), "lora_sp": LoRASP(rank=names.WIDE)}
+"""Method -> its settings on the second base, at the rate on the first."""
+MEDIUM: Mapping[str, tuple[Method, tuple[float, ...]]] = {
+    "lora": (LoRA(rank=32), (3e-4, 1e-3)),
+    "lora_sp": (LoRASP(rank=32), (3e-4, 1e-3)),
+    "ada_lora": (AdaLoRA(rank=32, target_rank=8), (1e-3, 3e-3)),
+    "full": (FullFineTuning(), (1e-4, 3e-4)),
+}
+"""Method -> its settings on the medium base, of which LoRA's are a tenth, and rates of its pilots;
+the rows of the paper's Table I."""
+
+
+def cells(
+    backbone: str,
+    seeds: Sequence[int],
+    pool: int,
+    make: Callable[..., Config],
+    pilots: Mapping[str, Sequence[str]],
+    scale: str,
+) -> Iterator[Cell]:
+    """Yield the bases of a backbone and their policies; arguments as in `recipes.cells`."""
+    for kind, (size, seed, steps) in BASES.items():
+        base = get_config(scale)
+        if scale == "accelerator":
+            base = replace(base, optim=replace(base.optim, steps=steps))
+            base = replace(base, model=replace(base.model, size=size))
+        base = replace(base, model=replace(base.model, backbone=backbone), seed=seed)
+        yield Cell(names.base(backbone, kind), base, (), f"{backbone}/base_{kind}")
+    policy = functools.partial(_policy, backbone=backbone, pool=pool, make=make)
+    for method, settings in SECOND.items():
+        for seed in seeds:
+            yield policy("second", method, settings, f"s{seed}", seed, tuple(pilots[method]))
+    for method, (settings, rates) in MEDIUM.items():
+        tried = [names.on_base(backbone, "medium", method, f"pilot/{rate}") for rate in rates]
+        for rate in rates:
+            yield policy("medium", method, settings, f"pilot/{rate}", names.PILOT_SEED)
+        for seed in seeds:
+            yield policy("medium", method, settings, f"s{seed}", seed, tuple(tried))
+
+
+def _policy(
+    kind: str,
+    method: str,
+    settings: Method,
+    name: str,
+    seed: int,
+    pilots: tuple[str, ...] = (),
+    *,
+    backbone: str,
+    pool: int,
+    make: Callable[..., Config],
+) -> Cell:
+    """Return a policy on a base, at the rate of the best pilot, or in its name."""
+    source = names.base(backbone, kind)
+
+    def config(results: Results) -> Config:
+        rate = best_rate(results, pilots) if pilots else float(name.rpartition("/")[2])
+        found = make(settings, seed=seed, rate=rate)
+        where = str(Path("runs") / names.STUDY / source / "base")
+        size = BASES[kind][0] if found.scale == "accelerator" else found.model.size
+        return replace(found, model=replace(found.model, checkpoint=where, size=size))
+
+    own = names.on_base(backbone, kind, method, name)
+    options: dict[str, Any] = {"evaluate": judge, "source": source, "pool": pool}
+    return Cell(own, config, pilots, f"{backbone}/{kind}/{method}", **options)
