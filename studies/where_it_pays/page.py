@@ -1,6 +1,6 @@
 """The tables and the figure of README.md, from the results of all policies alone."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -141,10 +141,7 @@ def _form_table(results: Results, backbone: str) -> str:
                 [_formed(backbone, x, healed, seed) for seed in SEEDS] for x in (name, "whole")
             ]
             both = names.ran(results, *policies)
-            stacked = [outcomes(each, "recorded") for each in both] if both[0] else []
-            row += [page.percent(statistics.success(stacked[0]))] if stacked else [page.NONE]
-            paired = stacked and name != "whole"
-            row += [page.points(statistics.difference(*stacked))] if paired else [page.NONE]
+            row += _compared(both, "recorded", itself=name == "whole")
         if both[0]:
             size, count = f"{both[0][0]['bytes'] / 1e6:.1f} MB", len(both[0])
         rows.append([*row, size, str(count)])
@@ -167,10 +164,7 @@ def _base_table(results: Results, backbone: str) -> str:
             both = names.ran(results, *(_policies_on(backbone, kind, x) for x in (method, "lora")))
             row = [kind, label]
             for scene in SCENES:
-                stacked = [outcomes(found, scene) for found in both] if both[0] else []
-                row.append(page.percent(statistics.success(stacked[0])) if stacked else page.NONE)
-                paired = stacked and method != "lora"
-                row.append(page.points(statistics.difference(*stacked)) if paired else page.NONE)
+                row += _compared(both, scene, itself=method == "lora")
             rows.append([*row, str(len(both[0]))])
     heads = [f"{scene}{head}" for scene in SCENES.values() for head in ("", ", minus LoRA")]
     return page.table([f"{BACKBONES[backbone]}: base", "method", *heads, "seeds"], rows)
@@ -195,10 +189,7 @@ def _recipe_table(results: Results) -> str:
             ]
             both = names.ran(results, *policies)
             for scene in SCENES:
-                stacked = [outcomes(found, scene) for found in both] if both[0] else []
-                row.append(page.percent(statistics.success(stacked[0])) if stacked else page.NONE)
-                paired = stacked and name != "lora_sp"
-                row.append(page.points(statistics.difference(*stacked)) if paired else page.NONE)
+                row += _compared(both, scene, itself=name == "lora_sp")
         rows.append(row)
     heads = [
         f"{label}, {scene}{head}"
@@ -207,6 +198,17 @@ def _recipe_table(results: Results) -> str:
         for head in ("", ", minus LoRA-SP")
     ]
     return page.table(["pilots", *heads], rows)
+
+
+def _compared(
+    both: Sequence[Sequence[Mapping[str, Any]]], scene: str, *, itself: bool
+) -> list[str]:
+    """Return success of the first of two methods, and that minus the second's, unless `itself`."""
+    if not both[0]:
+        return [page.NONE, page.NONE]
+    stacked = [outcomes(found, scene) for found in both]
+    minus = page.NONE if itself else page.points(statistics.difference(*stacked))
+    return [page.percent(statistics.success(stacked[0])), minus]
 
 
 def _pair(
