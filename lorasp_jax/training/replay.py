@@ -1,5 +1,7 @@
 """Replay of what the base was taught, so that it is not forgotten."""
 
+import dataclasses
+
 from lorasp_jax.base import hub
 from lorasp_jax.config import Config
 from lorasp_jax.training import records
@@ -31,3 +33,8 @@ def replayed_tasks(config: Config) -> tuple[str, ...]:
     if not (others := tuple(task for task in taught["tasks"] if task not in config.tasks)):
         raise ValueError(f"{where} was taught no other tasks than this run's: drop data.replay")
     return others
+
+
+def with_replayed(config: Config) -> Config:
+    """Return the config of collecting a run's demonstrations: its tasks, then those to replay."""
+    return dataclasses.replace(config, tasks=(*config.tasks, *replayed_tasks(config)))

@@ -14,7 +14,7 @@ from lorasp_jax.models.noise_actor import PATH
 from lorasp_jax.training import dataset, export
 from lorasp_jax.training.demonstrations import Demonstrations
 from lorasp_jax.training.export import BASE, describe
-from lorasp_jax.training.replay import replayed_tasks
+from lorasp_jax.training.replay import with_replayed
 from lorasp_jax.training.run import Run
 
 C = TypeVar("C", bound=Config)
@@ -78,9 +78,7 @@ def with_data(
     if config.data.source:
         dataset.load(run, dataset.open_dataset(config, model, folder), free_bytes=0.0)
         return run
-    tasks = (*config.tasks, *replayed_tasks(config))
-    every = dataclasses.replace(config, tasks=tasks)
-    run.episodes = collect(every, folder, lambda *_: None)
+    run.episodes = collect(with_replayed(config), folder, lambda *_: None)
     return run
 
 

@@ -11,8 +11,9 @@ import lorasp_jax
 from lorasp_jax.config import Config
 from lorasp_jax.peft import AdaLoRA
 from lorasp_jax.training import loop, rules, start
-from lorasp_jax.training.demonstrations import demonstrations
+from lorasp_jax.training.demonstrations import are_cached, demonstrations
 from lorasp_jax.training.finished_run import recorded_config
+from lorasp_jax.training.replay import with_replayed
 from lorasp_jax.training.run import Run
 from lorasp_jax.training.run_folder import CONFIG_FILE, read_json
 from lorasp_jax.training.step import Objective
@@ -29,7 +30,7 @@ def check(run: Path) -> Config:
 
     Raises:
         ValueError: it is not finished, has learned something other than its data, has adapters that
-            cannot train on, or its demonstrations are gone; see also `start.with_kept`.
+            cannot train on, or some of its demonstrations are gone; see also `start.with_kept`.
     """
     config, recorded = recorded_config(run, simulated=False), read_json(run / CONFIG_FILE)
     reasons = {
@@ -40,7 +41,9 @@ def check(run: Path) -> Config:
         "ada_lora has spent its rank budget": any(
             isinstance(method, AdaLoRA) for method in rules.methods(config)
         ),
-        "its demonstrations are gone": not (config.data.source or (run / "cache").is_dir()),
+        "some of its demonstrations are gone": not (
+            config.data.source or are_cached(with_replayed(config), run)
+        ),
     }
     if reason := next((text for text, applies in reasons.items() if applies), ""):
         raise ValueError(f"{run} cannot be healed: {reason}")

@@ -16,7 +16,7 @@ from lorasp_jax.extras.deployment import healing, measurement, variants
 from lorasp_jax.extras.serving import loading
 from lorasp_jax.extras.study import held_out
 from lorasp_jax.models.smolvla import SmolVLAConfig
-from lorasp_jax.training import export
+from lorasp_jax.training import demonstrations, export
 from lorasp_jax.training.finished_run import recorded_config
 from lorasp_jax.training.run_folder import read_json, to_json, write_json
 from tests.cases import mostly_slow
@@ -124,9 +124,23 @@ def test_a_run_of_a_dataset_is_healed_on_it(run, tmp_path):
         healing.heal(whole, changed, 12)
 
 
+def test_missing_demonstrations_are_not_collected(run, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(demonstrations, "_collect", lambda *_: OWN["press"])
+    changed, results = shutil.copytree(run, tmp_path / "run"), read_json(run / "results.json")
+    tasks = dict.fromkeys(("press", "pour"), results["tasks"]["press"])
+    write_json(changed / "results.json", results | {"tasks": tasks})
+    files, out = {path: path.stat().st_mtime_ns for path in changed.rglob("*")}, tmp_path / "policy"
+    error = refuse(capsys, changed, "--save", "half-bf16", "--out", out, "--heal", 1)
+    assert "run cannot be healed: some of its demonstrations are gone" in error
+    with pytest.raises(ValueError, match="some of its demonstrations are gone"):
+        healing.heal(export.load_policy(run), changed, 1)
+    assert {path: path.stat().st_mtime_ns for path in changed.rglob("*")} == files
+    assert not out.exists()
+
+
 def test_demonstrations_must_be_those_of_the_policy(run, tmp_path):
     cell = shutil.copytree(run, tmp_path / "cell", ignore=shutil.ignore_patterns("cache"))
-    with pytest.raises(ValueError, match="cell cannot be healed: its demonstrations are gone"):
+    with pytest.raises(ValueError, match="cell cannot be healed: some of its demonstrations are"):
         healing.check(cell)
     other = dataclasses.replace(OWN["press"], instructions=("press", "push"))
     other.save(cell / "cache/press.npz")
