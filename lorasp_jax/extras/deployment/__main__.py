@@ -22,7 +22,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=program,
         description="Compare forms in which a LoRA-SP run can be deployed, or save one of them.",
-        epilog="variants: whole, pruned, half or merged, then -bf16, -int8 or -nf4, such as "
+        epilog="variants: whole, pruned, half, lora or merged, then -bf16, -int8 or -nf4, such as "
         "half-int8. See docs/deployment.md.",
     )
     add = parser.add_argument

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import statistics as medians
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,20 +27,23 @@ CALLS = 20
 """Number of timed calls."""
 
 
-def cells(run: Path, episodes: int = 0, prefix: str = "") -> tuple[Derived, ...]:
-    """Return a cell for each variant of a run, `WHOLE` first, evaluated on the same layouts.
+def cells(
+    run: Path, episodes: int = 0, prefix: str = "", names: Sequence[str] = VARIANTS
+) -> tuple[Derived, ...]:
+    """Return a cell for each variant of a run, evaluated on the same layouts.
 
     Args:
         run: folder of a finished LoRA-SP run.
         episodes: episodes per task; 0: as many as in the run's evaluation.
         prefix: what the names of the cells begin with, before those of the variants.
+        names: of the variants.
     """
     config = functools.partial(evaluated, episodes=episodes)
 
     def transform(name: str) -> Any:
         return lambda policy, _, held: variants.transform(name, policy, held)
 
-    return tuple(Derived(prefix + n, run, transform(n), config=config) for n in VARIANTS)
+    return tuple(Derived(prefix + n, run, transform(n), config=config) for n in names)
 
 
 def measure(run: Run, _: Demonstrations, __: lorasp_jax.policies.Policy | None) -> dict[str, Any]:

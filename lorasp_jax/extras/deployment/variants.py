@@ -47,10 +47,11 @@ FORMS: dict[str, Callable[[nnx.Module, Batches], nnx.Module]] = {
     "whole": _whole,
     "pruned": _pruned,
     "half": _half,
+    "lora": _distilled,
     "merged": _distilled,
 }
 """Forms by name: as trained; pruned to the directions in use on calibration data, and those more
-that a kernel needs; pruned to the most used half of the bank; distilled to LoRA, then merged."""
+that a kernel needs; pruned to the most used half of the bank; distilled to LoRA; and merged."""
 BASES: dict[str, Literal["int8", "nf4"] | None] = {"bf16": None, "int8": "int8", "nf4": "nf4"}
 """How the base is stored."""
 

@@ -1,6 +1,7 @@
 """Test variants, their table and the command on a run with a tiny backbone, without simulation."""
 
 import dataclasses
+import itertools
 import shutil
 from typing import Any, cast
 
@@ -18,6 +19,9 @@ from lorasp_jax.extras.deployment.measurement import call_milliseconds
 from lorasp_jax.extras.serving import loading
 from lorasp_jax.extras.study import held_out, results, run_cell
 from lorasp_jax.peft import LoRA
+from lorasp_jax.policies.policy import Policy
+from lorasp_jax.policies.prompt_table import PromptTable
+from lorasp_jax.policies.tokenizer import Offline
 from lorasp_jax.training import export
 from lorasp_jax.training.run_folder import to_json, write_json
 from tests.cases import mostly_slow
@@ -29,17 +33,25 @@ HELD_OUT = random_episodes("press", 0)
 EPISODES = {"press": HELD_OUT}
 
 
-def finished_run(folder, base, method=CONFIG.peft):
+def finished_run(folder, base, method=CONFIG.peft, instructions=None):
+    """Write a run without its data, with instructions by task if they are given."""
+    tasks = tuple(instructions or ("press",))
     options = dataclasses.replace(CONFIG.model, checkpoint=str(base))
-    settings = {"peft": method, "tasks": ("press",), "targets": ("action/blocks/q_proj",)}
+    settings = {"peft": method, "tasks": tasks, "targets": ("action/blocks/q_proj",)}
     evaluation = dataclasses.replace(CONFIG.evaluation, denoise_steps=STEPS)
     config = dataclasses.replace(CONFIG, model=options, evaluation=evaluation, **settings)
     run = make_run(folder, config, models.load(base))
-    run.policy = dataclasses.replace(run.policy, model=add_noise(run.policy.model, 0.1))
+    processor = run.policy.processor
+    if instructions:
+        phrases, model = itertools.chain(*instructions.values()), run.policy.model.config
+        prompts = PromptTable.of(Offline(), [*phrases], model, num_joints=6)
+        processor = dataclasses.replace(processor, prompts=prompts)
+    run.policy = Policy(add_noise(run.policy.model, 0.1), processor)
     run.base_hash = models.weights_hash(base)
     export.write(run)
     write_json(folder / "config.json", to_json(config))
-    write_json(folder / "results.json", RESULTS)
+    results_by_task = dict.fromkeys(tasks, RESULTS["tasks"]["press"])
+    write_json(folder / "results.json", RESULTS | {"tasks": results_by_task})
     return folder
 
 
@@ -62,9 +74,10 @@ def episodes(monkeypatch):
     outcomes = iter(["1101", "1001"] * 6)
 
     def play(_, run):
-        """Stand in for an evaluation, in episodes of one task."""
+        """Stand in for an evaluation."""
         after = {"success": 0.5, "episodes": 4, "ci95": [0, 1], "outcomes": next(outcomes)}
-        write_json(run.folder / "results.json", RESULTS | {"tasks": {"press": {"after": after}}})
+        tasks = {task: {"after": after} for task in run.config.tasks}
+        write_json(run.folder / "results.json", RESULTS | {"tasks": tasks})
 
     monkeypatch.setattr(run_cell.Evaluation, "on_end", play)
 
@@ -124,23 +137,28 @@ def test_forms(run):
         for form in forms
     }
     assert (ranks["whole"], ranks["half"], ranks["merged"]) == ({RANK}, {RANK // 2}, set())
+    assert ranks["lora"] == {RANK}
     assert max(ranks["pruned"]) <= RANK
     assert {leaf.dtype for leaf in jax.tree.leaves(forms["merged"].model)} == {
         jnp.dtype("bfloat16")
     }
     np.testing.assert_allclose(actions(forms["whole"]), actions(policy), atol=1e-2)
+    np.testing.assert_allclose(actions(forms["lora"]), actions(forms["merged"]), atol=1e-2)
     assert not quantization.is_quantized(forms["whole"].model)
     sizes = {
         (form, base): measurement.weight_bytes(variants.on_base(forms[form], base))
         for form in forms
         for base in variants.BASES
     }
-    assert sizes["merged", "bf16"] < sizes["half", "bf16"] < sizes["whole", "bf16"]
+    ordered = [sizes[form, "bf16"] for form in ("merged", "lora", "whole")]
+    assert ordered == sorted({*ordered})
+    assert sizes["half", "bf16"] < sizes["whole", "bf16"]
     assert sizes["whole", "nf4"] < sizes["whole", "int8"] < sizes["whole", "bf16"]
 
 
 @pytest.mark.parametrize(
-    "name", mostly_slow(["half-nf4", "half-int8", "merged-bf16", "merged-nf4"], ["half-nf4"])
+    "name",
+    mostly_slow(["half-nf4", "half-int8", "lora-int8", "merged-bf16", "merged-nf4"], ["half-nf4"]),
 )
 def test_a_saved_variant_is_served(run, tmp_path, capsys, name):
     out = tmp_path / "policy"
