@@ -103,6 +103,13 @@ class PromptTable:
             raise ValueError(f"the policy has no prompt for {missing[0]!r}")
         return np.array([self.instructions.index(text) for text in instructions], np.int32)
 
+    def only(self, instructions: Sequence[str]) -> "PromptTable":
+        """Return the table of some of its instructions; errors are those of `rows`."""
+        count = len(self.instructions)
+        rows = self.rows(instructions) + count * np.arange(len(self.endings))[:, None]
+        start = Ids(*(jnp.asarray(array)[rows.reshape(-1)] for array in self.start))
+        return dataclasses.replace(self, start=start, instructions=tuple(instructions))
+
     def shared(self) -> "PromptTable":
         """Drop the instructions and repeat rows up to a multiple of `SHARED_ROWS`.
 

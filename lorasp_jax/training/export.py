@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -64,14 +64,21 @@ def write(run: Run) -> None:
 
 
 def write_variant(
-    folder: Path, policy: Policy, source: Path, *, quantized: Kind | None = None
+    folder: Path,
+    policy: Policy,
+    source: Path,
+    *,
+    tasks: Sequence[str] = (),
+    quantized: Kind | None = None,
 ) -> None:
     """Write a policy made from a run's, with frozen weights in bf16, for `load_policy`.
 
     Args:
         folder: folder to create.
-        policy: a policy with adapters, or one without, whose base is then written as well.
+        policy: a policy with adapters, or one without, whose base is then written as well. It may
+            have only some of the run's instructions.
         source: folder of the run.
+        tasks: what the policy is for; (): the run's tasks.
         quantized: how to quantize the base whenever the policy is loaded.
 
     Raises:
@@ -82,8 +89,14 @@ def write_variant(
             f"the policy of {source} has learned its initial noise: it has no variants"
         )
     metadata = describe(source)
-    fields = metadata["policy"] | {"config": dataclasses.asdict(policy.model.config)}
+    prompts = policy.processor.prompts
+    fields = metadata["policy"] | {
+        "config": dataclasses.asdict(policy.model.config),
+        "prompts": _prompts_digest(prompts),
+        "instructions": list(prompts.instructions),
+    }
     metadata |= {"policy": fields, QUANTIZED: quantized, STEPS: denoise_steps(source)}
+    metadata |= {"tasks": list(tasks)} if tasks else {}
     if adaptation.methods(policy.model):
         base = native.read_description(source)["base"]
         native.save_adapters(folder, policy.model, base=base, metadata=metadata)

@@ -1,6 +1,7 @@
 """Compare prompts assembled from a table with those of the tokenizers."""
 
 import dataclasses
+import functools
 import json
 
 import jax
@@ -34,6 +35,14 @@ def test_rows_of_instructions():
     assert table.rows(TEXTS[:1] * 2).tolist() == [0, 0]
     with pytest.raises(ValueError, match="'close the lid'"):
         table.rows([TEXTS[0], "close the lid"])
+
+
+def test_some_instructions_have_the_table_that_they_would_have_alone(few_bins):
+    of = functools.partial(PromptTable.of, tokenizer.Offline(), num_joints=1)
+    for config in (Pi0Config.nano(), PI05):
+        some, alone = of(instructions=TEXTS, config=config).only(TEXTS[1:]), of(TEXTS[1:], config)
+        assert some.instructions == alone.instructions
+        jax.tree.map(np.testing.assert_array_equal, some, alone)
 
 
 @pytest.mark.parametrize(
@@ -117,5 +126,7 @@ def test_endings_follow_every_instruction_and_must_fit():
     asked = table.with_instructions(Letters(), ["put"])
     assert "".join(map(chr, np.asarray(asked.start.ids[0])[:4])) == "put+"
     assert asked.endings == ("+",)  # a row for each
+    said = ["".join(map(chr, row[row > 0])) for row in np.asarray(table.only(["go"]).start.ids)]
+    assert (said, table.only(["go"]).instructions) == (["go+", "go-", "go"], ("go",))
     with pytest.raises(ValueError, match=r"'release' leaves no room for '[+]' in 6 tokens"):
         PromptTable.of(Letters(), ["release"], config, num_joints=6, endings=("+", "-", ""))

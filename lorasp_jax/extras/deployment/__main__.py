@@ -30,6 +30,8 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--variants", nargs="+", default=[], metavar="VARIANT", help="default: all")
     text = "episodes per task (default: as in the run's evaluation)"
     add("--episodes", type=int, default=0, metavar="N", help=text)
+    text = "calibrate, heal and measure on this task of the run alone (default: all its tasks)"
+    add("--task", default="", metavar="NAME", help=text)
     add("--save", default="", metavar="VARIANT", help="write this variant instead of measuring")
     add("--out", type=Path, metavar="DIR", help="folder to write, which the policy server serves")
     text = "train the form on for this many steps, on the run's data, before it is written"
@@ -48,21 +50,23 @@ def _run(options: argparse.Namespace) -> None:
         raise ValueError("--heal changes what --save writes: add --save and --out")
     if options.heal is not None and options.heal < 1:
         raise ValueError(f"--heal must be at least 1 step, got {options.heal}")
-    variants.check_run(options.run)
+    variants.check_run(options.run, options.task)
     if options.save:
-        variants.save(options.run, options.save, options.out, options.heal or 0)
+        settings = {"heal": options.heal or 0, "task": options.task}
+        variants.save(options.run, options.save, options.out, **settings)
         print(f"written: {options.out}")
         return
     from lorasp_jax.extras.study import Study
     from lorasp_jax.extras.study.workers import run_here
 
     chosen = dict.fromkeys((variants.WHOLE, *map(variants.check, options.variants)))
-    cells = measurement.cells(options.run, options.episodes)
+    tasks, prefix = ((options.task,), f"{options.task}/") if options.task else ((), "")
+    cells = measurement.cells(options.run, options.episodes, prefix, tasks)
     study = Study("deployment", cells, measure=measurement.measure)
-    names = chosen if options.variants else variants.VARIANTS
+    names = [prefix + name for name in (chosen if options.variants else variants.VARIANTS)]
     say = functools.partial(print, file=sys.stderr)
     results = run_here(study, options.run / study.name, names, say)
-    print(measurement.table(results), end="")
+    print(measurement.table(results, prefix), end="")
 
 
 if __name__ == "__main__":

@@ -25,14 +25,18 @@ WARMUP = 0.1
 """Largest share of the steps in which the learning rate rises; the optimizer starts anew."""
 
 
-def check(run: Path) -> Config:
-    """Return the config of a finished run that can be healed.
+def check(run: Path, task: str = "") -> Config:
+    """Return the config of a finished run that can be healed, with that task alone if it is given.
 
     Raises:
         ValueError: it is not finished, has learned something other than its data, has adapters that
-            cannot train on, or some of its demonstrations are gone; see also `start.with_kept`.
+            cannot train on, some of its demonstrations are gone, or recordings would have to be
+            limited to a task; see also `start.with_kept`.
     """
     config, recorded = recorded_config(run, simulated=False), read_json(run / CONFIG_FILE)
+    if task:
+        data = dataclasses.replace(config.data, replay=0.0)
+        config = dataclasses.replace(config, tasks=(task,), data=data)
     reasons = {
         "it has learned from its own success, not from data": "online" in recorded,
         "it is distilled to few flow steps, which its data do not teach": "distill" in recorded,
@@ -44,21 +48,27 @@ def check(run: Path) -> Config:
         "some of its demonstrations are gone": not (
             config.data.source or are_cached(with_replayed(config), run)
         ),
+        f"it has learned from recordings, which cannot be limited to {task}": bool(
+            task and config.data.source
+        ),
     }
     if reason := next((text for text, applies in reasons.items() if applies), ""):
         raise ValueError(f"{run} cannot be healed: {reason}")
     return start.with_kept(config, run, config, (), ())
 
 
-def heal(policy: lorasp_jax.policies.Policy, run: Path, steps: int) -> lorasp_jax.policies.Policy:
+def heal(
+    policy: lorasp_jax.policies.Policy, run: Path, steps: int, task: str = ""
+) -> lorasp_jax.policies.Policy:
     """Return a policy whose adapters have trained on with the data of a finished run.
 
-    For the arguments see `train_on`; `run` is the run's folder.
+    For the arguments see `train_on`; `run` is the run's folder. With a `task`, its demonstrations
+    alone are the data, and its instructions must be the policy's only ones.
 
     Raises:
         ValueError: see `check` and `loop.train`; or the data are gone or have other instructions.
     """
-    config = check(run)
+    config = check(run, task)
     data = start.with_data(config, run, policy.model.config, demonstrations)
     if not data.recordings:
         spoken = [phrase for group in data.episodes.values() for phrase in group.instructions]

@@ -28,7 +28,11 @@ CALLS = 20
 
 
 def cells(
-    run: Path, episodes: int = 0, prefix: str = "", names: Sequence[str] = VARIANTS
+    run: Path,
+    episodes: int = 0,
+    prefix: str = "",
+    tasks: tuple[str, ...] = (),
+    names: Sequence[str] = VARIANTS,
 ) -> tuple[Derived, ...]:
     """Return a cell for each variant of a run, evaluated on the same layouts.
 
@@ -36,9 +40,10 @@ def cells(
         run: folder of a finished LoRA-SP run.
         episodes: episodes per task; 0: as many as in the run's evaluation.
         prefix: what the names of the cells begin with, before those of the variants.
+        tasks: of the run on which to calibrate and evaluate; (): all.
         names: of the variants.
     """
-    config = functools.partial(evaluated, episodes=episodes)
+    config = functools.partial(evaluated, tasks=tasks, episodes=episodes)
 
     def transform(name: str) -> Any:
         return lambda policy, _, held: variants.transform(name, policy, held)

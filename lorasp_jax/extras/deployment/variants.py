@@ -117,24 +117,28 @@ def on_base(policy: lorasp_jax.policies.Policy, base: str) -> lorasp_jax.policie
     return dataclasses.replace(policy, model=quantized(policy.model, BASES[base]))
 
 
-def check_run(run: Path) -> None:
+def check_run(run: Path, task: str = "") -> None:
     """Raise ValueError unless a run is finished, can be simulated, and has LoRA-SP layers.
 
-    A run that has learned its noise is refused, too: other weights need other noise.
+    A run that has learned its noise is refused, too: other weights need other noise; and so is a
+    `task`, if given, that is none of its own.
     """
     config = recorded_config(run)
     start.refuse_actor(run, "make variants of the run that it started from")
     if not any(map(is_bank, rules.methods(config))):
         name = rules.describe(config)
         raise ValueError(f"{run} was trained with {name}: only LoRA-SP runs have variants")
+    if task and task not in config.tasks:
+        raise ValueError(f"{run} has no task {task!r}: choose one of {', '.join(config.tasks)}")
 
 
-def save(run: Path, name: str, out: Path, heal: int = 0) -> None:
+def save(run: Path, name: str, out: Path, heal: int = 0, task: str = "") -> None:
     """Make one variant of a run and write it to a new folder.
 
     The folder has the adapters and refers to the run's base, or has the merged weights. A base in
     int8 or nf4 is quantized whenever the folder is loaded. `heal` is the number of steps by which
-    the adapters of the form train on, see `healing.heal`.
+    the adapters of the form train on, see `healing.heal`. With a `task` of the run, that task's
+    demonstrations alone calibrate and heal the form, which then has its instructions alone.
 
     Raises:
         ValueError: the variant is unknown, the folder exists, or the run cannot be healed.
@@ -144,11 +148,23 @@ def save(run: Path, name: str, out: Path, heal: int = 0) -> None:
     if out.exists():
         raise ValueError(f"{out} exists already: choose another --out")
     if heal:
-        healing.check(run)
+        healing.check(run, task)
     cache.enable()
-    policy = export.load_policy(run)
+    policy, config, tasks = export.load_policy(run), recorded_config(run), (task,) if task else ()
+    config = dataclasses.replace(config, tasks=tasks or config.tasks)
     # Those on which `measurement` calibrates.
-    episodes = held_out_demonstrations(run / "deployment", recorded_config(run))
-    train = functools.partial(healing.heal, run=run, steps=heal) if heal else None
+    episodes = held_out_demonstrations(run / "deployment", config)
+    if task:
+        policy = _with_instructions(policy, episodes[task].instructions)
+    train = functools.partial(healing.heal, run=run, steps=heal, task=task) if heal else None
     deployed = in_form(policy, form, episodes, train)
-    export.write_variant(out, deployed, run, quantized=BASES[base])
+    export.write_variant(out, deployed, run, tasks=tasks, quantized=BASES[base])
+
+
+def _with_instructions(
+    policy: lorasp_jax.policies.Policy, instructions: Sequence[str]
+) -> lorasp_jax.policies.Policy:
+    """Return the policy with only some of its instructions."""
+    prompts = policy.processor.prompts.only(instructions)
+    processor = dataclasses.replace(policy.processor, prompts=prompts)
+    return dataclasses.replace(policy, processor=processor)

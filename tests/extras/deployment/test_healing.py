@@ -89,9 +89,9 @@ def test_the_optimizer_is_the_runs_but_slower(run):
 def test_a_healed_variant_is_saved_and_served(run, tmp_path, capsys, monkeypatch, name):
     made, out, (form, base) = [], tmp_path / "policy", name.split("-")
 
-    def write(folder, policy, source, *, quantized):
+    def write(folder, policy, source, **options):
         made.append(policy)
-        export_variant(folder, policy, source, quantized=quantized)
+        export_variant(folder, policy, source, **options)
 
     export_variant = export.write_variant
     monkeypatch.setattr(export, "write_variant", write)
