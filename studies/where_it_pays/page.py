@@ -22,6 +22,8 @@ BUDGETS = (8, 16, 32)
 """Mean ranks of plans and their rivals."""
 PARAMETERS = (0.3, 1, 3, 10)
 """Ticks of the figure [M]."""
+HALF = "lora_sp_half"
+"""LoRA-SP that learns the first half of the tasks."""
 BASE_ROWS = {
     "first": {"lora": "LoRA, r = 64", "lora_sp": "LoRA-SP, R = 64"},
     "second": {"lora": "LoRA, r = 64", "lora_sp": "LoRA-SP, R = 64"},
@@ -36,6 +38,8 @@ BASE_ROWS = {
 ALLOCATED = {
     "planned": "ranks in proportion to LoRA-SP's active ranks",
     "other_seed": "the same, of another seed",
+    "other_tasks": "the same, of a policy that learned two of the tasks",
+    "other_backbone": "the same, of the other backbone, by kind of layer",
     "shuffled": "the same, shuffled over layers of one size",
     "eva": "one rank, EVA's initialization",
     "ada_lora": "AdaLoRA",

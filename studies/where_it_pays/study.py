@@ -36,6 +36,7 @@ MAKE: Mapping[str, Callable[[int], Method]] = {
     "lora": lambda rank: LoRA(rank=rank),
     "lora_sp": lambda rank: LoRASP(rank=rank),
     "ada_lora": lambda rank: AdaLoRA(rank=names.WIDE, target_rank=rank),
+    page.HALF: lambda rank: LoRASP(rank=rank),
     "eva": lambda rank: LoRA(rank=rank, initialization="eva"),
 }
 """Method by its (mean) rank."""
@@ -78,26 +79,36 @@ _SMOKE = Scale(
 def get_study(scale: str) -> Study:
     """Return the study; scale smoke only shows that all of it runs."""
     chosen = {"accelerator": _ACCELERATOR, "smoke": _SMOKE}[scale]
-    cells = [cell for backbone in page.BACKBONES for cell in _cells(chosen, backbone)]
+    cells = [
+        cell
+        for part in (_ranked, _started)
+        for backbone in page.BACKBONES
+        for cell in part(chosen, backbone)
+    ]
     return Study(names.STUDY, tuple(cells), page=page.blocks, partial=True)
 
 
-def _cells(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
-    """Yield all policies of a backbone: the pilots, then seed by seed."""
+def _ranked(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
+    """Yield the pilots of a backbone, then LoRA and LoRA-SP of every rank, seed by seed."""
     pilot = functools.partial(judge_scenes, scenes=("recorded",))
-    for method, rank in _ranked(scale):
+    cases = [(method, rank) for rank in scale.ranks for method in names.METHODS]
+    for method, rank in cases:
         for name in _pilots(backbone, method, rank):
             rate = float(name.rpartition("/")[2])
             config = _config(scale, backbone, MAKE[method](rank), names.PILOT_SEED, rate)
             group = f"{backbone}/{method}_r{rank}"
             yield Cell(name, config, (), group, evaluate=pilot, pool=scale.pool)
+    for seed in scale.seeds:
+        for method, rank in cases:
+            yield _cell(scale, backbone, method, rank, seed)
+
+
+def _started(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
+    """Yield what comes after the policies of every rank."""
     make = functools.partial(_config, scale, backbone)
     pilots = {method: _pilots(backbone, method, names.WIDE) for method in names.METHODS}
     for seed in page.RECIPE_SEEDS[: len(scale.seeds)]:
         yield from recipes.cells(backbone, seed, scale.pool, make, pilots)
-    for seed in scale.seeds:
-        for method, rank in _ranked(scale):
-            yield _cell(scale, backbone, method, rank, seed)
     for seed in scale.seeds:
         yield from _allocated(scale, backbone, seed)
         yield from forms.cells(backbone, seed, scale.pool, scale.heal)
@@ -105,17 +116,16 @@ def _cells(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
     yield from bases.cells(backbone, scale.seeds, scale.pool, make, pilots, scale.config.scale)
 
 
-def _ranked(scale: Scale) -> Iterator[tuple[str, int]]:
-    for rank in scale.ranks:
-        for method in names.METHODS:
-            yield method, rank
-
-
 def _allocated(scale: Scale, backbone: str, seed: int) -> Iterator[Cell | Derived]:
     """Yield the policies of a seed whose layers differ in rank, and their rivals."""
     own = names.cell(backbone, "lora_sp", names.WIDE, seed)
     following = scale.seeds[(scale.seeds.index(seed) + 1) % len(scale.seeds)]
     other = names.cell(backbone, "lora_sp", names.WIDE, following)
+    yield (half := _cell(scale, backbone, page.HALF, names.WIDE, seed))
+    (twin,) = (x for x in page.BACKBONES if x != backbone)
+    twin = names.cell(twin, "lora_sp", names.WIDE, seed)
+    for kind, source in (("other_backbone", twin), ("other_tasks", half.name)):
+        yield _cell(scale, backbone, kind, scale.budgets[0], seed, source)
     for rank in scale.budgets:
         for kind, source in (("planned", own), ("shuffled", own), ("other_seed", other)):
             yield _cell(scale, backbone, kind, rank, seed, source)
@@ -134,12 +144,14 @@ def _allocated(scale: Scale, backbone: str, seed: int) -> Iterator[Cell | Derive
 
 def _cell(scale: Scale, backbone: str, method: str, rank: int, seed: int, source: str = "") -> Cell:
     """Return a policy; the active ranks of `source` decide the ranks of its layers, if given."""
-    tuned = method if method in names.METHODS else "lora"
+    tuned = {page.HALF: "lora_sp"}.get(method, method if method in names.METHODS else "lora")
     pilots = _pilots(backbone, tuned, rank)
 
     def config(results: Results) -> Config:
         made = MAKE.get(method, MAKE["lora"])(rank)
         found = _config(scale, backbone, made, seed, best_rate(results, pilots))
+        if method == page.HALF:
+            return replace(found, tasks=found.tasks[: len(found.tasks) // 2])
         if not source:
             return found
         active = results[source]["layer_active_rank"]
@@ -162,9 +174,11 @@ def make_plan(
     """Return ranks by layer, with as many parameters as `rank` in every layer.
 
     Args:
-        kind: "planned" and "other_seed" are in proportion to the active ranks, "shuffled" permutes
-            them among layers of one size. "dropped" gives the kinds of layers with the lowest
-            active rank no adapter, until half of the parameters are left, "dropped_random" others.
+        kind: "planned" and "other_..." are in proportion to the active ranks, of which a layer has
+            the mean over layers of its kind if they are those of another backbone; "shuffled"
+            permutes them among layers of one size. "dropped" gives the kinds of layers with the
+            lowest active rank no adapter, until half of the parameters are left, "dropped_random"
+            others.
         backbone: name.
         scale: whose model has the layers.
         active: mean active ranks by tower and layer, as in results.json.
@@ -172,13 +186,27 @@ def make_plan(
         seed: of "shuffled" and "dropped_random".
     """
     shapes = _shapes(backbone, scale.config.model.size, scale.config.targets)
-    ranks = {path: tuple(active[rules.tower(path)][rules.short_name(path)]) for path in shapes}
+    if kind == "other_backbone":
+        ranks = {
+            path: (_of_kind(active, path),) * layers for path, (layers, _, _) in shapes.items()
+        }
+    else:
+        ranks = {path: tuple(active[rules.tower(path)][rules.short_name(path)]) for path in shapes}
     if kind.startswith("dropped"):
         return plan.RankPlan(backbone, _without_half(kind, shapes, ranks, rank, seed), rule=kind)
     budget = rank * sum(layers * (d_in + d_out) for layers, d_in, d_out in shapes.values())
     found = plan.allocate(ranks, shapes, budget, most=names.WIDE)
     made = plan.RankPlan(backbone, found, rule=kind, budget=budget)
     return plan.shuffled(made, shapes, jax.random.key(seed)) if kind == "shuffled" else made
+
+
+def _of_kind(active: Mapping[str, Mapping[str, list[float]]], path: str) -> float:
+    """Return the mean active rank of another backbone's layers of the kind and tower of a layer."""
+    kind = path.rpartition("/")[2]
+    stacks = active[rules.tower(path)].items()
+    return float(
+        np.mean([x for name, ranks in stacks if name.rpartition("/")[2] == kind for x in ranks])
+    )
 
 
 def _without_half(

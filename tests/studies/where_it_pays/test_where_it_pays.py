@@ -104,7 +104,8 @@ def test_policies_differ_in_what_their_names_say(results):
             assert config.model.size == bases.BASES[method][0]
             assert isinstance(config.peft, FullFineTuning) == (rank == ["full"])
             continue
-        assert bool(config.plan) == (method not in ("lora", "lora_sp", "ada_lora", "eva"))
+        assert bool(config.plan) == (method not in (*study.MAKE, page.HALF))
+        assert len(config.tasks) == (2 if method == page.HALF else 4)
         named = config.peft.target_rank if method == "ada_lora" else config.peft.rank
         assert [f"r{named}"] == rank
 
@@ -128,6 +129,11 @@ def test_plans_have_the_parameters_of_one_rank(backbone):
         dropped, left = parameters(kind)
         assert whole / 2 <= left < 0.6 * whole
         assert {*dropped.ranks} == {*shapes}
+    other = {"pi0": "smolvla", "smolvla": "pi0"}[backbone]
+    borrowed = study.make_plan("other_backbone", backbone, SCALE, active(other), 8, 0)
+    used = sum(sizes[path] * sum(ranks) for path, ranks in borrowed.ranks.items())
+    assert 0 <= whole - used < max(sizes.values())
+    assert all(max(ranks) - min(ranks) <= 1 for ranks in borrowed.ranks.values())
     low = [path for path, ranks in parameters("dropped")[0].ranks.items() if not any(ranks)]
     means = {
         path: np.mean(active(backbone)[rules.tower(path)][rules.short_name(path)])
