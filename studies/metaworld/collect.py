@@ -74,7 +74,7 @@ def _parser() -> argparse.ArgumentParser:
     add("out", type=Path, help="folder to create")
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--tasks", nargs="+", choices=INSTRUCTIONS, metavar="TASK")
-    text = "all fifty tasks, the 45 or the 5 of ML45 (default: %(default)s)"
+    text = "all fifty tasks, the 45 or the 5 of ML45, or a smaller set (default: %(default)s)"
     which.add_argument("--set", choices=SETS, default="mt50", help=text)
     add("--episodes", type=int, default=50, metavar="N", help="successful episodes per task")
     add("--processes", type=int, default=2, metavar="N")

@@ -1,6 +1,7 @@
 """The tables of README.md, from the results of all policies alone."""
 
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,7 @@ import numpy as np
 from lorasp_jax.extras.study import page, statistics
 from lorasp_jax.extras.study.page import BACKBONES, NONE
 from lorasp_jax.extras.study.study import Results
-from studies.metaworld.tasks import GROUPS, HELD_OUT
+from studies.metaworld.tasks import FIRST, GROUPS, HELD_OUT, SETS
 
 LABELS = {
     "lora_sp": "LoRA-SP, R = 64",
@@ -17,20 +18,38 @@ LABELS = {
     "ada_lora": "AdaLoRA, 64 cut to a mean of 16",
     "full": "full fine-tuning",
 }
+GROWING = ("lora_r16", "lora_r64", "lora_sp")
+"""Methods that learn sets of every size, LoRA-SP and the LoRA of its size last."""
+RANKS = {
+    rank: (f"lora_r{rank}", "lora_sp" if rank == 64 else f"lora_sp_r{rank}")
+    for rank in (4, 8, 16, 32, 64, 128)
+}
+"""R -> LoRA and LoRA-SP."""
+SEEDS = (0, 1, 2)
+SIZES = (*(f"first{size}" for size in FIRST), "mt50")
+"""Sets of tasks that contain each other."""
 COLUMNS: Mapping[str, Mapping[str, Sequence[str]]] = {
     "mt50": {name: tuple(members) for name, members in GROUPS.items()},
     "ml5": {task: (task,) for task in HELD_OUT},
 }
 """Stage -> column of its table -> the tasks that it averages."""
+Case = tuple[Sequence[str], str]
+"""Stages that together have all tasks, and a method."""
 Seeds = Sequence[Mapping[str, Any]]
 """Results of one method, by seed."""
 
 
 def blocks(results: Results) -> dict[str, str]:
-    """Return the tables of both stages by name."""
+    """Return all tables by name, with a dash for what has not run."""
+    tables: dict[str, Callable[[Results, str], str]] = {
+        **{stage: functools.partial(_table, stage=stage) for stage in COLUMNS},
+        "sizes": _size_table,
+        "shared": _shared_table,
+        "ranks": _rank_table,
+    }
     return {
-        stage: "\n".join(_table(results, backbone, stage) for backbone in BACKBONES)
-        for stage in COLUMNS
+        name: "\n".join(table(results, backbone) for backbone in BACKBONES)
+        for name, table in tables.items()
     }
 
 
@@ -42,8 +61,10 @@ def _table(results: Results, backbone: str, stage: str) -> str:
         method: [r for n, r in results.items() if n.startswith(f"{backbone}/{stage}/{method}/")]
         for method in LABELS
     }
-    rows = [_row(LABELS[m], seeds[m], seeds["lora_sp"], columns) for m in LABELS]
-    return page.table([*head, "mean", "minus LoRA-SP"], rows)
+    head += ["mean", "minus LoRA-SP"]
+    if any(len(ran) < len(SEEDS) for ran in seeds.values()):
+        return page.table(head, [_filled([label], head) for label in LABELS.values()])
+    return page.table(head, [_row(LABELS[m], seeds[m], seeds["lora_sp"], columns) for m in LABELS])
 
 
 def _row(
@@ -69,3 +90,118 @@ def _ranks(seeds: Seeds) -> str:
     modules = [m for m in ("vision", "language", "action") if m in seeds[0]["active_rank"]]
     means = [np.mean([cell["active_rank"][module] for cell in seeds]) for module in modules]
     return ", ".join(f"{mean:.1f}" for mean in means) or NONE
+
+
+def _size_table(results: Results, backbone: str) -> str:
+    """Return success on all tasks of a policy, and LoRA-SP's lead, by their number."""
+    head = [f"{BACKBONES[backbone]}: tasks", *(LABELS[method] for method in GROWING)]
+    head += ["lead over r = 16", "lead over r = 64", "the latter, minus that with 5"]
+    rows, leads = [], {}
+    for stage in SIZES:
+        row = [str(len(SETS[stage]))]
+        if found := _outcomes(results, backbone, [((stage,), m) for m in GROWING], SETS[stage]):
+            *others, own = found
+            row += [page.percent(statistics.success(each)) for each in found]
+            row += [page.points(statistics.difference(own, other)) for other in others]
+            leads[stage] = statistics.draw(statistics.minus, (own, others[-1]))
+            if SIZES[0] in leads and stage != SIZES[0]:
+                (value, draws), (first, first_draws) = leads[stage], leads[SIZES[0]]
+                ends = statistics.percentiles(draws - first_draws)
+                row.append(page.points(statistics.Estimate(value - first, *ends)))
+        rows.append(_filled(row, head))
+    return page.table(head, rows)
+
+
+def _shared_table(results: Results, backbone: str) -> str:
+    """Return success on the tasks of the smallest set by the number of tasks that a policy learns.
+
+    Then that minus the success of one policy per task.
+    """
+    head = [f"{BACKBONES[backbone]}: tasks", *(LABELS[method] for method in GROWING)]
+    head += [f"{LABELS[method]}, minus alone" for method in GROWING]
+    head += ["LoRA-SP's minus r = 64's"]
+    shared, rows = SETS[SIZES[0]], []
+    alone = tuple(f"single-{task}" for task in shared)
+    for number, stages in ((1, alone), *((len(SETS[stage]), (stage,)) for stage in SIZES)):
+        row, own = [str(number)], [(stages, method) for method in GROWING]
+        if found := _outcomes(results, backbone, own, shared):
+            row += [page.percent(statistics.success(each)) for each in found]
+        both = [*own, *((alone, method) for method in GROWING)]
+        if number > 1 and (found := _outcomes(results, backbone, both, shared)):
+            pairs = [*zip(found[: len(own)], found[len(own) :], strict=True)]
+            row += [page.points(statistics.difference(*pair)) for pair in pairs]
+            row.append(page.points(statistics.bootstrap(_gain, *pairs[-1], *pairs[-2])))
+        rows.append(_filled(row, head))
+    return page.table(head, rows)
+
+
+def _gain(*rates: np.ndarray) -> np.ndarray:
+    """Return success minus success alone of a method, minus that of another one."""
+    return statistics.minus(*rates[:2]) - statistics.minus(*rates[2:])
+
+
+def _rank_table(results: Results, backbone: str) -> str:
+    """Return success on the fifty tasks by R, and its span over all R."""
+    head = [f"{BACKBONES[backbone]}: R", "LoRA", "LoRA-SP", "LoRA-SP minus LoRA"]
+    head += ["LoRA's rate", "LoRA-SP's rate"]
+    rows, every = [], []
+    for rank, pair in RANKS.items():
+        ran = [_outcomes(results, backbone, [(("mt50",), method)], SETS["mt50"]) for method in pair]
+        row = [page.percent(statistics.success(*found)) if found else NONE for found in ran]
+        lora, own = ran
+        row.append(page.points(statistics.difference(*own, *lora)) if lora and own else NONE)
+        rates = [_rate(results, f"{backbone}/mt50/{method}/s{SEEDS[0]}") for method in pair]
+        rows.append([str(rank), *row, *rates])
+        every.append([*lora, *own])
+    row = ["highest minus lowest"]
+    if all(len(both) == 2 for both in every):
+        loras, owns = zip(*every, strict=True)
+        row += [page.percent(statistics.bootstrap(_span, *each)) for each in (loras, owns)]
+        row.append(page.points(statistics.bootstrap(_span_difference, *owns, *loras)))
+    return page.table(head, [*rows, _filled(row, head)])
+
+
+def _rate(results: Results, name: str) -> str:
+    return f"{results[name]['config']['optim']['learning_rate']:g}" if name in results else NONE
+
+
+def _span(*rates: np.ndarray) -> np.ndarray:
+    means = np.stack([statistics.mean(each) for each in rates])
+    return means.max(0) - means.min(0)
+
+
+def _span_difference(*rates: np.ndarray) -> np.ndarray:
+    """Return the span of the first half of some methods minus that of the others."""
+    return _span(*rates[: len(rates) // 2]) - _span(*rates[len(rates) // 2 :])
+
+
+def _outcomes(
+    results: Results, backbone: str, cases: Sequence[Case], tasks: Sequence[str]
+) -> list[np.ndarray]:
+    """Return the outcomes `[S, T, N]` of some policies on some tasks, on their common layouts.
+
+    [] unless all seeds of all of them have run.
+    """
+    names = [
+        [[f"{backbone}/{stage}/{method}/s{seed}" for stage in stages] for seed in SEEDS]
+        for stages, method in cases
+    ]
+    if any(name not in results for case in names for seed in case for name in seed):
+        return []
+    found = [
+        statistics.outcomes([[_only(results[name], tasks) for name in seed] for seed in case])
+        for case in names
+    ]
+    layouts = min(each.shape[2] for each in found)
+    return [each[..., :layouts] for each in found]
+
+
+def _only(cell: Mapping[str, Any], tasks: Sequence[str]) -> Mapping[str, Any]:
+    return {
+        "outcomes": {task: cell["outcomes"][task] for task in tasks if task in cell["outcomes"]}
+    }
+
+
+def _filled(row: Sequence[str], head: Sequence[str]) -> list[str]:
+    """Return a row with dashes where it lacks cells."""
+    return [*row, *[NONE] * (len(head) - len(row))]

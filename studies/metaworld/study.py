@@ -2,13 +2,18 @@
 
     lorasp-jax study --config studies/metaworld/study.py --results studies/metaworld/results.json
 
-Needs the demonstrations of `python -m studies.metaworld.collect` in data/mt50, data/ml45 and
-data/ml5, and another Python environment for the judge; see the README.
+Needs the demonstrations of `python -m studies.metaworld.collect` in data/SET for every set of
+tasks, and another Python environment for the judge; see the README. Three questions; the cells of
+the second are '*/first*' '*/single-*', those of the third '*/mt50/*' '*/pilot/*':
+
+- Which method adapts best to fifty tasks, or to five new ones?
+- Does LoRA-SP's lead over LoRA grow with the number of tasks?
+- Does LoRA-SP depend less on R?
 """
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,19 +25,26 @@ from lorasp_jax.extras.study.study import Results
 from lorasp_jax.peft import AdaLoRA, FullFineTuning, LoRA, LoRASP, Method
 from studies.metaworld import page
 from studies.metaworld.judge import judge
+from studies.metaworld.tasks import FIRST, SETS
 
-SEEDS, PILOT_SEED = (0, 1, 2), 1000
+PILOT_SEED = 1000
 METHODS: Mapping[str, Method] = {
     "lora_sp": LoRASP(rank=64),
     "lora_r64": LoRA(rank=64),
     "lora_r16": LoRA(rank=16),
     "ada_lora": AdaLoRA(rank=64, target_rank=16),
     "full": FullFineTuning(),
+    **{f"lora_sp_r{rank}": LoRASP(rank=rank) for rank in (4, 8, 16, 32, 128)},
+    **{f"lora_r{rank}": LoRA(rank=rank) for rank in (4, 8, 32, 128)},
 }
 RATES = (3e-4, 1e-3, 3e-3)
 """Learning rates, of which short pilots choose one per backbone and method."""
-TUNED_AS = {"lora_r16": "lora_r64"}
+FEWER_RATES = dict.fromkeys((4, 8, 32), RATES[1:]) | {128: RATES[:2]}
+"""Rank -> its two rates, if not all three."""
+TUNED_AS = {"lora_r16": "lora_r64", "lora_sp_r16": "lora_sp"}
 """Method -> the method whose rate it takes."""
+STEPS_PER_TASK = 120
+"""Training steps per task of policies for fifty tasks and for fewer."""
 NAME = "metaworld"
 
 
@@ -58,6 +70,8 @@ STAGES = {
     "mt50": Stage("mt50", 6_000, 10),
     "ml45": Stage("ml45", 10_000, 0),
     "ml5": Stage("ml5", 2_000, 10),
+    **{f"first{n}": Stage(f"first{n}", n * STEPS_PER_TASK, 500 // n) for n in FIRST},
+    **{f"single-{task}": Stage(task, STEPS_PER_TASK, 50) for task in SETS["first5"]},
 }
 
 
@@ -66,16 +80,15 @@ def get_study(scale: str) -> Study:
     if scale != "accelerator":
         raise ValueError(f"the study has the scale accelerator, got {scale!r}")
     cells = [cell for backbone in page.BACKBONES for cell in _cells(backbone)]
-    return Study(NAME, tuple(cells), page=lambda _, results, __: page.blocks(results))
+    return Study(NAME, tuple(cells), page=lambda _, results, __: page.blocks(results), partial=True)
 
 
 def _cells(backbone: str) -> Iterator[Cell]:
     """Yield all policies of a backbone, each after those that it needs."""
     for method in METHODS:
         if method not in TUNED_AS:
-            for rate in RATES:
-                name = f"{backbone}/pilot/{method}/{rate}"
-                yield _cell(name, _config(name, PILOT_SEED, rate))
+            for name in _pilots(f"{backbone}/mt50/{method}/s0"):
+                yield _cell(name, _config(name, PILOT_SEED, float(name.rpartition("/")[2])))
     for name in (f"{backbone}/ml45/full/s0", *_compared(backbone)):
         pilots = _pilots(name)
         base = f"{backbone}/ml45/full/s0" if "/ml5/" in name else ""
@@ -88,22 +101,33 @@ def _cells(backbone: str) -> Iterator[Cell]:
 
 
 def _compared(backbone: str) -> Iterator[str]:
-    for stage in ("mt50", "ml5"):
-        for method in METHODS:
-            for seed in SEEDS:
+    """Yield the policies of the tables, question by question."""
+    other_ranks = [method for method in METHODS if method not in page.LABELS]
+    by_tasks = [stage for stage in STAGES if stage.startswith(("first", "single-"))]
+    methods: Iterable[tuple[str, Iterable[str]]] = (
+        *((stage, page.LABELS) for stage in ("mt50", "ml5")),
+        *((stage, page.GROWING) for stage in by_tasks),
+        ("mt50", other_ranks),
+    )
+    for stage, compared in methods:
+        for method in compared:
+            for seed in page.SEEDS:
                 yield f"{backbone}/{stage}/{method}/s{seed}"
 
 
 def _cell(name: str, config: Any, after: tuple[str, ...] = (), base: str = "") -> Cell:
-    stage = STAGES[name.split("/")[1]]
+    backbone, kind, method, _ = name.split("/")
+    stage, group = STAGES[kind], f"{backbone}/{kind.partition('-')[0]}/{method}"
     evaluate = functools.partial(judge, stage.tasks, stage.episodes, stage.first_seed)
-    return Cell(name, config, after, name.rpartition("/")[0], evaluate=evaluate, source=base)
+    return Cell(name, config, after, group, evaluate=evaluate, source=base)
 
 
 def _pilots(name: str) -> tuple[str, ...]:
     """Return the policies whose success decides a policy's learning rate."""
     backbone, _, method, _ = name.split("/")
-    return tuple(f"{backbone}/pilot/{TUNED_AS.get(method, method)}/{rate}" for rate in RATES)
+    method = TUNED_AS.get(method, method)
+    rates = FEWER_RATES.get(getattr(METHODS[method], "rank", 0), RATES)
+    return tuple(f"{backbone}/pilot/{method}/{rate}" for rate in rates)
 
 
 def best_rate(results: Results, pilots: tuple[str, ...]) -> float:
@@ -124,6 +148,9 @@ def _config(name: str, seed: int, rate: float) -> Config:
     if kind == "ml5":  # it starts from a fully fine-tuned policy
         base = Path("runs") / NAME / backbone / "ml45/full/s0/base"
         model = dataclasses.replace(model, checkpoint=str(base))
+    optim = dataclasses.replace(config.optim, steps=stage.steps, learning_rate=rate)
+    warmup = min(optim.warmup_steps, stage.steps // 20)
+    whole = stage.steps % config.log_every == 0  # a shorter last call would be compiled, too
     return dataclasses.replace(
         config,
         peft=METHODS[method],
@@ -134,7 +161,8 @@ def _config(name: str, seed: int, rate: float) -> Config:
             augment=AugmentConfig("none"),
             validation=("0",),
         ),
-        optim=dataclasses.replace(config.optim, steps=stage.steps, learning_rate=rate),
+        optim=dataclasses.replace(optim, warmup_steps=warmup),
+        log_every=config.log_every if whole else STEPS_PER_TASK,
         evaluation=dataclasses.replace(config.evaluation, denoise_steps=10),
         seed=seed,
     )

@@ -1,17 +1,22 @@
 """The comparison on Meta-World: its cells, and what the judge is asked."""
 
+import dataclasses
+import itertools
 import json
+import re
 import sys
+from pathlib import Path
 
 import pytest
 
 from lorasp_jax import peft
 from lorasp_jax.extras.judge import __main__ as judging
+from lorasp_jax.extras.study import progress, statistics
 from lorasp_jax.extras.study import results as files
 from lorasp_jax.extras.study.progress import describe_config
 from lorasp_jax.training.run_folder import MetricsLog, changed_settings
-from studies.metaworld import judge, study
-from studies.metaworld.tasks import HELD_OUT, SETS
+from studies.metaworld import judge, page, study
+from studies.metaworld.tasks import EXTREME, GROUPS, HELD_OUT, SETS
 from tests import ROOT
 from tests.runs import make_run
 
@@ -24,21 +29,123 @@ def test_sets_split_the_fifty_tasks():
     assert sorted(SETS["ml45"] + SETS["ml5"]) == sorted(SETS["mt50"])
 
 
-def test_every_method_has_three_seeds_on_both_sets():
+def test_every_method_has_three_seeds_on_its_sets():
     names = [cell.name for cell in STUDY.cells]
-    for prefix in ("pi0/mt50/", "pi0/ml5/", "smolvla/mt50/", "smolvla/ml5/"):
-        assert sum(name.startswith(prefix) for name in names) == 5 * 3
-    assert {*names} == RESULTS.keys()
+    for backbone in page.BACKBONES:
+        for stage, methods in {"mt50": 14, "ml5": 5, "first5": 3, "single-reach": 3}.items():
+            ran = [name for name in names if name.startswith(f"{backbone}/{stage}/")]
+            assert len({name.split("/")[2] for name in ran}) == methods
+            assert len(ran) == 3 * methods
+    assert RESULTS.keys() <= {*names}
+
+
+def test_smaller_sets_are_nested_and_balanced():
+    sizes = [len(SETS[stage]) for stage in page.SIZES]
+    assert sizes == [5, 10, 25, 50]
+    for small, large in itertools.pairwise(page.SIZES):
+        assert {*SETS[small]} < {*SETS[large]}
+    for stage, size in zip(page.SIZES, sizes, strict=True):
+        for group in GROUPS.values():
+            assert abs(len({*SETS[stage]} & {*group}) - size * len(group) / 50) <= 1
+
+
+def test_tasks_that_join_last_are_those_that_pilots_nearly_always_or_never_solve():
+    pilots = [f"/pilot/{method}/" for method in page.LABELS]
+    ran = [result for name, result in RESULTS.items() if any(each in name for each in pilots)]
+    for task in SETS["mt50"]:
+        digits = "".join(result["outcomes"][task] for result in ran)
+        assert len(digits) == 120
+        assert (task in EXTREME) == (not 12 <= digits.count("1") <= 96)
+
+
+def test_policies_for_any_number_of_tasks_train_as_long_for_each():
+    alone = [f"single-{task}" for task in SETS["first5"]]
+    for kind in (*page.SIZES, *alone):
+        cell = STUDY[f"pi0/{kind}/lora_sp/s0"]
+        config = cell.config(RESULTS)
+        (source,) = config.data.source
+        assert config.optim.steps == 120 * len(SETS[Path(source).name])
+        assert config.optim.warmup_steps <= config.optim.steps / 20
+        assert config.optim.steps % config.log_every == 0
+    assert {cell.group for cell in STUDY.cells if cell.name.startswith("pi0/single-")} == {
+        f"pi0/single/{method}" for method in page.GROWING
+    }
+
+
+def test_both_methods_choose_their_rate_alike_at_every_rank():
+    for rank, pair in page.RANKS.items():
+        rates = [
+            [name.rpartition("/")[2] for name in study._pilots(f"pi0/mt50/{method}/s0")]
+            for method in pair
+        ]
+        assert rates[0] == rates[1]
+        assert [study.METHODS[method].rank for method in pair] == [rank, rank]
+
+
+def test_what_has_run_stays_finished(tmp_path):
+    statuses = progress.read(dataclasses.replace(STUDY, finished=RESULTS), tmp_path)
+    assert {statuses[name].state for name in RESULTS} == {progress.CellState.FINISHED}
+
+
+@pytest.fixture
+def few_draws(monkeypatch):
+    """Intervals from fewer draws, which are faster."""
+    monkeypatch.setattr(statistics, "DRAWS", 100)
+    statistics._counts.cache_clear()
+    yield
+    statistics._counts.cache_clear()
+
+
+@pytest.mark.usefixtures("few_draws")
+def test_tables_show_what_has_run():
+    made = page.blocks(RESULTS)
+    assert _rows(made["ranks"])[6] == ["64", "47.5", "52.1", "+4.6", "0.001", "0.001"]
+    lacking = {name: r for name, r in RESULTS.items() if name != "pi0/mt50/lora_sp/s1"}
+    fewer = page.blocks(lacking)
+    assert fewer["ml5"] == made["ml5"]
+    pi0, smolvla = fewer["mt50"].split("\n\n")
+    assert pi0.count("–") == 5 * 9
+    assert smolvla in made["mt50"]
+    for table in page.blocks({}).values():
+        assert not re.search(r"\d\.\d", table)
+
+
+@pytest.mark.usefixtures("few_draws")
+def test_tables_compare_numbers_of_tasks_and_ranks():
+    """LoRA-SP leads r = 64 by 10 points with 5 tasks and 30 with 50, alone by none."""
+    wins = {"first5": 60, "first10": 60, "first25": 60, "mt50": 80}
+    results = {}
+    for cell in STUDY.cells:
+        _, kind, method, _ = cell.name.split("/")
+        rate = wins.get(kind, 40) if method.startswith("lora_sp") else 50 if kind in wins else 40
+        stage = study.STAGES[kind]
+        digits = ("1" * (rate // 10)).ljust(10, "0") * 10
+        config = {"optim": {"learning_rate": 1e-3}}
+        outcomes = dict.fromkeys(SETS[stage.tasks], digits[: stage.episodes])
+        results[cell.name] = {"outcomes": outcomes, "config": config, "active_rank": {}}
+        results[cell.name] |= {"trainable_parameters": 1, "total_parameters": 2}
+    made = page.blocks(results)
+    sizes, shared, ranks = (_rows(made[name]) for name in ("sizes", "shared", "ranks"))
+    assert sizes[5] == ["50", "50.0", "50.0", "80.0", "+30.0", "+30.0", "+20.0"]
+    assert shared[3] == ["5", "50.0", "50.0", "60.0", "+10.0", "+10.0", "+20.0", "+10.0"]
+    assert ranks[2][:4] == ["4", "50.0", "80.0", "+30.0"]
+    assert ranks[8][1:4] == ["0.0", "0.0", "+0.0"]
+
+
+def _rows(table):
+    """Return the values of every row, without their intervals."""
+    lines = table.replace("\u00a0", " ").splitlines()
+    return [[c.split(" [")[0].strip() for c in line.strip("|").split("|")] for line in lines]
 
 
 def test_runs_have_the_settings_in_the_results():
     kinds = {"lora_sp": peft.LoRASP, "ada_lora": peft.AdaLoRA, "full": peft.FullFineTuning}
-    for cell in STUDY.cells:
+    for cell in (STUDY[name] for name in RESULTS):
         config = cell.config(RESULTS) if callable(cell.config) else cell.config
         recorded = RESULTS[cell.name]["config"]
         assert changed_settings(recorded, describe_config(cell, config)) == ["name"]
         backbone, stage, method, _ = cell.name.split("/")
-        assert type(config.peft) is kinds.get(method, peft.LoRA)
+        assert type(config.peft) is kinds.get(re.sub(r"sp_r\d+", "sp", method), peft.LoRA)
         assert config.data.source == (f"data/{study.STAGES[stage].tasks}",)
         base = f"runs/metaworld/{backbone}/ml45/full/s0/base"
         bundled = f"assets/{backbone}_small"
