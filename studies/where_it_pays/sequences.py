@@ -24,6 +24,7 @@ from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Run
 from studies.few import judge as scenes
 from studies.where_it_pays import names, sequence_page
+from studies.where_it_pays.judge import padded
 from studies.where_it_pays.sequence_page import ORDERS, SINGLE
 
 REPLAYED = 0.02
@@ -126,6 +127,6 @@ def _interpolated(model: Backbone, config: Config, number: int) -> Backbone:
 def _outcomes(run: Run, policy: Any, number: int, tasks: list[str]) -> dict[str, str]:
     """Return the outcomes of a policy after a number of tasks."""
     shown = dataclasses.replace(run, config=dataclasses.replace(run.config, tasks=tuple(tasks)))
-    shown.policy = policy
+    shown.policy = padded(policy, run.config.targets)
     found = scenes.judge(shown, ("recorded",))["outcomes"]
     return {f"{number}/{name.partition('/')[2]}": text for name, text in found.items()}

@@ -10,16 +10,18 @@ from flax import nnx
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import flatten
-from lorasp_jax.dense import AdaptedLayer
+from lorasp_jax.dense import AdaptedLayer, AdapterParam
 from lorasp_jax.extras.study import Derived, statistics
-from lorasp_jax.models import flow_matching
+from lorasp_jax.models import flow_matching, presets
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.peft import FullFineTuning, LoRA
+from lorasp_jax.models.smolvla import SmolVLAConfig
+from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP, plan
 from lorasp_jax.peft.settings import to_settings
 from lorasp_jax.training import activations, rules
 from studies.where_it_pays import (
     bases,
     forms,
+    judge,
     names,
     page,
     recipes,
@@ -237,3 +239,37 @@ def test_leading_inputs_begin_the_bank():
         np.testing.assert_allclose(*lengths, rtol=1e-5)
         first = np.abs(v[..., 0]) / lengths[1][..., :1]
         np.testing.assert_allclose(first, np.broadcast_to(np.eye(v.shape[-2])[3], first.shape))
+
+
+def with_updates(model):
+    """A model whose adapters change its outputs, where they have a rank."""
+    graphdef, adapters, frozen = adaptation.split(model)
+    root = nnx.List([nnx.merge(graphdef, with_noise(adapters, 0.1), frozen)])
+    for location in paths.locate(root, AdaptedLayer):
+        layer = location.child
+        if isinstance(layer.method, LoRA):
+            layer.adapter = AdapterParam(layer.method.trimmed(layer.adapter.get_value()))
+    return root[0]
+
+
+@pytest.mark.parametrize("backbone", [Pi0Config, SmolVLAConfig])
+def test_policies_of_all_ranks_share_the_programs_of_evaluation(backbone, tmp_path):
+    base = random_backbone(backbone.dummy())
+    shapes = rules.shapes(base, presets.patterns(("all-linear",)))
+    ranks = {path: tuple(range(1, n + 1)) for path, (n, _, _) in shapes.items()}
+    dropped = next(path for path in ranks if "down_proj" in path)
+    planned = plan.RankPlan("pi0", ranks | {dropped: (0,) * len(ranks[dropped])})
+    structures = []
+    for method, chosen in ((LoRA(rank=4), planned), (LoRA(rank=64), None), (LoRASP(rank=8), None)):
+        config = dataclasses.replace(CONFIG, peft=method, plan=chosen, targets=("all-linear",))
+        run = make_run(tmp_path / f"{method.name}{method.rank}", config, base)
+        own = dataclasses.replace(run.policy, model=with_updates(run.policy.model))
+        shown = judge.padded(own, config.targets)
+        structures.append(adaptation.split(shown.model)[0])
+        key, batch = next(activations.sampled(run, own.processor, base.config.chunk))
+        chunks = [
+            x.model.loss(key, batch.observation, batch.actions)[0] for x in (own, shown, run.policy)
+        ]
+        np.testing.assert_allclose(*chunks[:2], rtol=1e-4, atol=1e-5)
+        assert float(jnp.abs(chunks[0] - chunks[2]).max()) > 1e-2
+    assert structures[0] == structures[1] != structures[2]
