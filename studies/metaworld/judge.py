@@ -62,12 +62,13 @@ def _run(folder: Path, options: list[str]) -> None:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     server = [sys.executable, "-m", "lorasp_jax.extras.serving", str(folder)]
+    server += ["--port", str(port), "--seed", "0", "--max-batch", str(PROCESSES)]
     where = ["--server", f"ws://127.0.0.1:{port}", "--wait", "600"]
     python = os.environ.get(PYTHON, "")
     client = [python, "-m", "lorasp_jax.extras.judge", *where]
     client += ["--env", "studies.metaworld.world:mt50", *options]
     with (
-        _process([*server, "--port", str(port), "--seed", "0"]) as serving,
+        _process(server) as serving,
         _process(client) as judging,
     ):
         while judging.poll() is None:
