@@ -44,8 +44,8 @@ class ModelConfig:
     backbone: str = "pi0"
     """A folder of `lorasp_jax/models`, such as pi0 or smolvla."""
     size: str = "nano"
-    """nano for a CPU, small for one accelerator, base for the published size; pi0 also has
-    nano_pi05 and base_pi05."""
+    """nano for a CPU, small for one accelerator, medium without bundled weights, base for the
+    published size; pi0 also has nano_pi05 and base_pi05."""
     checkpoint: str = "assets/{backbone}_{size}"
     """Base weights: a folder, hf://owner/name or a bucket URL; empty: random initialization.
     {backbone} and {size} are replaced by those fields. Bundled bases (assets/...) resolve from any

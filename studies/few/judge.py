@@ -12,6 +12,7 @@ import envs
 from envs import Env, Randomization
 from envs.physics import physics
 from envs.state import State
+from lorasp_jax.evaluation import metrics
 from lorasp_jax.evaluation.programs import Rollout, make_rollout
 from lorasp_jax.evaluation.results import evaluate
 from lorasp_jax.training.demonstrations import map_threads
@@ -40,6 +41,9 @@ def judge(run: Run, scenes: Iterable[str] = SCENES, *, cropped: bool = False) ->
 
     Both scenes have layouts that no demonstration has; policies of one seed share them. With
     `cropped`, the policy sees the middle of the side camera's pictures, enlarged.
+
+    Raises:
+        ValueError: the device computed some episodes wrongly.
     """
     policy = run.policy.with_sampler()
     settings = run.config.evaluation
@@ -55,7 +59,9 @@ def judge(run: Run, scenes: Iterable[str] = SCENES, *, cropped: bool = False) ->
     cases = [(scene, task) for scene in scenes for task in run.config.tasks]
     # Warp is not thread-safe.
     run_all = map if physics.default_backend() == "warp" else map_threads
-    found = run_all(one, cases)
+    found = [*run_all(one, cases)]
+    if bias := metrics.position_bias([x == "1" for x in text] for text in found):
+        raise ValueError(bias)
     trainable, total = run.parameters
     return {
         "outcomes": dict(zip(map("/".join, cases), found, strict=True)),

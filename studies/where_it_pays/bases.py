@@ -15,8 +15,8 @@ from studies.few.judge import judge
 from studies.where_it_pays import names
 from studies.where_it_pays.judge import best_rate
 
-BASES = {"second": ("small", 1, 12_000), "medium": ("medium", 0, 6_000)}
-"""Kind -> size, seed and steps of pretraining, else as in configs/pretrain.py."""
+BASES = {"second": ("small", 1, 12_000, 1e-3), "medium": ("medium", 0, 6_000, 5e-4)}
+"""Kind -> size, seed, steps and rate of pretraining, else as in configs/pretrain.py."""
 SECOND: Mapping[str, Method] = {"lora": LoRA(rank=names.WIDE), "lora_sp": LoRASP(rank=names.WIDE)}
 """Method -> its settings on the second base, at the rate on the first."""
 MEDIUM: Mapping[str, tuple[Method, tuple[float, ...]]] = {
@@ -38,11 +38,12 @@ def cells(
     scale: str,
 ) -> Iterator[Cell]:
     """Yield the bases of a backbone and their policies; arguments as in `recipes.cells`."""
-    for kind, (size, seed, steps) in BASES.items():
+    for kind, (size, seed, steps, rate) in BASES.items():
         base = get_config(scale)
         if scale == "accelerator":
-            base = replace(base, optim=replace(base.optim, steps=steps))
-            base = replace(base, model=replace(base.model, size=size))
+            base = replace(base, optim=replace(base.optim, steps=steps, learning_rate=rate))
+            # Several processes share the device, and none knows what their demonstrations take.
+            base = replace(base, model=replace(base.model, size=size, remat="full"))
         base = replace(base, model=replace(base.model, backbone=backbone), seed=seed)
         yield Cell(names.base(backbone, kind), base, (), f"{backbone}/base_{kind}")
     policy = functools.partial(_policy, backbone=backbone, pool=pool, make=make)

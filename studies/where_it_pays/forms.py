@@ -38,7 +38,7 @@ def cells(backbone: str, seed: int, pool: int, steps: int) -> Iterator[Derived]:
             evaluate = functools.partial(judge, form=form, steps=healed, pool=pool)
             source = names.cell(backbone, method, names.WIDE, seed)
             name = names.form(backbone, form, healed > 0, seed)
-            settings = {"form": form, "steps": healed}
+            settings = {"form": form, "steps": healed, "rate": healing.RATE, "pool": pool}
             yield Derived(name, source, settings=settings, evaluate=evaluate)
 
 
@@ -46,13 +46,14 @@ def judge(run: Run, form: str, steps: int, pool: int) -> dict[str, Any]:
     """Return the outcomes of a form of the run's policy, and the `bytes` of its weights.
 
     "taught" is merged after the policy's own velocities have taught it in place of demonstrations.
-    "by_task" is a policy for each task, of which `bytes` is the sum.
+    "by_task" is a policy for each task, which shares the steps; `bytes` is the sum.
     """
     settings, study_folder = run.config, run.folder.parents[3]
     held_out = held_out_demonstrations(study_folder, settings)
     every = shared_demonstrations(study_folder, pool, settings, run.folder, lambda *_: None)
-    options = {"steps": steps, "objective": Taught(run.policy.model) if form == "taught" else None}
     groups = [(task,) for task in settings.tasks] if form == "by_task" else [settings.tasks]
+    options = {"objective": Taught(run.policy.model) if form == "taught" else None}
+    options |= {"steps": max(steps // len(groups), 1)}
     outcomes, size = {}, 0
     for tasks in groups:
         shown = dataclasses.replace(run, config=dataclasses.replace(settings, tasks=tasks))

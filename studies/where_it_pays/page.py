@@ -36,18 +36,20 @@ BASE_ROWS = {
 }
 """Base -> method -> label; see `bases.BASES`."""
 ALLOCATED = {
-    "planned": "ranks in proportion to LoRA-SP's active ranks",
-    "other_seed": "the same, of another seed",
-    "other_tasks": "the same, of a policy that learned two of the tasks",
-    "other_backbone": "the same, of the other backbone, by kind of layer",
-    "shuffled": "the same, shuffled over layers of one size",
-    "eva": "one rank, EVA's initialization",
-    "ada_lora": "AdaLoRA",
-    "cut": "LoRA with r = 64, cut by one threshold on singular values",
-    "dropped": "the layers with the lowest active rank dropped, half of the parameters",
-    "dropped_random": "random layers dropped, half of the parameters",
+    "ranks in proportion to LoRA-SP's active ranks": ("planned", "lora"),
+    "the same, shuffled over layers of one size": ("shuffled", "lora"),
+    "the former minus the latter": ("planned", "shuffled"),
+    "ranks of another seed, minus own": ("other_seed", "planned"),
+    "ranks of a policy that learned two of the tasks, minus own": ("other_tasks", "planned"),
+    "ranks of the other backbone, by kind of layer, minus own": ("other_backbone", "planned"),
+    "one rank, EVA's initialization": ("eva", "lora"),
+    "AdaLoRA": ("ada_lora", "lora"),
+    "LoRA with r = 64, cut by one threshold on singular values": ("cut", "lora"),
+    "trained with the ranks, minus cut": ("planned", "cut"),
+    "the layers with the lowest active rank dropped, half of the parameters": ("dropped", "lora"),
+    "the same, minus random layers dropped": ("dropped", "dropped_random"),
 }
-"""What is compared with LoRA of one rank for all layers."""
+"""Label -> two methods whose success is compared; "lora" has one rank for all layers."""
 
 FORMS = {
     "whole": ("lora_sp", "whole"),
@@ -62,8 +64,9 @@ FORMS = {
 """Form of a policy with R = `WIDE` -> its method, and its label; see docs/deployment.md."""
 HEAL = 400
 """Steps by which forms train on."""
-HEALED = ("whole", "taught")
+HEALED = ("taught",)
 """Forms that exist only after training on."""
+_MINUS = ("", ", minus whole", ", minus merged")
 
 RECIPES = {
     "lora": "LoRA, r = 64",
@@ -122,17 +125,13 @@ def _rank_table(results: Results, backbone: str) -> str:
 
 
 def _layer_table(results: Results, backbone: str) -> str:
-    """Return success as recorded of LoRA with ranks by layer minus that of one rank."""
+    """Return differences of success as recorded between ways to give layers their ranks."""
     rows = []
-    for method, label in ALLOCATED.items():
-        row = [label]
-        for rank in BUDGETS:
-            both = _pair(results, backbone, (method, rank), ("lora", rank))
-            stacked = [outcomes(found, "recorded") for found in both] if both[0] else []
-            row.append(page.points(statistics.difference(*stacked)) if stacked else page.NONE)
-        rows.append(row)
+    for label, methods in ALLOCATED.items():
+        pairs = [_pair(results, backbone, *((x, rank) for x in methods)) for rank in BUDGETS]
+        rows.append([label, *(_compared(both, "recorded")[1] for both in pairs)])
     heads = [f"mean r = {rank}" for rank in BUDGETS]
-    return page.table([f"{BACKBONES[backbone]}, points over one rank", *heads], rows)
+    return page.table([f"{BACKBONES[backbone]}, points", *heads], rows)
 
 
 def _form_table(results: Results, backbone: str) -> str:
@@ -141,29 +140,33 @@ def _form_table(results: Results, backbone: str) -> str:
     for name, (_, label) in FORMS.items():
         row, size, count = [label], page.NONE, 0
         for healed in (False, True):
-            policies = [
-                [_formed(backbone, x, healed, seed) for seed in SEEDS] for x in (name, "whole")
-            ]
-            both = names.ran(results, *policies)
-            row += _compared(both, "recorded", itself=name == "whole")
-        if both[0]:
-            size, count = f"{both[0][0]['bytes'] / 1e6:.1f} MB", len(both[0])
+            (own,) = names.ran(results, _formed(backbone, name, healed))
+            row.append(
+                page.percent(statistics.success(outcomes(own, "recorded"))) if own else page.NONE
+            )
+            for other in ("whole", "merged"):
+                both = names.ran(results, *(_formed(backbone, x, healed) for x in (name, other)))
+                row.append(_compared(both, "recorded", itself=name == other)[1])
+        if own:
+            size, count = f"{own[0]['bytes'] / 1e6:.1f} MB", len(own)
         rows.append([*row, size, str(count)])
-    heads = ["as made", "minus whole", f"after {HEAL} steps", "minus whole", "weights", "seeds"]
+    heads = [f"{when}{head}" for when in ("as made", f"after {HEAL} steps") for head in _MINUS]
+    heads += ["weights", "seeds"]
     return page.table([BACKBONES[backbone], *heads], rows)
 
 
-def _formed(backbone: str, name: str, healed: bool, seed: int) -> str:
-    """Return the name of a form's policy; that of the whole policy as made is its own."""
-    if name == "whole" and not healed:
-        return cell(backbone, "lora_sp", WIDE, seed)
-    return names.form(backbone, name, healed, seed)
+def _formed(backbone: str, name: str, healed: bool) -> list[str]:
+    """Return the names of a form's policies by seed."""
+    return [names.form(backbone, name, healed, seed) for seed in SEEDS]
 
 
 def _base_table(results: Results, backbone: str) -> str:
     """Return success on three bases, also minus LoRA's."""
     rows = []
     for kind, methods in BASE_ROWS.items():
+        if base := results.get(names.base(backbone, kind)):
+            rate = page.percent(statistics.success(statistics.outcomes([[base]])))
+            rows.append([kind, "the base itself, on the Panda", rate, *[page.NONE] * 3, "1"])
         for method, label in methods.items():
             both = names.ran(results, *(_policies_on(backbone, kind, x) for x in (method, "lora")))
             row = [kind, label]
@@ -194,18 +197,15 @@ def _recipe_table(results: Results) -> str:
             both = names.ran(results, *policies)
             for scene in SCENES:
                 row += _compared(both, scene, itself=name == "lora_sp")
+            row.append(str(len(both[0])))
         rows.append(row)
-    heads = [
-        f"{label}, {scene}{head}"
-        for label in BACKBONES.values()
-        for scene in SCENES.values()
-        for head in ("", ", minus LoRA-SP")
-    ]
+    scenes = [f"{x}{head}" for x in SCENES.values() for head in ("", ", minus LoRA-SP")]
+    heads = [f"{label}, {head}" for label in BACKBONES.values() for head in (*scenes, "seeds")]
     return page.table(["pilots", *heads], rows)
 
 
 def _compared(
-    both: Sequence[Sequence[Mapping[str, Any]]], scene: str, *, itself: bool
+    both: Sequence[Sequence[Mapping[str, Any]]], scene: str, *, itself: bool = False
 ) -> list[str]:
     """Return success of the first of two methods, and that minus the second's, unless `itself`."""
     if not both[0]:

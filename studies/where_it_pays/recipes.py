@@ -18,10 +18,10 @@ from lorasp_jax.extras.study.held_out import shared_demonstrations
 from lorasp_jax.extras.study.study import Results
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.peft import LoRA, LoRASP, Method
-from lorasp_jax.training import activations, loop, setup
+from lorasp_jax.training import activations, setup
 from lorasp_jax.training.run import Run
 from studies.few.judge import judge as judge_scenes
-from studies.where_it_pays import names
+from studies.where_it_pays import names, sequences
 from studies.where_it_pays.judge import best_rate
 
 _BANK = LoRASP(rank=names.WIDE)
@@ -69,19 +69,20 @@ def cells(
         functools.partial(judge_eva, pool=pool),
         names.recipe(backbone, "lora_sp", seed),
     )
-    yield Derived(names.recipe(backbone, "eva", seed), source, evaluate=evaluate)
+    settings = {"initialization": "eva", "pool": pool}
+    own = names.recipe(backbone, "eva", seed)
+    yield Derived(own, source, settings=settings, evaluate=evaluate)
 
 
 def judge_eva(run: Run, pool: int) -> dict[str, Any]:
     """Train the run's policy anew from a bank whose V are the leading inputs of each layer."""
     episodes = shared_demonstrations(run.folder.parents[2], pool, run.config, run.folder, _silent)
-    learner = dataclasses.replace(run, folder=run.folder / "learned", episodes=episodes)
-    learner.folder.mkdir(exist_ok=True)
+    learner = dataclasses.replace(run, episodes=episodes)
     model = setup.build(run.config, run.folder).model
     batches = activations.sampled(learner, run.policy.processor, model.config.chunk)
     moments = calibration.input_moments(model, batches, ".*", activations.loss)
     learner.policy = replace(run.policy, model=_with_leading_inputs(model, moments))
-    loop.train(learner, resume=True)
+    learner.policy = sequences.learned(learner)
     return judge_scenes(learner)
 
 

@@ -18,6 +18,7 @@ from lorasp_jax.config import Config
 from lorasp_jax.extras.study import Derived
 from lorasp_jax.extras.study.held_out import shared_demonstrations
 from lorasp_jax.models.backbone import Backbone
+from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training import loop, protect, rules, setup
 from lorasp_jax.training.demonstrations import Demonstrations
 from lorasp_jax.training.random_streams import RandomStream
@@ -27,6 +28,8 @@ from studies.where_it_pays import names, sequence_page
 from studies.where_it_pays.judge import padded
 from studies.where_it_pays.sequence_page import ORDERS, SINGLE
 
+RATE = 1e-3
+"""Learning rate of all kinds, since what is forgotten depends on it."""
 REPLAYED = 0.02
 """Share of the demonstrations of earlier tasks that `replay` trains on, too."""
 KEPT = 0.5
@@ -35,19 +38,20 @@ KEPT = 0.5
 
 def cells(backbone: str, seed: int, pool: int, ranks: Sequence[int]) -> Iterator[Derived]:
     """Yield the policies of a seed that learn one task after another; see `study.Scale`."""
-    for kind, (method, rank, _) in sequence_page.KINDS.items():
+    for kind, (method, rank, *_) in sequence_page.KINDS.items():
         if rank not in ranks:
             continue
         source = names.cell(backbone, method, rank, seed)
         for order in range(1 if kind in SINGLE else len(ORDERS)):
             evaluate = functools.partial(judge, kind=kind, order=order, pool=pool)
             name = names.sequence(backbone, kind, order, seed)
-            settings = {"kind": kind, "order": order}
+            settings = {"kind": kind, "tasks": list(ORDERS[order]), "rate": RATE, "pool": pool}
+            settings |= {"replayed": REPLAYED, "kept": KEPT, "least": protect.LEAST}
             yield Derived(name, source, settings=settings, evaluate=evaluate)
 
 
 def judge(run: Run, kind: str, order: int, pool: int) -> dict[str, Any]:
-    """Learn the tasks one after another, each with an equal part of the run's steps.
+    """Learn the tasks one after another, each with an equal part of the run's steps and warm-up.
 
     The policy begins with new adapters on the base, its processor is that of the run, which learned
     all tasks together. `SINGLE` kinds have new adapters for each task.
@@ -69,14 +73,14 @@ def judge(run: Run, kind: str, order: int, pool: int) -> dict[str, Any]:
     for number, task in enumerate(tasks, 1):
         if single:
             policy = dataclasses.replace(policy, model=start)
-        before = policy.model
         counts = {task: every[task].num_episodes}
         if kind == "replay":
             counts |= {t: math.ceil(REPLAYED * every[t].num_episodes) for t in tasks[: number - 1]}
-        stage = _stage(run, policy, some(every, counts), tasks)
-        if kind == "protected":
-            stage.fixed = protect.fixed(before, protected)
-        policy = _learned(stage)
+        stage = _stage(run, kind, len(tasks))
+        stage.policy, stage.episodes = policy, some(every, counts)
+        if protected:  # the first task trains all
+            stage.fixed = protect.fixed(policy.model, protected)
+        policy = learned(stage)
         if kind == "protected":
             protected = protect.in_use(stage, policy.model, policy.processor, protected)
             shares.append(float(np.mean([rows.mean() for rows in protected.values()])))
@@ -95,21 +99,23 @@ def some(every: Demonstrations, counts: Mapping[str, int]) -> Demonstrations:
     return {task: group.select(np.arange(counts.get(task, 0))) for task, group in every.items()}
 
 
-def _stage(run: Run, policy: Any, episodes: Demonstrations, tasks: list[str]) -> Run:
-    """Return a run that trains a policy on demonstrations, on one device."""
-    steps = run.config.optim.steps // len(tasks)
-    optim = dataclasses.replace(run.config.optim, steps=steps)
+def _stage(run: Run, kind: str, count: int) -> Run:
+    """Return a run that is to learn one of `count` tasks."""
+    optim = run.config.optim
+    steps, warmup = optim.steps // count, optim.warmup_steps // count
+    optim = dataclasses.replace(optim, steps=steps, warmup_steps=warmup, learning_rate=RATE)
     config = dataclasses.replace(run.config, optim=optim, checkpoint_every=steps, log_every=steps)
-    stage = Run(config, run.folder, run.console, run.base_hash, episodes=episodes)
-    stage.policy, stage.devices, stage.programs = policy, jax.devices()[:1], run.programs
-    return stage
+    if kind == "no_spectral":
+        auxiliary = dataclasses.replace(config.auxiliary, spectral=0.0)
+        config = dataclasses.replace(config, auxiliary=auxiliary)
+    return dataclasses.replace(run, config=config)
 
 
-def _learned(stage: Run) -> Any:
-    """Train a stage; return its policy."""
+def learned(run: Run) -> Policy:
+    """Train a run on one device, without files in its folder; return its policy."""
     with tempfile.TemporaryDirectory() as folder:
-        trained = dataclasses.replace(stage, folder=Path(folder))
-        trained.policy = stage.policy
+        trained = dataclasses.replace(run, folder=Path(folder), devices=jax.devices()[:1])
+        trained.policy = run.policy
         loop.train(trained)
     return trained.policy
 
@@ -124,7 +130,7 @@ def _interpolated(model: Backbone, config: Config, number: int) -> Backbone:
     return adaptation.adapt(merged, rules.rules(config), rngs=nnx.Rngs(key))
 
 
-def _outcomes(run: Run, policy: Any, number: int, tasks: list[str]) -> dict[str, str]:
+def _outcomes(run: Run, policy: Policy, number: int, tasks: list[str]) -> dict[str, str]:
     """Return the outcomes of a policy after a number of tasks."""
     shown = dataclasses.replace(run, config=dataclasses.replace(run.config, tasks=tuple(tasks)))
     shown.policy = padded(policy, run.config.targets)

@@ -107,13 +107,13 @@ def _started(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
     """Yield what comes after the policies of every rank."""
     make = functools.partial(_config, scale, backbone)
     pilots = {method: _pilots(backbone, method, names.WIDE) for method in names.METHODS}
+    yield from bases.cells(backbone, scale.seeds, scale.pool, make, pilots, scale.config.scale)
     for seed in page.RECIPE_SEEDS[: len(scale.seeds)]:
         yield from recipes.cells(backbone, seed, scale.pool, make, pilots)
     for seed in scale.seeds:
         yield from _allocated(scale, backbone, seed)
         yield from forms.cells(backbone, seed, scale.pool, scale.heal)
         yield from sequences.cells(backbone, seed, scale.pool, scale.ranks)
-    yield from bases.cells(backbone, scale.seeds, scale.pool, make, pilots, scale.config.scale)
 
 
 def _allocated(scale: Scale, backbone: str, seed: int) -> Iterator[Cell | Derived]:

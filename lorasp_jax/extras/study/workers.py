@@ -113,15 +113,16 @@ def _work(
 
     def run(job: Job) -> dict[str, Any]:
         cell.value = job.cell.name.encode()
-        try:
-            with _output_to(folder / "logs" / f"{job.cell.name}.txt"):
-                return run_cell(job)
-        finally:
-            cell.value = b""
+        with _output_to(folder / "logs" / f"{job.cell.name}.txt"):
+            return run_cell(job)
+
+    def say(text: str) -> None:  # when a cell has ended, and before the next one
+        cell.value = b""
+        print(text, flush=True)
 
     try:
         with sigterm_as_interrupt():
-            work(load(), folder, names, run, lambda text: print(text, flush=True))
+            work(load(), folder, names, run, say)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
 

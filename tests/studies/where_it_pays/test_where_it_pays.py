@@ -1,6 +1,8 @@
 """The study of where adaptive rank pays: its cells, their plans, and its page."""
 
 import dataclasses
+import itertools
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 from flax import nnx
 
 from lorasp_jax.adapters import adaptation, paths
-from lorasp_jax.config import Config
+from lorasp_jax.config import AuxiliaryConfig, Config
 from lorasp_jax.data.batches import flatten
 from lorasp_jax.dense import AdaptedLayer, AdapterParam
 from lorasp_jax.extras.study import Derived, statistics
@@ -22,7 +24,6 @@ from studies.where_it_pays import (
     bases,
     forms,
     judge,
-    names,
     page,
     recipes,
     sequence_page,
@@ -54,15 +55,20 @@ def episodes(rate):
 
 
 def forgetting(kind, order):
-    """Outcomes of a policy with 10 % before, 80 % after a task, and 20 % less after each later."""
+    """Outcomes of a policy by number of learned tasks and task.
+
+    Of a task's episodes, 10 % succeed in the base, 20 % after other tasks, 80 % right after it,
+    then 90 %, and 60 % at the end, or 70 % with a kind of LoRA-SP.
+    """
     tasks = sequence_page.ORDERS[order]
     if kind in sequence_page.SINGLE:
-        return {f"{k}/{task}": episodes(0.7) for k, task in enumerate(tasks, 1)}
+        return {f"{k}/{task}": episodes(0.6 + k / 20) for k, task in enumerate(tasks, 1)}
+    end = 0.6 if sequence_page.KINDS[kind][0] == "lora" else 0.7
     found = {}
-    for learned in range(len(tasks) + 1):
+    for done in range(len(tasks) + 1):
         for k, task in enumerate(tasks, 1):
-            rate = 0.8 - 0.2 * (learned - k) if learned >= k else 0.1
-            found[f"{learned}/{task}"] = episodes(rate)
+            rate = (0.1 + 0.1 * (done > 0), 0.8, 0.9)[np.sign(done - k) + 1]
+            found[f"{done}/{task}"] = episodes(end if done == len(tasks) > k else rate)
     return found
 
 
@@ -71,17 +77,20 @@ def results():
     """Results of all policies, of which those at the higher rate are the best."""
     found = {}
     for cell in STUDY.cells:
+        backbone, kind, *_ = cell.name.split("/")
         text = episodes(0.5 + 0.2 * cell.name.endswith("0.003"))
-        outcomes = {f"{s}/{t}": text for s in page.SCENES for t in ("press", "pour")}
-        if (kind := cell.name.split("/")[1]) in sequence_page.KINDS:
-            outcomes = forgetting(kind, cell.settings["order"])
-        backbone = cell.name.split("/")[0]
-        measures = {
+        if kind in ("form_half", "recipe_relu", "planned", "second"):
+            text = episodes(0.25 if "/lora/" in cell.name else 0.75)
+        outcomes = {f"{s}/{t}": text for s in page.SCENES for t in sequence_page.ORDERS[0]}
+        if kind in sequence_page.KINDS:
+            outcomes = forgetting(kind, int(cell.name.split("/")[2][1]))
+        found[cell.name] = {
+            "outcomes": outcomes,
             "trainable_parameters": 1000,
             "bytes": 2e6,
             "layer_active_rank": active(backbone),
+            **({"protected": [0.25, 0.5]} if kind == "protected" else {}),
         }
-        found[cell.name] = {"outcomes": outcomes, **measures}
     return found
 
 
@@ -93,6 +102,10 @@ def test_policies_differ_in_what_their_names_say(results):
         if isinstance(cell, Derived):
             assert cell.source in STUDY_NAMES
             assert (cell.source.split("/")[0], cell.source.split("/")[-1]) == (backbone, seed)
+            if method in sequence_page.KINDS:
+                kind = [sequence_page.KINDS[method][0], "r16" if "16" in method else "r64"]
+                assert cell.source.split("/")[1:3] == kind
+                assert cell.settings["tasks"] == [*sequence_page.ORDERS[int(rank[0][1])]]
             continue
         config = cell.config if isinstance(cell.config, Config) else cell.config(results)
         assert config.model.backbone == backbone
@@ -150,20 +163,35 @@ def test_page(results, tmp_path, monkeypatch):
     for found in ({}, results):
         blocks = page.blocks(STUDY, found, tmp_path)
         assert (tmp_path / "ranks.svg").exists()
-        numbers = "50.0 [" in blocks["pi0 ranks"].replace("\u00a0", " ")
-        assert numbers == bool(found)
+        assert ("50.0 [" in blocks["pi0 ranks"].replace("\u00a0", " ")) == bool(found)
         assert len(blocks["smolvla layers"].splitlines()) == 2 + len(page.ALLOCATED)
-        assert blocks["recipes"].count("50.0") == (2 * 2 * len(page.RECIPES) if found else 0)
-    rows = [line.split(" | ") for line in blocks["pi0 sequences"].splitlines()[4:]]
-    numbers = {
-        row[0].replace("\u00a0", " "): [cell.split("\u00a0")[0] for cell in row[1:]] for row in rows
-    }
-    for kind, (_, _, label) in sequence_page.KINDS.items():
-        own = ["70.0", "70.0", "–", "–"]
-        shown = own if kind in sequence_page.SINGLE else ["50.0", "80.0", "+40.0", "+0.0"]
-        assert numbers[f"| {label}"] == [*shown, "3 |"]
-    assert {names.form("pi0", kind, True, 0) for kind in page.FORMS} <= STUDY_NAMES
-    assert blocks["pi0 bases"].replace("\u00a0", " ").count("50.0 [") == 2 * 8
+    shown = {name: numbers(block) for name, block in blocks.items()}
+    lora = ["65.0", "+15.0", "80.0", "80.0", "+20.0", "–", "+10.0", "–", "3"]
+    assert shown["pi0 sequences"]["LoRA"] == lora
+    lora_sp = ["72.5", "+22.5", "80.0", "80.0", "+10.0", "−10.0", "+10.0", "–", "3"]
+    assert shown["pi0 sequences"]["LoRA-SP"] == lora_sp
+    protected = shown["pi0 sequences"]["LoRA-SP, used directions protected"]
+    assert protected == [*lora_sp[:5], "+0.0", "+10.0", "50 %", "3"]
+    alone = ["72.5", "+22.5", "72.5", *["–"] * 5, "3"]
+    assert shown["pi0 sequences"]["one LoRA per task, r = 16"] == alone
+    half = ["75.0", "+25.0", "+25.0"] * 2
+    assert shown["pi0 forms"]["half of the bank"] == [*half, "2.0 MB", "3"]
+    assert shown["pi0 forms"]["whole"][:3] == ["50.0", "–", "+0.0"]
+    layers = shown["smolvla layers"]
+    assert layers["the former minus the latter"] == ["+25.0"] * 3
+    assert layers["ranks of another seed, minus own"] == ["−25.0"] * 3
+    assert layers["ranks of the other backbone, by kind of layer, minus own"][0] == "−25.0"
+    assert shown["recipes"]["ReLU scores"] == [*["75.0", "+25.0"] * 2, "3"] * 2
+    lines = [line.split(" | ") for line in blocks["pi0 bases"].splitlines() if "| second" in line]
+    rates = [[cell.split("\u00a0")[0] for cell in line[2:4]] for line in lines[1:]]
+    assert rates == [["25.0", "–"], ["75.0", "+50.0"]]
+
+
+def numbers(block):
+    """The numbers of a table's rows without their intervals, by label."""
+    lines = block.replace("\u00a0", " ").splitlines()[2:]
+    rows = [line.strip("| ").split(" | ") for line in lines]
+    return {row[0]: [cell.split(" [")[0] for cell in row[1:]] for row in rows}
 
 
 def test_the_recipes_differ_in_one_thing():
@@ -171,10 +199,13 @@ def test_the_recipes_differ_in_one_thing():
     assert all(first != other for i, first in enumerate(made) for other in made[:i])
     assert {*recipes.RECIPES, "eva"} == {*page.RECIPES}
     plain = to_settings(recipes.RECIPES["lora_sp"][0])
+    losses = dataclasses.asdict(AuxiliaryConfig())
     for name, (method, changes) in recipes.RECIPES.items():
         if name != "lora":
-            settings = to_settings(method)
-            assert sum(settings[x] != plain[x] for x in plain) + len(changes) == (name != "lora_sp")
+            settings, changed = to_settings(method), changes.get("auxiliary", AuxiliaryConfig())
+            count = sum(settings[x] != plain[x] for x in plain) + ("adapt" in changes)
+            count += sum(value != losses[x] for x, value in dataclasses.asdict(changed).items())
+            assert count == (name != "lora_sp")
 
 
 def test_tasks_without_demonstrations_keep_the_numbers_of_instructions():
@@ -184,6 +215,50 @@ def test_tasks_without_demonstrations_keep_the_numbers_of_instructions():
     rows = flatten([*shown.values()]).instruction
     first = len(every["press"].instructions)
     assert {*rows.tolist()} == {*(first + every["pour"].instruction[:2]).tolist()}
+
+
+@pytest.mark.parametrize("kind", ["sequential_sp", "protected", "no_spectral", "single"])
+def test_a_sequence_learns_task_after_task(kind, tmp_path, monkeypatch):
+    tasks, learned, shown = ("press", "pick_place"), [], []
+    config = dataclasses.replace(CONFIG, tasks=tasks)
+    (folder := tmp_path / "pi0" / kind / "o0").mkdir(parents=True)
+    run = make_run(folder / "s0", config, random_backbone(Pi0Config.dummy()))
+    start = run.policy.model
+    every = {task: random_episodes(task, 0) for task in tasks}
+
+    def train(stage):
+        learned.append((stage, [task for task, x in stage.episodes.items() if x.num_episodes]))
+        return real(stage)
+
+    def evaluate(run, scenes):
+        layer = next(x.child for x in paths.locate(nnx.List([run.policy.model]), AdaptedLayer))
+        params = layer.adapter.get_value()
+        shown.append([np.array(params["router"]["w1"]), np.array(params["bank"]["u"])])
+        return {"outcomes": {f"{scene}/{x}": "01" for scene in scenes for x in run.config.tasks}}
+
+    real = sequences.learned
+    monkeypatch.setattr(sequences, "learned", train)
+    monkeypatch.setattr(sequences.scenes, "judge", evaluate)
+    monkeypatch.setattr(sequences.setup, "build", lambda *_: SimpleNamespace(model=start))
+    monkeypatch.setattr(sequences, "shared_demonstrations", lambda *_: every)
+    found = sequences.judge(run, kind, 0, 0)
+    stages, of = zip(*learned, strict=True)
+    assert [*of] == [["press"], ["pick_place"]]
+    assert [x.config.optim.steps for x in stages] == [CONFIG.optim.steps // 2] * 2
+    assert [x.config.auxiliary.spectral == 0 for x in stages] == [kind == "no_spectral"] * 2
+    began = [stage.policy.model is start for stage in stages]
+    assert began == [True, kind == "single"]
+    if kind == "single":
+        assert [*found["outcomes"]] == ["1/press", "2/pick_place"]
+        return
+    assert [*found["outcomes"]] == [f"{k}/{task}" for k in range(3) for task in tasks]
+    moved = [
+        [bool((new != old).any()) for new, old in zip(after, before, strict=True)]
+        for before, after in itertools.pairwise(shown)
+    ]
+    assert moved[0] == [True, True]  # the first task trains all
+    assert moved[1][0] == (kind != "protected")
+    assert ("protected" in found) == (kind == "protected")
 
 
 @pytest.fixture(scope="module")
@@ -209,6 +284,9 @@ def test_half_of_an_update_is_merged(lora):
     base, whole = kernel(model), kernel(adaptation.merge(model))
     np.testing.assert_allclose(kernel(after), base / 2 + whole / 2, atol=1e-5)
     assert np.abs(whole - base).max() > 1e-3
+    for location in paths.locate(nnx.List([after]), AdaptedLayer):
+        if location.child.adapter is not None:  # new ones, without an update
+            assert not np.any(location.child.adapter.get_value()["lora_b"])
 
 
 def test_a_policy_that_teaches_itself_makes_no_error(lora, tmp_path):
