@@ -38,7 +38,7 @@ from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.processors import of_datasets, processor
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.relative import for_robot
-from lorasp_jax.training.replay import replayed_tasks
+from lorasp_jax.training.replay import with_replayed
 from lorasp_jax.training.run import Run
 
 Collect = Callable[[Config, Path, Progress], Demonstrations]
@@ -92,7 +92,7 @@ def build(
     if config.protect:
         protect.check(config)
     sizes = {"image_size": config.image_size, "control_dt": config.control_dt}
-    tasks = () if config.data.source else (*config.tasks, *replayed_tasks(config))
+    tasks = () if config.data.source else with_replayed(config).tasks
     environments = [envs.make(task, robot=config.robot, **sizes) for task in tasks]
     use_bundled = abstract and hub.is_remote(config.model.tokenizer)
     tokenizer = load_tokenizer("" if use_bundled else config.model.tokenizer)
@@ -309,11 +309,10 @@ def _collect(run: Run, instructions: Sequence[str], collect: Collect) -> Demonst
                 bar_ids[task] = progress.add_task(text, total=total)
             progress.update(bar_ids[task], completed=done, description=text)
 
-        replayed, config = replayed_tasks(run.config), run.config
-        if replayed:
+        config = with_replayed(run.config)
+        if replayed := config.tasks[len(run.config.tasks) :]:
             share = f"{100 * config.data.replay:g} % of the windows"
             run.console.print(f"{share} are of what the base was taught: {', '.join(replayed)}")
-            config = dataclasses.replace(config, tasks=(*config.tasks, *replayed))
         episodes = collect(config, run.folder, report)
     # Steps refer to instructions by index.
     if [phrase for group in episodes.values() for phrase in group.instructions] != [*instructions]:
