@@ -11,6 +11,7 @@ import pytest
 from flax import nnx
 
 from lorasp_jax.models import flow_matching
+from lorasp_jax.models.flow_matching import Times
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
 from tests.models.random_models import observation, random_backbone
@@ -63,7 +64,7 @@ def _trained(model: Any, obs: Any, actions: jax.Array) -> Any:
     optimizer = optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, STEPS))
 
     def loss(params: Any, key: jax.Array) -> jax.Array:
-        noise, time = flow_matching.draw(key, actions, MAX_DELAY)
+        noise, time = flow_matching.draw(key, actions, Times(max_delay=MAX_DELAY))
         model = nnx.merge(graphdef, params)
         error, _ = model.loss(key, obs, actions, noise=noise, flow_time=time)
         return jnp.mean(error, where=(time > 0)[..., None])
