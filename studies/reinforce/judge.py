@@ -96,7 +96,7 @@ def judge(run: Run, trial: Trial) -> dict[str, Any]:
     That is a row per iteration: minutes, environment steps, and success by task of the policy's and
     the teachers' own episodes and, if evaluated, on fixed layouts, in the scenes of learning, as
     `before` is. `shifted` has the outcomes in a shifted scene, such as "after/pour", if all tasks
-    were learned. If teachers taught some, `outcomes` has the others, too.
+    were learned. If teachers taught some, `before` and `outcomes` have the others, too.
     """
     folder = run.folder / "learned"
     folder.mkdir(exist_ok=True)
@@ -114,7 +114,8 @@ def judge(run: Run, trial: Trial) -> dict[str, Any]:
     if not trial.tasks:
         found["shifted"] = _shifted(run, after)
     elif trial.learning.method == "teacher":
-        found["outcomes"] = _outcomes(after, "recorded", run.config.tasks)
+        for when, policy in (("before", run), ("outcomes", after)):
+            found[when] = _outcomes(policy, "recorded", run.config.tasks)
     return found
 
 

@@ -54,7 +54,7 @@ def cell(backbone: str, count: int, policy: str, seed: int) -> str:
 
 def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
     """Write the figures into `folder`; return the tables, with the seeds that have run."""
-    seeds = {(b, n): _seeds(results, b, n, "start", "teacher") for b in BACKBONES for n in COUNTS}
+    seeds = {(b, n): _seeds(results, b, n, "teacher") for b in BACKBONES for n in COUNTS}
     _figure(results, folder / "progress.svg")
     _rank_figure(results, folder / "ranks.svg")
     return {
@@ -69,9 +69,9 @@ def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
     }
 
 
-def _seeds(results: Results, backbone: str, count: int, *policies: str) -> list[int]:
-    """Return the seeds whose policies have all run."""
-    return [s for s in SEEDS if all(cell(backbone, count, p, s) in results for p in policies)]
+def _seeds(results: Results, backbone: str, count: int, policy: str) -> list[int]:
+    """Return the seeds of which a policy has run."""
+    return [s for s in SEEDS if cell(backbone, count, policy, s) in results]
 
 
 def _outcomes(
@@ -80,9 +80,13 @@ def _outcomes(
     policy: str,
     seeds: Sequence[int],
     tasks: Sequence[str] = TASKS,
+    when: str = "outcomes",
 ) -> np.ndarray:
-    """Stack the episodes of a policy's seeds, bool `[S, T, N]`."""
-    found = [results[cell(*where, policy, seed)]["outcomes"] for seed in seeds]
+    """Stack the episodes of a policy's seeds, bool `[S, T, N]`; `when` "before": of its start.
+
+    That is the start that it began from, which each computer has trained for itself.
+    """
+    found = [results[cell(*where, policy, seed)][when] for seed in seeds]
     return statistics.outcomes([[{"outcomes": {t: x[t] for t in tasks}}] for x in found])
 
 
@@ -94,9 +98,9 @@ def _success_table(results: Results, seeds: dict[tuple[str, int], list[int]]) ->
         if own:
             at = results, (backbone, count)
             stacked = [
-                _outcomes(*at, policy, own, tasks)
+                _outcomes(*at, "teacher", own, tasks, when)
                 for tasks in (TASKS, HARD)
-                for policy in ("start", "teacher")
+                for when in ("before", "outcomes")
             ]
             row += [page.percent(statistics.success(x)) for x in stacked]
             row += [f"{_last(*at, own, 'environment_steps') / 1e6:.1f} M"]
@@ -141,7 +145,7 @@ def _gains(
     if not seeds:
         return [page.NONE] * len(TASKS)
     pairs = [
-        [_outcomes(results, where, name, seeds, [task]) for name in (policy, "start")]
+        [_outcomes(results, where, policy, seeds, [task], when) for when in ("outcomes", "before")]
         for task in TASKS
     ]
     return [page.points(statistics.difference(*pair)) for pair in pairs]
@@ -196,12 +200,12 @@ def _scene_table(results: Results) -> str:
             ("learned as recorded", "teacher", "after"),
             ("learned in shifted scenes", "randomized", "after"),
         ):
-            own = _seeds(results, *where, "start", name)
+            own = _seeds(results, *where, name)
             row = [BACKBONES[backbone], label, str(len(own))]
             if own:
-                policy = "start" if when == "before" else name
+                recorded = "before" if when == "before" else "outcomes"
                 stacked = [
-                    _outcomes(results, where, policy, own),
+                    _outcomes(results, where, name, own, when=recorded),
                     _shifted(results, where, name, own, when),
                 ]
                 row += [page.percent(statistics.success(x)) for x in stacked]
@@ -223,7 +227,7 @@ def _forgetting_table(results: Results) -> str:
     """Return the gains of policies that learned `HARD` alone, by task over paired episodes."""
     rows = []
     for backbone in BACKBONES:
-        own = _seeds(results, backbone, COUNTS[0], "start", "some")
+        own = _seeds(results, backbone, COUNTS[0], "some")
         gains = _gains(results, (backbone, COUNTS[0]), "some", own)
         rows.append([BACKBONES[backbone], str(len(own)), *gains])
     return page.table(["gain [points]", "seeds", *TASKS], rows)
@@ -233,13 +237,14 @@ def _owner_table(results: Results) -> str:
     """Return success in one task by the number of own episodes."""
     rows = []
     for backbone in BACKBONES:
-        cases = {"before": ("start",), "its 16 demonstrations alone": ("imitation_0",)}
+        cases = {"before": (f"noise_{EPISODES[1]}",)}
+        cases |= {"its 16 demonstrations alone": ("imitation_0",)}
         cases |= {label: tuple(f"{x}_{n}" for n in EPISODES) for x, label in OWNERS.items()}
         for label, names in cases.items():
-            row = [BACKBONES[backbone], label]
+            row, when = [BACKBONES[backbone], label], "before" if label == "before" else "outcomes"
             for name in names:
                 own = _seeds(results, backbone, COUNTS[0], name)
-                where = results, (backbone, COUNTS[0]), name, own, [OWNED]
+                where = results, (backbone, COUNTS[0]), name, own, [OWNED], when
                 row.append(
                     page.percent(statistics.success(_outcomes(*where))) if own else page.NONE
                 )

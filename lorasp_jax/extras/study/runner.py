@@ -82,7 +82,7 @@ def work(
         if not runnable:
             return
         runnable.sort(key=lambda name: group_of[name] != group_of.get(last))
-        run = functools.partial(_run_claimed, study, folder, run_cell, say)
+        run = functools.partial(_run_claimed, study, folder, run_cell, say, set())
         # The best cell that is free; then look again, because it may have enabled better ones.
         ran = next((name for name in runnable if run(name)), "")
         if not ran:
@@ -90,11 +90,20 @@ def work(
         last = ran or last
 
 
-def _run_claimed(study: Study, folder: Path, run_cell: RunCell, say: Say, name: str) -> bool:
-    """Run a cell, after those of `_due`; return False if another worker has claimed one of them."""
+def _run_claimed(
+    study: Study, folder: Path, run_cell: RunCell, say: Say, taken: set[str], name: str
+) -> bool:
+    """Run a cell, after those of `_due`; return False if another worker has claimed one of them.
+
+    Those are added to `taken`, and not tried again: a source that is released between two of the
+    cells that need it must not let the second one run before the first.
+    """
     for due in _due(study, folder, study[name]):
+        if due.name in taken:
+            return False
         with _claimed(folder, due.name) as claimed:
             if not claimed:
+                taken.add(due.name)
                 return False
             statuses = progress.read(study, folder)
             config = statuses[due.name].config

@@ -1,3 +1,4 @@
+import contextlib
 import dataclasses
 import multiprocessing
 import random
@@ -113,6 +114,32 @@ def test_workers_run_a_missing_source_once(folder, tmp_path):
     names = ["cut/s0", "cut/again"]
     work_together(3, empty, names, fakes.run_slowly, started)
     assert sorted(ran(empty)) == ["cut/again", "cut/s0", "lora/s0"]
+
+
+@contextlib.contextmanager
+def _taken_at_first(claimed, folder, name, seen):
+    """Claim a cell, unless it is the first time that the source is asked for."""
+    if name == "lora/s0" and not seen:
+        seen.append(name)
+        yield False
+        return
+    with claimed(folder, name) as own:
+        yield own
+
+
+def test_a_source_that_is_released_in_between_does_not_change_the_order(
+    folder, tmp_path, monkeypatch
+):
+    work(folder)
+    finished = fakes.results(folder)
+    finished.pop("cut/s0")
+    empty, claimed, seen = tmp_path / "empty", runner._claimed, []
+    empty.mkdir()
+    monkeypatch.setattr(runner, "_claimed", lambda *at: _taken_at_first(claimed, *at, seen))
+    second = Derived("cut/again", "lora/s0", study()["cut/s0"].transform, ("sp/s0",))
+    started = dataclasses.replace(study(), cells=(*study().cells, second), finished=finished)
+    work(empty, ["cut/s0", "cut/again"], of=started)
+    assert ran(empty) == ["lora/s0", "cut/s0", "cut/again"]
 
 
 def test_kills_do_not_change_the_results(folder, tmp_path):
