@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from flax import nnx
 
@@ -18,7 +19,9 @@ from lorasp_jax.extras.study.held_out import shared_demonstrations
 from lorasp_jax.extras.study.study import Results
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.peft import LoRA, LoRASP, Method
-from lorasp_jax.training import activations, setup
+from lorasp_jax.peft.auxiliary import Aux
+from lorasp_jax.peft.method import Params
+from lorasp_jax.training import activations, rules, setup
 from lorasp_jax.training.run import Run
 from studies.few.judge import judge as judge_scenes
 from studies.where_it_pays import names, sequences
@@ -35,6 +38,7 @@ RECIPES: Mapping[str, tuple[Method, dict[str, Any]]] = {
     "spectral_0": (_BANK, {"auxiliary": AuxiliaryConfig(spectral=0.0)}),
     "spectral_0.1": (_BANK, {"auxiliary": AuxiliaryConfig(spectral=0.1)}),
     "balance_0": (_BANK, {"auxiliary": AuxiliaryConfig(balance=0.0)}),
+    "z_0.01": (_BANK, {"auxiliary": AuxiliaryConfig(z=0.01)}),
     "scale_1": (replace(_BANK, alpha=1.0 * names.WIDE), {}),
     "scale_4": (replace(_BANK, alpha=4.0 * names.WIDE), {}),
     "expert": (_BANK, {"adapt": ("expert-only=lora_sp:64", "all-linear=lora:64")}),
@@ -65,23 +69,20 @@ def cells(
         own, group = names.recipe(backbone, name, seed), f"{backbone}/{name}"
         after = tuple(pilots[method.name])
         yield Cell(own, config, after, group, evaluate=judge_scenes, pool=pool)
-    evaluate, source = (
-        functools.partial(judge_eva, pool=pool),
-        names.recipe(backbone, "lora_sp", seed),
-    )
-    settings = {"initialization": "eva", "pool": pool}
-    own = names.recipe(backbone, "eva", seed)
-    yield Derived(own, source, settings=settings, evaluate=evaluate)
+    source = names.recipe(backbone, "lora_sp", seed)
+    for name in CHANGES:
+        evaluate = functools.partial(judge_changed, name=name, pool=pool)
+        settings = {"change": name, "pool": pool}
+        own = names.recipe(backbone, name, seed)
+        yield Derived(own, source, settings=settings, evaluate=evaluate)
 
 
-def judge_eva(run: Run, pool: int) -> dict[str, Any]:
-    """Train the run's policy anew from a bank whose V are the leading inputs of each layer."""
+def judge_changed(run: Run, name: str, pool: int) -> dict[str, Any]:
+    """Train the run's policy anew, with one of `CHANGES` of its new adapters."""
     episodes = shared_demonstrations(run.folder.parents[2], pool, run.config, run.folder, _silent)
     learner = dataclasses.replace(run, episodes=episodes)
-    model = setup.build(run.config, run.folder).model
-    batches = activations.sampled(learner, run.policy.processor, model.config.chunk)
-    moments = calibration.input_moments(model, batches, ".*", activations.loss)
-    learner.policy = replace(run.policy, model=_with_leading_inputs(model, moments))
+    model = CHANGES[name](learner, setup.build(run.config, run.folder).model)
+    learner.policy = replace(run.policy, model=model)
     learner.policy = sequences.learned(learner)
     return judge_scenes(learner)
 
@@ -90,20 +91,82 @@ def _silent(*_: Any) -> None:
     """Report no progress."""
 
 
-def _with_leading_inputs(model: Backbone, moments: Mapping[str, Any]) -> Backbone:
-    """Return a model whose V begin with the eigenvectors of Σ x xᵀ (EVA, arXiv 2410.07170).
+def _eva(run: Run, model: Backbone) -> Backbone:
+    """Begin with the leading directions of each layer's inputs x (EVA, arXiv 2410.07170)."""
+    batches = activations.sampled(run, run.policy.processor, model.config.chunk)
+    moments = calibration.input_moments(model, batches, ".*", activations.loss)
+    return _changed(model, lambda path, layer: _with_leading(layer, moments[path]))
+
+
+def _pissa(run: Run, model: Backbone) -> Backbone:
+    """Begin with the leading directions of each kernel (as PiSSA, arXiv 2404.02948), but U = 0."""
+    del run
+
+    def change(path: str, layer: AdaptedLayer) -> None:
+        del path
+        kernel = layer.kernel_matrices().astype(jnp.float32)
+        _with_leading(layer, kernel @ kernel.mT)
+
+    return _changed(model, change)
+
+
+def _with_leading(layer: AdaptedLayer, moments: jax.Array) -> None:
+    """Let V of a layer begin with the leading eigenvectors of `moments` `[..., I, I]`.
 
     They have the length that V have otherwise; a bank wider than the input keeps its other V.
     """
+    _, params = layer.method_and_params()
+    v = params["bank"]["v"]
+    leading = jnp.linalg.eigh(moments)[1][..., ::-1][..., : v.shape[-1]]
+    leading *= jnp.linalg.norm(v[..., : leading.shape[-1]], axis=-2, keepdims=True)
+    v = v.at[..., : leading.shape[-1]].set(leading)
+    layer.adapter = AdapterParam({**params, "bank": {**params["bank"], "v": v}})
+
+
+class _SharedInChunk(LoRASP):
+    """LoRA-SP whose tokens all have the mean of their scores."""
+
+    def bottleneck(
+        self, params: Params, rows: jax.Array, token_mask: jax.Array | None
+    ) -> tuple[jax.Array, Aux]:
+        """Average what the router sees over tokens `[..., T]`, all valid, if there are some."""
+        if rows.ndim > 2:
+            hidden = rows[..., self.rank :]
+            hidden = jnp.broadcast_to(hidden.mean(-2, keepdims=True), hidden.shape)
+            rows = jnp.concatenate([rows[..., : self.rank], hidden], axis=-1)
+        return super().bottleneck(params, rows, token_mask)
+
+    def implementation(self, params: Params) -> LoRASP:
+        """These functions, not the fused kernel."""
+        del params
+        return self
+
+
+def _with_methods(run: Run, model: Backbone, action: Method, others: Method) -> Backbone:
+    """Give the layers of the action expert a method, and the others another, of the same size."""
+    del run
+
+    def change(path: str, layer: AdaptedLayer) -> None:
+        layer.method = action if rules.tower(path) == "action" else others
+
+    return _changed(model, change)
+
+
+def _changed(model: Backbone, change: Callable[[str, AdaptedLayer], None]) -> Backbone:
+    """Return a copy of a model, after a change of each of its adapted layers, given their paths."""
     root = nnx.List([nnx.clone(model)])
     for location in paths.locate(root, AdaptedLayer):
-        layer = location.child
-        if layer.adapter is None:
-            continue
-        params = layer.adapter.get_value()
-        v = params["bank"]["v"]
-        leading = jnp.linalg.eigh(moments[location.path])[1][..., ::-1][..., : v.shape[-1]]
-        leading *= jnp.linalg.norm(v[..., : leading.shape[-1]], axis=-2, keepdims=True)
-        v = v.at[..., : leading.shape[-1]].set(leading)
-        layer.adapter = AdapterParam({**params, "bank": {**params["bank"], "v": v}})
+        if location.child.adapter is not None:
+            change(location.path, location.child)
     return root[0]
+
+
+_LOW, _HIGH = (replace(_BANK, energy_target=target) for target in (0.8, 0.99))
+CHANGES: Mapping[str, Callable[[Run, Backbone], Backbone]] = {
+    "eva": _eva,
+    "pissa": _pissa,
+    "eta_vlm": functools.partial(_with_methods, action=_LOW, others=_HIGH),
+    "eta_expert": functools.partial(_with_methods, action=_HIGH, others=_LOW),
+    "chunk": functools.partial(_with_methods, action=_SharedInChunk(names.WIDE), others=_BANK),
+}
+"""Changes of a model with new adapters by recipe; see `page.RECIPES`."""

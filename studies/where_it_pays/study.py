@@ -4,8 +4,8 @@
         --results studies/where_it_pays/results.json --jobs 8
 
 Policies learn four tasks as in studies/few, from 120 demonstrations of each. Every method and rank
-has the better of two learning rates, chosen with a seed that no table uses; LoRA with ranks by
-layer takes that of LoRA with their mean.
+has the best of two or three learning rates, chosen with a seed that no table uses; LoRA with ranks
+by layer takes that of LoRA with their mean.
 """
 
 import functools
@@ -32,6 +32,8 @@ from studies.where_it_pays.judge import best_rate, judge
 
 RATES = (1e-3, 3e-3)
 """Learning rates, of which pilots choose one per backbone, method and rank."""
+HIGHER = 1e-2
+"""A third one of ranks up to 16, whose first pilots had much more success at the higher rate."""
 MAKE: Mapping[str, Callable[[int], Method]] = {
     "lora": lambda rank: LoRA(rank=rank),
     "lora_sp": lambda rank: LoRASP(rank=rank),
@@ -237,7 +239,8 @@ def _shapes(backbone: str, size: str, targets: tuple[str, ...]) -> plan.Shapes:
 
 
 def _pilots(backbone: str, method: str, rank: int) -> tuple[str, ...]:
-    return tuple(f"{backbone}/pilot/{method}_r{rank}/{rate}" for rate in RATES)
+    rates = (*RATES, HIGHER) if rank <= 16 else RATES
+    return tuple(f"{backbone}/pilot/{method}_r{rank}/{rate}" for rate in rates)
 
 
 def _config(

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -197,7 +198,7 @@ def numbers(block):
 def test_the_recipes_differ_in_one_thing():
     made = [recipes.RECIPES[name] for name in recipes.RECIPES]
     assert all(first != other for i, first in enumerate(made) for other in made[:i])
-    assert {*recipes.RECIPES, "eva"} == {*page.RECIPES}
+    assert {*recipes.RECIPES, *recipes.CHANGES} == {*page.RECIPES}
     plain = to_settings(recipes.RECIPES["lora_sp"][0])
     losses = dataclasses.asdict(AuxiliaryConfig())
     for name, (method, changes) in recipes.RECIPES.items():
@@ -301,22 +302,65 @@ def test_a_policy_that_teaches_itself_makes_no_error(lora, tmp_path):
     assert float(forms.Taught(with_adapters(CONFIG))(model, model, *drawn)[0].mean()) > 1e-6
 
 
-def test_leading_inputs_begin_the_bank():
-    def banks(model):
-        layers = paths.locate(nnx.List([model]), AdaptedLayer)
-        adapters = {x.path: x.child.adapter for x in layers if x.child.adapter is not None}
-        return {path: adapter.get_value()["bank"]["v"] for path, adapter in adapters.items()}
+def adapted(model):
+    """The adapted layers of a model by path."""
+    found = {x.path: x.child for x in paths.locate(nnx.List([model]), AdaptedLayer)}
+    return {path: layer for path, layer in found.items() if layer.adapter is not None}
 
+
+def banks(model):
+    """V of the layers of a model by path."""
+    return {path: x.adapter.get_value()["bank"]["v"] for path, x in adapted(model).items()}
+
+
+def test_leading_inputs_begin_the_bank(monkeypatch, tmp_path):
     model = with_adapters(CONFIG)
     before, third = banks(model), {}
     for path, v in before.items():
         third[path] = jnp.zeros((*v.shape[:-1], v.shape[-2])).at[..., 3, 3].set(1.0)
-    after = banks(recipes._with_leading_inputs(model, third))
+    monkeypatch.setattr(recipes.calibration, "input_moments", lambda *_: third)
+    run = make_run(tmp_path, CONFIG, random_backbone(Pi0Config.dummy()))
+    after = banks(recipes.CHANGES["eva"](run, model))
     for path, v in after.items():
         lengths = [np.linalg.norm(bank[path], axis=-2) for bank in (before, after)]
         np.testing.assert_allclose(*lengths, rtol=1e-5)
         first = np.abs(v[..., 0]) / lengths[1][..., :1]
         np.testing.assert_allclose(first, np.broadcast_to(np.eye(v.shape[-2])[3], first.shape))
+
+
+def test_leading_directions_of_the_kernels_begin_the_bank():
+    model = with_adapters(CONFIG)
+    after = recipes.CHANGES["pissa"](None, model)
+    for path, v in banks(after).items():
+        kernel = adapted(model)[path].kernel_matrices()
+        leading = jnp.linalg.svd(kernel)[0][..., 0]
+        cosine = (v[..., 0] * leading).sum(-1) / jnp.linalg.norm(v[..., 0], axis=-1)
+        np.testing.assert_allclose(jnp.abs(cosine), 1, atol=1e-3)
+    assert any((v != banks(after)[path]).any() for path, v in banks(model).items())
+
+
+def test_methods_of_the_action_expert_and_of_the_others():
+    made = recipes.CHANGES["eta_vlm"](None, with_adapters(CONFIG))
+    targets = {path: layer.method.energy_target for path, layer in adapted(made).items()}
+    assert targets == {path: 0.8 if rules.tower(path) == "action" else 0.99 for path in targets}
+    assert {*targets.values()} == {0.8, 0.99}
+
+
+def test_actions_of_a_chunk_share_their_scores():
+    plain, shared = LoRASP(rank=8), recipes._SharedInChunk(rank=8)
+    params = plain.init_params(jax.random.key(0), 16, 4)
+    params["router"]["w2"] = jax.random.normal(jax.random.key(1), params["router"]["w2"].shape)
+    x = jax.random.normal(jax.random.key(2), (3, 5, 16))
+    x = x.at[1].set(x[1, :1])  # tokens that are equal
+    found = [
+        method.bottleneck(params, x @ method.down(params), None)[1].active_rank
+        for method in (plain, shared)
+    ]
+    assert (found[0] != found[0][:, :1]).any()
+    np.testing.assert_array_equal(found[1], jnp.broadcast_to(found[1][:, :1], found[1].shape))
+    np.testing.assert_array_equal(found[0][1], found[1][1])
+    assert shared.implementation(params) is shared
+    assert plain != shared  # or they would share programs
 
 
 def with_updates(model):
