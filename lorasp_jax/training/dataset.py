@@ -266,6 +266,24 @@ def without(steps: Steps, held_out: Collection[int]) -> Steps:
     return dataclasses.replace(steps, starts=starts)
 
 
+def limit(run: Run, task: str) -> None:
+    """Limit the recordings of a run to one of its tasks, without what the run has held out.
+
+    Raises:
+        ValueError: none of its episodes to train on are of the task.
+    """
+    assert run.recordings is not None
+    assert run.dataset is not None
+    if task not in run.episodes:
+        raise ValueError(f"{run.folder} trained on no episode of {task}")
+    cache, steps = run.recordings, run.dataset
+    others = [n for n in range(len(cache)) if cache.episode(n, ()).task != task]
+    starts = np.arange(len(steps.end), dtype=np.int32) if steps.starts is None else steps.starts
+    starts = starts[~np.isin(cache.episodes, others)[starts]]
+    run.dataset = mixed(dataclasses.replace(steps, starts=starts, mixture=None), run.config.data)
+    run.episodes = {task: run.episodes[task]}
+
+
 def corrected_only(steps: Steps, cache: Cache, episodes: Collection[int]) -> Steps:
     """Return steps whose windows, in some episodes, start and end within runs of corrections."""
     if not episodes:

@@ -50,7 +50,7 @@ def _run(options: argparse.Namespace) -> None:
         raise ValueError("--heal changes what --save writes: add --save and --out")
     if options.heal is not None and options.heal < 1:
         raise ValueError(f"--heal must be at least 1 step, got {options.heal}")
-    variants.check_run(options.run, options.task)
+    variants.check_run(options.run, options.task, simulated=not options.save)
     if options.save:
         settings = {"heal": options.heal or 0, "task": options.task}
         variants.save(options.run, options.save, options.out, **settings)

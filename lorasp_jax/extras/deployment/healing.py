@@ -9,8 +9,9 @@ from rich.console import Console
 
 import lorasp_jax
 from lorasp_jax.config import Config
+from lorasp_jax.models.backbone import BackboneConfig
 from lorasp_jax.peft import AdaLoRA
-from lorasp_jax.training import loop, rules, start
+from lorasp_jax.training import dataset, export, loop, rules, start
 from lorasp_jax.training.demonstrations import are_cached, demonstrations
 from lorasp_jax.training.finished_run import recorded_config
 from lorasp_jax.training.replay import with_replayed
@@ -30,8 +31,8 @@ def check(run: Path, task: str = "") -> Config:
 
     Raises:
         ValueError: it is not finished, has learned something other than its data, has adapters that
-            cannot train on, some of its demonstrations are gone, or recordings would have to be
-            limited to a task; see also `start.with_kept`.
+            cannot train on, or some of its demonstrations are gone; see also `start.with_kept` and
+            `check_datasets`.
     """
     config, recorded = recorded_config(run, simulated=False), read_json(run / CONFIG_FILE)
     if task:
@@ -48,13 +49,36 @@ def check(run: Path, task: str = "") -> Config:
         "some of its demonstrations are gone": not (
             config.data.source or are_cached(with_replayed(config), run)
         ),
-        f"it has learned from recordings, which cannot be limited to {task}": bool(
-            task and config.data.source
-        ),
     }
     if reason := next((text for text, applies in reasons.items() if applies), ""):
         raise ValueError(f"{run} cannot be healed: {reason}")
+    check_datasets(run)
     return start.with_kept(config, run, config, (), ())
+
+
+def check_datasets(run: Path) -> None:
+    """Raise ValueError if a run's policy sees each of several datasets in another way.
+
+    A form acts for one of them, and the others' data are not for it.
+    """
+    if names := export.datasets(export.describe(run)):
+        raise ValueError(
+            f"the datasets of {run} have statistics or cameras of their own: a form of its policy "
+            f"would act for {names[0]}, but learn from all"
+        )
+
+
+def recorded(config: Config, run: Path, model: BackboneConfig, task: str = "") -> Run:
+    """Return a finished run with its data, of a task alone if it is given.
+
+    Raises:
+        ValueError: the data are gone, or none of the recordings that the run has learned are of the
+            task.
+    """
+    data = start.with_data(config, run, model, demonstrations)
+    if data.recordings and task:
+        dataset.limit(data, task)
+    return data
 
 
 def heal(
@@ -63,17 +87,16 @@ def heal(
     """Return a policy whose adapters have trained on with the data of a finished run.
 
     For the arguments see `train_on`; `run` is the run's folder. With a `task`, its demonstrations
-    alone are the data, and its instructions must be the policy's only ones.
+    alone are the data.
 
     Raises:
-        ValueError: see `check` and `loop.train`; or the data are gone or have other instructions.
+        ValueError: see `check`, `recorded` and `loop.train`; or the policy lacks an instruction.
     """
-    config = check(run, task)
-    data = start.with_data(config, run, policy.model.config, demonstrations)
-    if not data.recordings:
+    data = recorded(check(run, task), run, policy.model.config, task)
+    if not data.recordings:  # whose steps refer to all instructions, as the policy does
         spoken = [phrase for group in data.episodes.values() for phrase in group.instructions]
-        if spoken != [*policy.processor.prompts.instructions]:
-            raise ValueError(f"the demonstrations of {run} have other instructions than its policy")
+        steps_, rows = data.steps, policy.processor.prompts.rows(spoken)
+        data.dataset = dataclasses.replace(steps_, instruction=rows[steps_.instruction])
     return train_on(policy, data, steps)
 
 

@@ -6,18 +6,22 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from flax import nnx
 
 import lorasp_jax
+from envs.datasets.episodes import Episodes
 from lorasp_jax.base import compilation_cache as cache
 from lorasp_jax.base.files import check_local
 from lorasp_jax.extras.deployment import healing
 from lorasp_jax.extras.study.held_out import held_out_demonstrations
-from lorasp_jax.training import export, rules, start
+from lorasp_jax.training import activations, export, records, rules, start
 from lorasp_jax.training.base import in_bf16, quantized
 from lorasp_jax.training.demonstrations import Demonstrations
 from lorasp_jax.training.finished_run import recorded_config
 from lorasp_jax.training.fixed_batches import Keyed, forward, keyed_batches
+from lorasp_jax.training.run import Run
+from lorasp_jax.training.run_folder import read_json
 
 BATCH_SIZE, BATCHES = 64, 8
 """Windows per batch, and batches per task, for calibration and for the loss."""
@@ -88,7 +92,7 @@ def is_bank(method: Any) -> bool:
 def in_form(
     policy: lorasp_jax.policies.Policy,
     form: str,
-    episodes: Demonstrations,
+    data: Demonstrations | Run,
     heal: Callable[[lorasp_jax.policies.Policy], lorasp_jax.policies.Policy] | None = None,
 ) -> lorasp_jax.policies.Policy:
     """Return a policy whose adapters have another form, and whose frozen weights are in bf16.
@@ -96,20 +100,25 @@ def in_form(
     Args:
         policy: a LoRA-SP policy; not modified.
         form: one of `FORMS`.
-        episodes: calibration data by task; all tasks count alike.
+        data: calibrates; episodes by task, of which all tasks count alike, or a run whose data do.
         heal: trains the adapters before they are merged, such as `healing.heal`; None: do not.
     """
     model = in_bf16(policy.model)
     policy = dataclasses.replace(policy, model=model)
-    by_task = keyed_batches(policy, episodes, BATCH_SIZE, BATCHES)
-    together = [pair for pairs in by_task.values() for pair in pairs]
-    policy = dataclasses.replace(policy, model=FORMS[form](model, together))
+    policy = dataclasses.replace(policy, model=FORMS[form](model, _batches(policy, data)))
     if heal:
-        del by_task, together  # training needs their memory
         policy = heal(policy)
     if form == "merged":
         policy = dataclasses.replace(policy, model=in_bf16(lorasp_jax.merge(policy.model)))
     return policy
+
+
+def _batches(policy: lorasp_jax.policies.Policy, data: Demonstrations | Run) -> Batches:
+    """Return what calibrates a form of a policy; see `in_form`."""
+    if isinstance(data, Run):
+        return [*activations.sampled(data, policy.processor, policy.model.config.chunk)]
+    by_task = keyed_batches(policy, data, BATCH_SIZE, BATCHES)
+    return [pair for pairs in by_task.values() for pair in pairs]
 
 
 def on_base(policy: lorasp_jax.policies.Policy, base: str) -> lorasp_jax.policies.Policy:
@@ -117,13 +126,19 @@ def on_base(policy: lorasp_jax.policies.Policy, base: str) -> lorasp_jax.policie
     return dataclasses.replace(policy, model=quantized(policy.model, BASES[base]))
 
 
-def check_run(run: Path, task: str = "") -> None:
-    """Raise ValueError unless a run is finished, can be simulated, and has LoRA-SP layers.
+def check_run(run: Path, task: str = "", *, simulated: bool = False) -> None:
+    """Raise ValueError unless a run is finished and has LoRA-SP layers.
 
-    A run that has learned its noise is refused, too: other weights need other noise; and so is a
-    `task`, if given, that is none of its own.
+    Variants are only compared if its tasks can be `simulated`. A run that has learned its noise is
+    refused, too: other weights need other noise; and so is a `task`, if given, that is none of its
+    own.
     """
-    config = recorded_config(run)
+    config = recorded_config(run, simulated=False)
+    if simulated and not _is_simulated(run):
+        raise ValueError(
+            f"the tasks of {run} cannot be simulated: make a variant with --save, and compare it "
+            "with the run by lorasp-jax evaluate"
+        )
     start.refuse_actor(run, "make variants of the run that it started from")
     if not any(map(is_bank, rules.methods(config))):
         name = rules.describe(config)
@@ -138,10 +153,12 @@ def save(run: Path, name: str, out: Path, heal: int = 0, task: str = "") -> None
     The folder has the adapters and refers to the run's base, or has the merged weights. A base in
     int8 or nf4 is quantized whenever the folder is loaded. `heal` is the number of steps by which
     the adapters of the form train on, see `healing.heal`. With a `task` of the run, that task's
-    demonstrations alone calibrate and heal the form, which then has its instructions alone.
+    demonstrations alone calibrate and heal the form, which then has its instructions alone. If the
+    tasks cannot be simulated, the run's recordings calibrate.
 
     Raises:
-        ValueError: the variant is unknown, the folder exists, or the run cannot be healed.
+        ValueError: the variant is unknown, the folder exists, or the run cannot be healed; see also
+            `healing.recorded` and `healing.check_datasets`.
     """
     form, base = check(name).split("-")
     check_local(out)
@@ -150,15 +167,31 @@ def save(run: Path, name: str, out: Path, heal: int = 0, task: str = "") -> None
     if heal:
         healing.check(run, task)
     cache.enable()
-    policy, config, tasks = export.load_policy(run), recorded_config(run), (task,) if task else ()
-    config = dataclasses.replace(config, tasks=tasks or config.tasks)
-    # Those on which `measurement` calibrates.
-    episodes = held_out_demonstrations(run / "deployment", config)
-    if task:
-        policy = _with_instructions(policy, episodes[task].instructions)
+    policy, config = export.load_policy(run), recorded_config(run, simulated=False)
+    tasks = (task,) if task else ()
+    if _is_simulated(run):  # those on which `measurement` calibrates
+        config = dataclasses.replace(config, tasks=tasks or config.tasks)
+        data = held_out_demonstrations(run / "deployment", config)
+        phrases = data[task].instructions if task else ()
+    else:
+        healing.check_datasets(run)
+        data = healing.recorded(config, run, policy.model.config, task)
+        phrases = _spoken(data.episodes[task]) if task else ()
     train = functools.partial(healing.heal, run=run, steps=heal, task=task) if heal else None
-    deployed = in_form(policy, form, episodes, train)
+    deployed = in_form(policy, form, data, train)
+    if task:
+        deployed = _with_instructions(deployed, phrases)
     export.write_variant(out, deployed, run, tasks=tasks, quantized=BASES[base])
+
+
+def _is_simulated(run: Path) -> bool:
+    """Return whether the tasks of a finished run were evaluated in simulation."""
+    return bool(read_json(run / "results.json", records.RESULTS)["tasks"])
+
+
+def _spoken(episodes: Episodes) -> list[str]:
+    """Return the instructions of recordings, which refer to those of all tasks."""
+    return [episodes.instructions[row] for row in np.unique(episodes.instruction)]
 
 
 def _with_instructions(

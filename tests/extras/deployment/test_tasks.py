@@ -8,14 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from envs.datasets import rlds
 from lorasp_jax.adapters import adaptation
+from lorasp_jax.data import cache
+from lorasp_jax.data.opening import open_source
 from lorasp_jax.extras.deployment import __main__ as command
 from lorasp_jax.extras.deployment import healing, measurement, variants
 from lorasp_jax.extras.study import held_out, results
 from lorasp_jax.peft import LoRA
 from lorasp_jax.training import export
 from lorasp_jax.training.base import TRAINING
-from lorasp_jax.training.run_folder import read_json, write_json
+from lorasp_jax.training.finished_run import recorded_config
+from lorasp_jax.training.run_folder import read_json, to_json, write_json
 from tests.cases import mostly_slow
 from tests.extras.deployment.test_deployment import (  # noqa: F401  (a fixture)
     actions,
@@ -125,7 +129,7 @@ def sampled(policy, row):
 
 
 def test_the_demonstrations_of_the_task_alone_heal(run, tmp_path, capsys, monkeypatch):
-    """Others need not be there; a policy with the instructions of all is refused."""
+    """Others need not be there; the policy may have the instructions of all."""
     changed, seen = shutil.copytree(run, tmp_path / "run"), []
     (changed / "cache/press.npz").unlink()
     before = files(changed)
@@ -135,14 +139,13 @@ def test_the_demonstrations_of_the_task_alone_heal(run, tmp_path, capsys, monkey
 
     monkeypatch.setattr(healing.loop, "train", train)
     policy = export.load_policy(changed)
-    with pytest.raises(ValueError, match="have other instructions than its policy"):
-        healing.heal(policy, changed, 2, task="pour")
+    healing.heal(policy, changed, 2, task="pour")
     healing.heal(variants._with_instructions(policy, TASKS["pour"]), changed, 2, task="pour")
-    [(tasks, named, steps)] = seen
-    assert ([*tasks], named) == (["pour"], ("pour",))
     states = OWN["pour"].state[np.arange(9) < OWN["pour"].length[:, None]]
-    np.testing.assert_array_equal(steps.state, states)
-    assert set(steps.instruction.tolist()) == {0, 1}
+    for (tasks, named, steps), rows in zip(seen, ({2, 3}, {0, 1}), strict=True):
+        assert ([*tasks], named) == (["pour"], ("pour",))
+        np.testing.assert_array_equal(steps.state, states)
+        assert set(steps.instruction.tolist()) == rows
     words = changed, "--save", "half-bf16", "--out", tmp_path / "policy", "--heal", 1
     for more in ((), ("--task", "press")):
         assert "some of its demonstrations are gone" in refuse(capsys, *words, *more)
@@ -199,10 +202,64 @@ def test_refusals(run, tmp_path, capsys):
     for more in ((), words):
         error = refuse(capsys, run, "--task", "push", *more)
         assert f"{run} has no task 'push': choose one of press, pour" in error
-    config = read_json(run / "config.json")
-    recorded = shutil.copytree(run, tmp_path / "recorded")
-    data = config["data"] | {"source": "recorded"}
-    write_json(recorded / "config.json", config | {"data": data})
-    error = refuse(capsys, recorded, *words, "--task", "pour", "--heal", 1)
-    assert "it has learned from recordings, which cannot be limited to pour" in error
     assert not out.exists()
+
+
+@pytest.fixture(scope="module")
+def recorded(run, tmp_path_factory):
+    """A run that cannot be simulated, which learned from recordings of both tasks, and these."""
+    root = tmp_path_factory.mktemp("recorded")
+    for task, group in OWN.items():
+        rlds.write(group, root / task)
+    cache.write([open_source(root / task) for task in OWN], root / "joined", lambda *_: None)
+    folder = shutil.copytree(run, root / "run", ignore=shutil.ignore_patterns("cache"))
+    config = recorded_config(run)
+    data = dataclasses.replace(config.data, source=(str(root / "joined"),), validation=("1",))
+    write_json(folder / "config.json", to_json(dataclasses.replace(config, data=data)))
+    write_json(folder / "results.json", read_json(run / "results.json") | {"tasks": {}})
+    return folder
+
+
+@pytest.mark.parametrize("task", ["", "pour"])
+def test_recordings_calibrate_and_heal(recorded, tmp_path, monkeypatch, task):
+    """Not simulated demonstrations, nor episodes that are held out, nor those of other tasks."""
+    seen = []
+
+    def keep(run, *_):
+        seen.append(run)
+        return real(run, *_)
+
+    real = variants.activations.sampled
+    monkeypatch.setattr(held_out, "demonstrations", None)
+    monkeypatch.setattr(variants.activations, "sampled", keep)
+    monkeypatch.setattr(healing.loop, "train", seen.append)
+    folder = save(recorded, tmp_path / "policy", "lora-bf16", task, "--heal", "2")
+    assert len(seen) == 2
+    pour = len(OWN["press"].length)  # number of the first episode of pour
+    (spared,) = seen[0].held_out
+    for run in seen:
+        steps, cache = run.steps, run.recordings
+        learned = {*cache.episodes[steps.starts].tolist()}
+        every = {*range(pour if task else 0, len(cache))}
+        assert learned == every - {spared}
+    served = export.load_policy(folder)
+    texts = TASKS[task] if task else (*TASKS["press"], *TASKS["pour"])
+    assert {*served.processor.prompts.instructions} == {*texts}
+
+
+def test_refusals_of_recordings(recorded, tmp_path, capsys):
+    words = "--save", "lora-bf16", "--out", tmp_path / "policy"
+    error = refuse(capsys, recorded)
+    assert f"the tasks of {recorded} cannot be simulated: make a variant with --save" in error
+    changed, path = shutil.copytree(recorded, tmp_path / "run"), "adapter.json"
+    with pytest.raises(ValueError, match="run trained on no episode of push"):
+        healing.heal(export.load_policy(changed), changed, 1, task="push")
+    described = read_json(changed / path)
+    described["metadata"]["policy"]["datasets"] = {"a": {}, "b": {}}
+    write_json(changed / path, described)
+    for more in ((), ("--heal", 1)):
+        error = refuse(capsys, changed, *words, *more)
+        assert (
+            "have statistics or cameras of their own: a form of its policy would act for a" in error
+        )
+    assert not (tmp_path / "policy").exists()
