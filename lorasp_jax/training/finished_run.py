@@ -30,7 +30,7 @@ _GROUPS: dict[str, Any] = {
 
 
 def recorded_config(run: Path, *, simulated: bool = True) -> Config:
-    """Return the config of a finished run, with the robot of its policy.
+    """Return the config of a finished run, with the robot and the tasks of its policy.
 
     Raises:
         ValueError: the run is not finished, its config has settings that this version lacks, or,
@@ -44,12 +44,12 @@ def recorded_config(run: Path, *, simulated: bool = True) -> Config:
         raise ValueError(f"{run} is not a finished run: it needs {CONFIG_FILE} and results.json")
     if simulated and not finished["tasks"]:
         raise ValueError(f"the tasks of {run} cannot be simulated")
+    described = export.describe(run)  # config.json is older than a dataset, which decides these
     try:
-        config = _from_json(recorded, tuple(finished["tasks"] or recorded["tasks"]))
+        config = _from_json(recorded, tuple(finished["tasks"] or described["tasks"]))
     except TypeError as error:
         raise ValueError(f"{run / CONFIG_FILE} has settings of another version: {error}") from error
-    # config.json is older than the dataset, which decides the robot.
-    return dataclasses.replace(config, robot=export.describe(run)["robot"])
+    return dataclasses.replace(config, robot=described["robot"])
 
 
 def _from_json(recorded: Mapping[str, Any], tasks: tuple[str, ...]) -> Config:

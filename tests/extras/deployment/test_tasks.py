@@ -215,7 +215,8 @@ def recorded(run, tmp_path_factory):
     folder = shutil.copytree(run, root / "run", ignore=shutil.ignore_patterns("cache"))
     config = recorded_config(run)
     data = dataclasses.replace(config.data, source=(str(root / "joined"),), validation=("1",))
-    write_json(folder / "config.json", to_json(dataclasses.replace(config, data=data)))
+    config = dataclasses.replace(config, data=data, tasks=("open_pot",))  # the dataset's count
+    write_json(folder / "config.json", to_json(config))
     write_json(folder / "results.json", read_json(run / "results.json") | {"tasks": {}})
     return folder
 
