@@ -27,7 +27,10 @@ WARMUP = 0.1
 
 
 def check(run: Path, task: str = "") -> Config:
-    """Return the config of a finished run that can be healed, with that task alone if it is given.
+    """Return the config of a finished run that can be healed.
+
+    If a task is given and the run has demonstrations, it has that task alone; recordings are one
+    dataset, of which `with_data` takes a part.
 
     Raises:
         ValueError: it is not finished, has learned something other than its data, has adapters that
@@ -35,7 +38,7 @@ def check(run: Path, task: str = "") -> Config:
             `check_datasets`.
     """
     config, recorded = recorded_config(run, simulated=False), read_json(run / CONFIG_FILE)
-    if task:
+    if task and not config.data.source:
         data = dataclasses.replace(config.data, replay=0.0)
         config = dataclasses.replace(config, tasks=(task,), data=data)
     reasons = {
@@ -68,7 +71,7 @@ def check_datasets(run: Path) -> None:
         )
 
 
-def recorded(config: Config, run: Path, model: BackboneConfig, task: str = "") -> Run:
+def with_data(config: Config, run: Path, model: BackboneConfig, task: str = "") -> Run:
     """Return a finished run with its data, of a task alone if it is given.
 
     Raises:
@@ -90,9 +93,9 @@ def heal(
     alone are the data.
 
     Raises:
-        ValueError: see `check`, `recorded` and `loop.train`; or the policy lacks an instruction.
+        ValueError: see `check`, `with_data` and `loop.train`; or the policy lacks an instruction.
     """
-    data = recorded(check(run, task), run, policy.model.config, task)
+    data = with_data(check(run, task), run, policy.model.config, task)
     if not data.recordings:  # whose steps refer to all instructions, as the policy does
         spoken = [phrase for group in data.episodes.values() for phrase in group.instructions]
         steps_, rows = data.steps, policy.processor.prompts.rows(spoken)

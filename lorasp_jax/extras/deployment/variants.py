@@ -158,7 +158,7 @@ def save(run: Path, name: str, out: Path, heal: int = 0, task: str = "") -> None
 
     Raises:
         ValueError: the variant is unknown, the folder exists, or the run cannot be healed; see also
-            `healing.recorded` and `healing.check_datasets`.
+            `healing.with_data` and `healing.check_datasets`.
     """
     form, base = check(name).split("-")
     check_local(out)
@@ -175,7 +175,7 @@ def save(run: Path, name: str, out: Path, heal: int = 0, task: str = "") -> None
         phrases = data[task].instructions if task else ()
     else:
         healing.check_datasets(run)
-        data = healing.recorded(config, run, policy.model.config, task)
+        data = healing.with_data(config, run, policy.model.config, task)
         phrases = _spoken(data.episodes[task]) if task else ()
     train = functools.partial(healing.heal, run=run, steps=heal, task=task) if heal else None
     deployed = in_form(policy, form, data, train)

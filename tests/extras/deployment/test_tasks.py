@@ -177,6 +177,10 @@ def test_what_a_run_replays_must_be_there_too(run, dummy_base, tmp_path):
     assert healing.check(changed, "pour").data.replay == 0
     OWN["press"].save(changed / "cache/open_pot.npz")
     assert healing.check(changed).data.replay == 0.1
+    source = groups | {"data": {"replay": 0.1, "source": "recorded"}}
+    changes = {name: config[name] | group for name, group in source.items()}
+    write_json(changed / "config.json", config | changes)
+    assert healing.check(changed, "pour").data.replay == 0.1  # a part of the same dataset
 
 
 def test_variants_are_measured_on_one_task(run, capsys):
