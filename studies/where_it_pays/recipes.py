@@ -18,10 +18,10 @@ from lorasp_jax.extras.study.held_out import shared_demonstrations
 from lorasp_jax.extras.study.study import Results
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.peft import LoRA, LoRASP, Method
-from lorasp_jax.training import activations, setup
+from lorasp_jax.training import activations, loop, setup
 from lorasp_jax.training.run import Run
 from studies.few.judge import judge as judge_scenes
-from studies.where_it_pays import names, sequences
+from studies.where_it_pays import names
 from studies.where_it_pays.judge import best_rate
 
 _BANK = LoRASP(rank=names.WIDE)
@@ -82,7 +82,7 @@ def judge_eva(run: Run, pool: int) -> dict[str, Any]:
     batches = activations.sampled(learner, run.policy.processor, model.config.chunk)
     moments = calibration.input_moments(model, batches, ".*", activations.loss)
     learner.policy = replace(run.policy, model=_with_leading_inputs(model, moments))
-    learner.policy = sequences.learned(learner)
+    learner.policy = loop.trained(learner)
     return judge_scenes(learner)
 
 
