@@ -163,7 +163,7 @@ def test_rate_is_that_of_the_best_pilot():
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
-    """A run whose judge and server write down their options."""
+    """A run whose judge asks the server once, and writes down its options and the reply's shape."""
     made = make_run(tmp_path / "run")
     log = MetricsLog(made.folder)
     log.write(1, {"active_rank/vision": 3.25, "active_rank/vision/q_proj": 9.0, "task": 1.0})
@@ -171,15 +171,25 @@ def run(tmp_path, monkeypatch):
     (tmp_path / "python").write_text(
         f"#!{sys.executable}\n"
         "import json, pathlib, sys\n"
-        "if sys.argv[2].endswith('serving'):\n"
-        "    sys.exit()\n"
-        f"pathlib.Path({str(tmp_path)!r}, 'judge.txt').write_text(json.dumps(sys.argv[3:]))\n"
+        "import numpy as np\n"
+        "from lorasp_jax.extras.judge import __main__ as judging\n"
+        "from lorasp_jax.extras.serving.client import PolicyClient\n"
+        "options = judging.parser('').parse_args(sys.argv[3:])\n"
+        "with PolicyClient(options.server) as server:\n"
+        "    picture = np.zeros((32, 32, 3), np.uint8)\n"
+        "    images = dict.fromkeys(server.metadata['cameras'], picture)\n"
+        "    state = np.zeros(7, np.float32)\n"
+        "    request = {'image': images, 'state': state, 'prompt': 'press the button'}\n"
+        "    actions = np.asarray(server.infer(request)['actions'])\n"
+        "    said = [sys.argv[3:], [*actions.shape], server.metadata['denoise_steps']]\n"
+        f"pathlib.Path({str(tmp_path)!r}, 'judge.txt').write_text(json.dumps(said))\n"
         "tasks = {'door-lock': {'outcomes': [True, False]}}\n"
-        "pathlib.Path(sys.argv[-1]).write_text(json.dumps({'tasks': tasks}))\n"
+        "options.out.write_text(json.dumps({'tasks': tasks}))\n"
     )
     (tmp_path / "python").chmod(0o755)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv(judge.PYTHON, str(tmp_path / "python"))
-    monkeypatch.setattr(judge.sys, "executable", str(tmp_path / "python"))
+    monkeypatch.setattr(judge, "PROCESSES", 1)
     return made
 
 
@@ -188,9 +198,12 @@ def test_a_policy_is_served_and_judged(run, tmp_path):
     assert found["outcomes"] == {"door-lock": "10"}
     assert found["active_rank"] == {"vision": 3.25}
     assert 0 < found["trainable_parameters"] < found["total_parameters"]
-    options = judging.parser("").parse_args(json.loads((tmp_path / "judge.txt").read_text()))
+    given, shape, steps = json.loads((tmp_path / "judge.txt").read_text())
+    options = judging.parser("").parse_args(given)
     assert (options.tasks, options.episodes, options.seed) == ([*HELD_OUT], 2, 7)
     assert options.out == run.folder / "judged.json"
+    assert shape == [run.policy.model.config.chunk, 7]
+    assert steps == {"run": run.config.evaluation.denoise_steps}
     assert judge.judge("ml5", 2, 7, run) == found  # again, although there is a file
     (tmp_path / "judge.txt").unlink()
     assert judge.judge("ml45", 0, 0, run)["outcomes"] == {}
