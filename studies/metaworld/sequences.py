@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from lorasp_jax.data.cache import Cache
 from lorasp_jax.extras.study import Derived
 from lorasp_jax.policies.policy import Policy
-from lorasp_jax.training import dataset, demonstrations, start
+from lorasp_jax.training import dataset
 from lorasp_jax.training.run import Run
+from lorasp_jax.training.run_folder import CACHE
 from studies.metaworld import page
 from studies.metaworld.judge import outcomes
 from studies.metaworld.tasks import INSTRUCTIONS
@@ -33,10 +35,8 @@ def judge(run: Run, kind: str, order: int, episodes: int) -> dict[str, Any]:
     """
     method, rank, *_ = KINDS[kind]
     source = page.together(run.config.model.backbone, method, rank, run.config.seed)
-    folder = run.folder.parents[3] / source
-    model, collect = run.policy.model.config, demonstrations.demonstrations
-    cache = start.with_data(run.config, folder, model, collect).recordings
-    assert cache is not None
+    cache = Cache(run.folder.parents[3] / source / CACHE)
+    cache.verify_images()
     spoken = np.array([cache.episode(number, ()).instruction[0] for number in range(len(cache))])
 
     def demonstrate(stage: Run, shares: Mapping[str, float]) -> Run:
@@ -46,10 +46,10 @@ def judge(run: Run, kind: str, order: int, episodes: int) -> dict[str, Any]:
             left_out -= {*own[: math.ceil(share * len(own))].tolist()}
         return dataclasses.replace(stage, dataset=dataset.without(cache.steps, left_out))
 
-    def judged(policy: Policy, tasks: Sequence[str]) -> dict[str, str]:
+    def success(policy: Policy, tasks: Sequence[str]) -> dict[str, str]:
         shown = dataclasses.replace(run)
         shown.policy = policy
         return outcomes(shown, tasks, episodes, 0)
 
     tasks = page.SEQUENCES.orders[order]
-    return sequences.judged(run, kind, tasks, demonstrate, judged, whole=False)
+    return sequences.judged(run, kind, tasks, demonstrate, success, whole=False)

@@ -128,11 +128,9 @@ def _row(results: Results, backbone: str, kind: str, sequences: Sequences) -> tu
     together = _of_all(joint, sequences)
     if kind in SINGLE:
         after = _outcomes(found[0], {t: f"{k}/{t}" for k, t in enumerate(orders[0], 1)})
-        minus, rate = (
-            statistics.difference(after, together),
-            page.percent(statistics.success(after)),
-        )
-        return [rate, page.points(minus), rate, *[page.NONE] * 5], len(joint)
+        rate = page.percent(statistics.success(after))
+        minus = page.points(statistics.difference(after, together))
+        return [rate, minus, rate, *[page.NONE] * 5], len(joint)
     rates = [_rates(*pair) for pair in zip(found, orders, strict=True)]
     minus = statistics.bootstrap(_mean_minus, together, *(each.end for each in rates))
     row = [page.percent(estimate(at_end, rates, orders)), page.points(minus)]
@@ -165,8 +163,8 @@ def _of_all(seeds: Seeds, sequences: Sequences) -> np.ndarray:
 
 def _rates(seeds: Seeds, order: Sequence[str]) -> Rates:
     """Return the outcomes of policies that have learned tasks in an order."""
-    numbers = [*range(len(order))]
-    stages = ([0] * len(order), numbers, [k + 1 for k in numbers], [len(order)] * len(order))
+    count = len(order)
+    stages = [0] * count, range(count), range(1, count + 1), [count] * count
     keys = [{t: f"{k}/{t}" for k, t in zip(stage, order, strict=True)} for stage in stages]
     return Rates(*(_outcomes(seeds, each) for each in keys))
 

@@ -18,7 +18,7 @@ from lorasp_jax.extras.judge import __main__ as judging
 from lorasp_jax.extras.study import Derived, progress, statistics
 from lorasp_jax.extras.study import results as files
 from lorasp_jax.extras.study.progress import describe_config
-from lorasp_jax.training.run_folder import MetricsLog, changed_settings
+from lorasp_jax.training.run_folder import CACHE, MetricsLog, changed_settings
 from studies.metaworld import dataset, judge, page, sequences, study
 from studies.metaworld.tasks import EXTREME, GROUPS, HELD_OUT, INSTRUCTIONS, SETS
 from studies.where_it_pays import sequences as learning
@@ -181,8 +181,8 @@ def test_sequences_begin_with_what_learned_the_same_tasks_together():
 
 
 @pytest.fixture
-def cache(tmp_path):
-    """A dataset of three tasks, of which each has two episodes of its own lengths."""
+def demonstrated(tmp_path):
+    """The cache of a run of three tasks, of which each has two episodes of its own lengths."""
     tasks, rng = page.SEQUENCES.orders[0][:3], np.random.default_rng(0)
     writer = dataset.Writer(tmp_path / "data", 8)
     for length, task in enumerate(tasks, 3):
@@ -190,12 +190,14 @@ def cache(tmp_path):
         numbers = rng.uniform(-1, 1, (2, length, 4)).astype(np.float32)
         writer.add_task(INSTRUCTIONS[task], [([picture] * length, *numbers)] * 2)
     writer.close()
-    caches.write([open_source(tmp_path / "data")], tmp_path / "cache", lambda *_: None)
-    return caches.Cache(tmp_path / "cache")
+    folder = tmp_path / "pi0/together/lora_r64/s0" / CACHE
+    folder.parent.mkdir(parents=True)
+    caches.write([open_source(tmp_path / "data")], folder, lambda *_: None)
 
 
+@pytest.mark.usefixtures("demonstrated")
 @pytest.mark.parametrize("kind", ["sequential", "replay", "single"])
-def test_a_sequence_learns_each_task_from_its_demonstrations(kind, cache, tmp_path, monkeypatch):
+def test_a_sequence_learns_each_task_from_its_demonstrations(kind, tmp_path, monkeypatch):
     tasks, drawn, shown = page.SEQUENCES.orders[0][:3], [], []
     made = make_run(tmp_path / "run", dataclasses.replace(CONFIG, peft=peft.LoRA(rank=2)))
     made.folder = tmp_path / "pi0" / kind / "o0" / "s0"
@@ -212,12 +214,7 @@ def test_a_sequence_learns_each_task_from_its_demonstrations(kind, cache, tmp_pa
         shown.append([*tasks])
         return dict.fromkeys(tasks, "01")
 
-    def with_data(config, folder, *_):
-        assert folder == tmp_path / "pi0/together/lora_r64/s0"
-        return SimpleNamespace(recordings=cache)
-
     monkeypatch.setattr(sequences, "outcomes", evaluate)
-    monkeypatch.setattr(sequences.start, "with_data", with_data)
     three = dataclasses.replace(page.SEQUENCES, orders=(tasks,))
     monkeypatch.setattr(page, "SEQUENCES", three)
     monkeypatch.setattr(learning.loop, "trained", train)
