@@ -1,5 +1,6 @@
 """Activations of a model on the data of a run."""
 
+import functools
 import re
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -54,9 +55,7 @@ def batch_sampler(run: Run, processor: Processor, chunk: int) -> Callable[[jax.A
     if run.streams:
         stream = Stream(run.steps, batch_size=size, chunk=chunk, seed=run.config.seed)
         return lambda key: encode(key, next(stream), processor, state_noise=noise)
-    steps = jax.device_put(run.steps)
-    return jax.jit(
-        lambda key: sample_batch(
-            key, steps, processor, batch_size=size, chunk=chunk, state_noise=noise
-        )
-    )
+    steps, sizes = jax.device_put(run.steps), {"batch_size": size, "chunk": chunk}
+    # The steps are an argument, as a constant of their size takes long to compile.
+    draw = jax.jit(functools.partial(sample_batch, **sizes, state_noise=noise))
+    return lambda key: draw(key, steps, processor)

@@ -1,9 +1,12 @@
 """The training loop: resume, train, log, save. Evaluation and reports are callbacks."""
 
 import contextlib
+import dataclasses
 import functools
 import math
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -64,6 +67,18 @@ def train(
         state = _loop(run, state, program, checkpoints, callbacks, policy)
     run.policy = policy(state)
     _call(callbacks, run, "on_end")
+
+
+def trained(run: Run) -> Policy:
+    """Train a run on one device, without files in its folder; return its policy.
+
+    The run keeps the policy that it has. For errors see `train`.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        learner = dataclasses.replace(run, folder=Path(folder), devices=jax.devices()[:1])
+        learner.policy = run.policy
+        train(learner)
+    return learner.policy
 
 
 @contextlib.contextmanager

@@ -10,6 +10,8 @@ from lorasp_jax.extras.study import page, statistics
 from lorasp_jax.extras.study.page import BACKBONES, NONE
 from lorasp_jax.extras.study.study import Results
 from studies.metaworld.tasks import FIRST, GROUPS, HELD_OUT, SETS
+from studies.where_it_pays import sequence_page
+from studies.where_it_pays.names import WIDE
 
 LABELS = {
     "lora_sp": "LoRA-SP, R = 64",
@@ -33,10 +35,23 @@ COLUMNS: Mapping[str, Mapping[str, Sequence[str]]] = {
     "ml5": {task: (task,) for task in HELD_OUT},
 }
 """Stage -> column of its table -> the tasks that it averages."""
+TOGETHER = {"lora": "lora_r64", "lora_sp": "lora_sp"}
+"""Method of `sequence_page.KINDS` -> its name here."""
 Case = tuple[Sequence[str], str]
 """Stages that together have all tasks, and a method."""
 Seeds = Sequence[Mapping[str, Any]]
 """Results of one method, by seed."""
+
+
+def together(backbone: str, method: str, rank: int, seed: int) -> str:
+    """Return the name of the policy that learns the tasks of a sequence together."""
+    assert rank == WIDE
+    return f"{backbone}/together/{TOGETHER[method]}/s{seed}"
+
+
+_LEARNED = SETS["first10"]
+_KINDS = [kind for kind, (_, rank, *_) in sequence_page.KINDS.items() if rank == WIDE]
+SEQUENCES = sequence_page.Sequences((_LEARNED, _LEARNED[::-1]), together, kinds=_KINDS)
 
 
 def blocks(results: Results) -> dict[str, str]:
@@ -46,6 +61,7 @@ def blocks(results: Results) -> dict[str, str]:
         "sizes": _size_table,
         "shared": _shared_table,
         "ranks": _rank_table,
+        "sequences": functools.partial(sequence_page.table, sequences=SEQUENCES),
     }
     return {
         name: "\n".join(table(results, backbone) for backbone in BACKBONES)

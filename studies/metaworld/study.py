@@ -3,12 +3,14 @@
     lorasp-jax study --config studies/metaworld/study.py --results studies/metaworld/results.json
 
 Needs the demonstrations of `python -m studies.metaworld.collect` in data/SET for every set of
-tasks, and another Python environment for the judge; see the README. Three questions; the cells of
-the second are '*/first*' '*/single-*', those of the third '*/mt50/*' '*/pilot/*':
+tasks, and another Python environment for the judge; see the README. Four questions; the cells of
+the second are '*/first*' '*/single-*', those of the third '*/mt50/*' '*/pilot/*', those of the last
+'*/together/*' '*/o?/*':
 
 - Which method adapts best to fifty tasks, or to five new ones?
 - Does LoRA-SP's lead over LoRA grow with the number of tasks?
 - Does LoRA-SP depend less on R?
+- What does a policy forget that learns ten tasks one after another?
 """
 
 import dataclasses
@@ -20,10 +22,10 @@ from typing import Any
 
 from configs.metaworld import get_config
 from lorasp_jax.config import AugmentConfig, Config
-from lorasp_jax.extras.study import Cell, Study
+from lorasp_jax.extras.study import Cell, Derived, Study
 from lorasp_jax.extras.study.study import Results
 from lorasp_jax.peft import AdaLoRA, FullFineTuning, LoRA, LoRASP, Method
-from studies.metaworld import page
+from studies.metaworld import page, sequences
 from studies.metaworld.judge import judge
 from studies.metaworld.tasks import FIRST, SETS
 
@@ -74,6 +76,7 @@ STAGES = {
     "ml5": Stage("ml5", 2_000, 10),
     **{f"first{n}": Stage(f"first{n}", n * STEPS_PER_TASK, 500 // n) for n in FIRST},
     **{f"single-{task}": Stage(task, STEPS_ALONE, 50) for task in SETS["first5"]},
+    "together": Stage("first10", 10 * STEPS_ALONE, sequences.EPISODES),
 }
 
 
@@ -85,7 +88,7 @@ def get_study(scale: str) -> Study:
     return Study(NAME, tuple(cells), page=lambda _, results, __: page.blocks(results), partial=True)
 
 
-def _cells(backbone: str) -> Iterator[Cell]:
+def _cells(backbone: str) -> Iterator[Cell | Derived]:
     """Yield all policies of a backbone, each after those that it needs."""
     for method in METHODS:
         if method not in TUNED_AS:
@@ -100,6 +103,8 @@ def _cells(backbone: str) -> Iterator[Cell]:
             return _config(name, seed, best_rate(results, _pilots(name)))
 
         yield _cell(name, config, pilots, base)
+    for seed in page.SEEDS:
+        yield from sequences.cells(backbone, seed)
 
 
 def _compared(backbone: str) -> Iterator[str]:
@@ -110,6 +115,7 @@ def _compared(backbone: str) -> Iterator[str]:
         *((stage, page.LABELS) for stage in ("mt50", "ml5")),
         *((stage, page.GROWING) for stage in by_tasks),
         ("mt50", other_ranks),
+        ("together", page.TOGETHER.values()),
     )
     for stage, compared in methods:
         for method in compared:

@@ -1,5 +1,6 @@
 """The tables and the figure of README.md, from the results of all policies alone."""
 
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -92,6 +93,9 @@ RECIPES = {
 """Changes of LoRA-SP that pilots try, and LoRA."""
 RECIPE_SEEDS = (1001, 1002, 1003)
 
+_ORDER = ("press", "open_pot", "pick_place", "pour")
+SEQUENCES = sequence_page.Sequences((_ORDER, _ORDER[::-1]), cell, "recorded/")
+
 
 def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
     """Write the figure into `folder`; return the tables, with the seeds that have run."""
@@ -100,7 +104,7 @@ def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
         "ranks": _rank_table,
         "layers": _layer_table,
         "forms": _form_table,
-        "sequences": sequence_page.table,
+        "sequences": functools.partial(sequence_page.table, sequences=SEQUENCES),
         "bases": _base_table,
     }
     made = {f"{b} {name}": table(results, b) for name, table in tables.items() for b in BACKBONES}

@@ -21,10 +21,10 @@ from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.peft import LoRA, LoRASP, Method
 from lorasp_jax.peft.auxiliary import Aux
 from lorasp_jax.peft.method import Params
-from lorasp_jax.training import activations, rules, setup
+from lorasp_jax.training import activations, loop, rules, setup
 from lorasp_jax.training.run import Run
 from studies.few.judge import judge as judge_scenes
-from studies.where_it_pays import names, sequences
+from studies.where_it_pays import names
 from studies.where_it_pays.judge import best_rate
 
 _BANK = LoRASP(rank=names.WIDE)
@@ -83,7 +83,7 @@ def judge_changed(run: Run, name: str, pool: int) -> dict[str, Any]:
     learner = dataclasses.replace(run, episodes=episodes)
     model = CHANGES[name](learner, setup.build(run.config, run.folder).model)
     learner.policy = replace(run.policy, model=model)
-    learner.policy = sequences.learned(learner)
+    learner.policy = loop.trained(learner)
     return judge_scenes(learner)
 
 

@@ -1,7 +1,8 @@
 """The tables of policies that learn one task after another."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -9,7 +10,6 @@ from lorasp_jax.extras.study import page, statistics
 from lorasp_jax.extras.study.page import BACKBONES
 from lorasp_jax.extras.study.statistics import Estimate
 from lorasp_jax.extras.study.study import Results
-from studies.few.page import outcomes
 from studies.where_it_pays import names
 from studies.where_it_pays.names import METHODS, SEEDS, WIDE
 
@@ -26,29 +26,67 @@ KINDS = {
 """How tasks are learned one after another -> method, R, label, and the kind that it changes."""
 SINGLE = ("single", "single_r16")
 """Kinds whose tasks have adapters of their own, so that their order does not matter."""
-ORDERS = (("press", "open_pot", "pick_place", "pour"), ("pour", "pick_place", "open_pot", "press"))
-"""Orders of tasks."""
 
-Rates = Sequence[np.ndarray]
-"""Success rates `[..., T]` after 0 to T tasks, tasks in order of name."""
+
+@dataclass(frozen=True)
+class Sequences:
+    """What the policies of a study learn one after another.
+
+    Attributes:
+        orders: orders of its tasks.
+        together: from backbone, method, R and seed to the name of the policy that learns all tasks
+            together.
+        scene: what its outcomes have before the name of a task.
+        kinds: of `KINDS`.
+    """
+
+    orders: Sequence[Sequence[str]]
+    together: Callable[[str, str, int, int], str]
+    scene: str = ""
+    kinds: Collection[str] = tuple(KINDS)
+
+    def of_kind(self, kind: str) -> Sequence[Sequence[str]]:
+        """Return the orders in which a kind learns the tasks."""
+        return self.orders[: 1 if kind in SINGLE else None]
+
+
+class Rates(NamedTuple):
+    """Success in each task `[..., T]`, or its outcomes `[S, T, N]`, tasks in order of name.
+
+    Attributes:
+        base: before the first task is learned.
+        before: right before this task is.
+        after: right after it.
+        end: after the last task.
+    """
+
+    base: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    end: np.ndarray
+
+
 Order = Sequence[int]
 """Which of the tasks by name is learned first, second, ..."""
+Seeds = Sequence[Mapping[str, Any]]
+"""Results of one kind in one order, by seed."""
 
 
 def at_end(rates: Rates, order: Order) -> np.ndarray:
     """Mean success after the last task."""
     del order
-    return rates[-1].mean(-1)
+    return rates.end.mean(-1)
 
 
 def learned(rates: Rates, order: Order) -> np.ndarray:
     """Mean success in each task right after it was learned."""
-    return np.mean([rates[k + 1][..., task] for k, task in enumerate(order)], axis=0)
+    del order
+    return rates.after.mean(-1)
 
 
 def last(rates: Rates, order: Order) -> np.ndarray:
     """Success in the last task."""
-    return rates[-1][..., order[-1]]
+    return rates.end[..., order[-1]]
 
 
 def forgotten(rates: Rates, order: Order) -> np.ndarray:
@@ -56,63 +94,85 @@ def forgotten(rates: Rates, order: Order) -> np.ndarray:
 
     This is minus the backward transfer. The fall from the best of all later stages would be biased.
     """
-    falls = [rates[k + 1][..., task] - rates[-1][..., task] for k, task in enumerate(order[:-1])]
-    return np.mean(falls, axis=0)
+    return (rates.after - rates.end)[..., order[:-1]].mean(-1)
 
 
 def before(rates: Rates, order: Order) -> np.ndarray:
     """Mean success in a task right before it is learned, minus the base's; not the first's."""
-    gains = [rates[k][..., task] - rates[0][..., task] for k, task in enumerate(order) if k]
-    return np.mean(gains, axis=0)
+    return (rates.before - rates.base)[..., order[1:]].mean(-1)
 
 
-def table(results: Results, backbone: str) -> str:
+def table(results: Results, backbone: str, sequences: Sequences) -> str:
     """Return what policies that learn one task after another can do, learn and forget."""
     rows = []
     for method, label in METHODS.items():
-        (found,) = names.ran(results, [names.cell(backbone, method, WIDE, s) for s in SEEDS])
-        rate = statistics.success(outcomes(found, "recorded")) if found else None
+        (found,) = names.ran(results, _together(backbone, method, sequences))
+        rate = statistics.success(_of_all(found, sequences)) if found else None
         row = [page.percent(rate) if rate else page.NONE, *[page.NONE] * 7, str(len(found))]
         rows.append([f"{label}, all tasks together", *row])
-    for kind, (_, _, label, _) in KINDS.items():
-        row, count = _row(results, backbone, kind)
-        rows.append([label, *row, str(count)])
+    for kind in sequences.kinds:
+        row, count = _row(results, backbone, kind, sequences)
+        rows.append([KINDS[kind][2], *row, str(count)])
     heads = ["at the end", "minus together", "right after learning", "of these, the last"]
     heads += ["forgotten", "minus", "gained before learning", "directions protected", "seeds"]
     return page.table([f"{BACKBONES[backbone]}, success [%]", *heads], rows)
 
 
-def _row(results: Results, backbone: str, kind: str) -> tuple[list[str], int]:
+def _row(results: Results, backbone: str, kind: str, sequences: Sequences) -> tuple[list[str], int]:
     """Return the numbers of a kind, and of how many seeds they are."""
     method, _, _, changed = KINDS[kind]
-    together = [names.cell(backbone, method, WIDE, seed) for seed in SEEDS]
-    *found, joint = names.ran(results, *_policies(backbone, kind), together)
+    own, orders = _policies(backbone, kind, sequences), sequences.orders
+    *found, joint = names.ran(results, *own, _together(backbone, method, sequences))
     if not joint:
         return [page.NONE] * 8, 0
-    count = len(ORDERS[0])
+    together = _of_all(joint, sequences)
     if kind in SINGLE:
-        own = np.concatenate([outcomes(found[0], str(k + 1)) for k in range(count)], axis=1)
-        own = own[:, [*np.argsort(ORDERS[0])]]  # tasks in order of name
-        minus = page.points(statistics.difference(own, outcomes(joint, "recorded")))
-        rate = page.percent(statistics.success(own))
+        after = _outcomes(found[0], {t: f"{k}/{t}" for k, t in enumerate(orders[0], 1)})
+        rate = page.percent(statistics.success(after))
+        minus = page.points(statistics.difference(after, together))
         return [rate, minus, rate, *[page.NONE] * 5], len(joint)
-    ends = [outcomes(each, str(count)) for each in found]
-    minus = statistics.bootstrap(_mean_minus, outcomes(joint, "recorded"), *ends)
-    row = [page.percent(estimate(at_end, found)), page.points(minus)]
-    row += [page.percent(estimate(statistic, found)) for statistic in (learned, last)]
-    row += [page.points(estimate(forgotten, found)), page.NONE]
+    rates = [_rates(*pair) for pair in zip(found, orders, strict=True)]
+    minus = statistics.bootstrap(_mean_minus, together, *(each.end for each in rates))
+    row = [page.percent(estimate(at_end, rates, orders)), page.points(minus)]
+    row += [page.percent(estimate(statistic, rates, orders)) for statistic in (learned, last)]
+    row += [page.points(estimate(forgotten, rates, orders)), page.NONE]
     if changed:
-        both = names.ran(results, *_policies(backbone, kind), *_policies(backbone, changed))
-        row[-1] = page.points(estimate(forgotten, both)) if both[0] else page.NONE
+        both = names.ran(results, *own, *_policies(backbone, changed, sequences))
+        if both[0]:
+            pairs = [_rates(*pair) for pair in zip(both, [*orders, *orders], strict=True)]
+            row[-1] = page.points(estimate(forgotten, pairs, orders))
     shares = [each["protected"][-1] for order in found for each in order if "protected" in each]
     share = f"{100 * np.mean(shares):.0f} %" if shares else page.NONE
-    return [*row, page.points(estimate(before, found)), share], len(joint)
+    return [*row, page.points(estimate(before, rates, orders)), share], len(joint)
 
 
-def _policies(backbone: str, kind: str) -> list[list[str]]:
+def _policies(backbone: str, kind: str, sequences: Sequences) -> list[list[str]]:
     """Return the names of the policies of a kind by order and seed."""
-    orders = range(1 if kind in SINGLE else len(ORDERS))
+    orders = range(len(sequences.of_kind(kind)))
     return [[names.sequence(backbone, kind, order, seed) for seed in SEEDS] for order in orders]
+
+
+def _together(backbone: str, method: str, sequences: Sequences) -> list[str]:
+    return [sequences.together(backbone, method, WIDE, seed) for seed in SEEDS]
+
+
+def _of_all(seeds: Seeds, sequences: Sequences) -> np.ndarray:
+    """Return the outcomes of policies that have learned all tasks together."""
+    return _outcomes(seeds, {task: sequences.scene + task for task in sequences.orders[0]})
+
+
+def _rates(seeds: Seeds, order: Sequence[str]) -> Rates:
+    """Return the outcomes of policies that have learned tasks in an order."""
+    count = len(order)
+    stages = [0] * count, range(count), range(1, count + 1), [count] * count
+    keys = [{t: f"{k}/{t}" for k, t in zip(stage, order, strict=True)} for stage in stages]
+    return Rates(*(_outcomes(seeds, each) for each in keys))
+
+
+def _outcomes(seeds: Seeds, keys: Mapping[str, str]) -> np.ndarray:
+    """Stack some outcomes, bool `[S, T, N]`, given their keys by task."""
+    texts = [{task: seed["outcomes"][key] for task, key in keys.items()} for seed in seeds]
+    return statistics.outcomes([[{"outcomes": text}] for text in texts])
 
 
 def _mean_minus(joint: np.ndarray, *ends: np.ndarray) -> np.ndarray:
@@ -120,21 +180,21 @@ def _mean_minus(joint: np.ndarray, *ends: np.ndarray) -> np.ndarray:
 
 
 def estimate(
-    statistic: Callable[[Rates, Order], np.ndarray], found: Sequence[Sequence[Mapping[str, Any]]]
+    statistic: Callable[[Rates, Order], np.ndarray],
+    found: Sequence[Rates],
+    orders: Sequence[Sequence[str]],
 ) -> Estimate:
-    """Estimate a statistic, averaged over `ORDERS`, from the results of each by seed.
+    """Estimate a statistic, averaged over orders, from the outcomes in each.
 
-    With the results of a second kind behind those of the first, estimate the difference.
+    With those of a second kind behind those of the first, estimate the difference.
     """
-    order = [[sorted(tasks).index(task) for task in tasks] for tasks in ORDERS]
-    count = len(ORDERS[0]) + 1
+    numbers = [[sorted(order).index(task) for task in order] for order in orders]
+    size = len(Rates._fields)
 
-    def mean(*rates: np.ndarray) -> np.ndarray:
-        each = [rates[i * count : (i + 1) * count] for i in range(len(found))]
-        values = [statistic(x, order[i % len(ORDERS)]) for i, x in enumerate(each)]
-        first, second = values[: len(ORDERS)], values[len(ORDERS) :]
+    def mean(*arrays: np.ndarray) -> np.ndarray:
+        each = [Rates(*arrays[i * size : (i + 1) * size]) for i in range(len(found))]
+        values = [statistic(x, numbers[i % len(numbers)]) for i, x in enumerate(each)]
+        first, second = values[: len(numbers)], values[len(numbers) :]
         return np.mean(first, axis=0) - (np.mean(second, axis=0) if second else 0.0)
 
-    return statistics.bootstrap(
-        mean, *(outcomes(each, str(k)) for each in found for k in range(count))
-    )
+    return statistics.bootstrap(mean, *(x for rates in found for x in rates))

@@ -3,9 +3,7 @@
 import dataclasses
 import functools
 import math
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -24,9 +22,9 @@ from lorasp_jax.training.demonstrations import Demonstrations
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Run
 from studies.few import judge as scenes
-from studies.where_it_pays import names, sequence_page
+from studies.where_it_pays import names, page
 from studies.where_it_pays.judge import padded
-from studies.where_it_pays.sequence_page import ORDERS, SINGLE
+from studies.where_it_pays.sequence_page import KINDS, SINGLE, Sequences
 
 RATE = 1e-3
 """Learning rate of all kinds, since what is forgotten depends on it."""
@@ -35,60 +33,114 @@ REPLAYED = 0.02
 KEPT = 0.5
 """α of `retain`: W ← (1 - α) W_before + α W_after, after each task (RETAIN, arXiv 2512.08333)."""
 
+Demonstrate = Callable[[Run, Mapping[str, float]], Run]
+"""Returns a run with demonstrations of some tasks, given the share of those of each."""
+
 
 def cells(backbone: str, seed: int, pool: int, ranks: Sequence[int]) -> Iterator[Derived]:
     """Yield the policies of a seed that learn one task after another; see `study.Scale`."""
-    for kind, (method, rank, *_) in sequence_page.KINDS.items():
-        if rank not in ranks:
-            continue
-        source = names.cell(backbone, method, rank, seed)
-        for order in range(1 if kind in SINGLE else len(ORDERS)):
-            evaluate = functools.partial(judge, kind=kind, order=order, pool=pool)
+    kinds = [kind for kind, (_, rank, *_) in KINDS.items() if rank in ranks]
+    chosen = dataclasses.replace(page.SEQUENCES, kinds=kinds)
+    yield from derived(chosen, backbone, seed, judge, pool=pool)
+
+
+def derived(
+    sequences: Sequences, backbone: str, seed: int, evaluate: Callable[..., Any], **settings: Any
+) -> Iterator[Derived]:
+    """Yield the policies of a seed that learn one task after another.
+
+    `evaluate` is called with a run, `kind`, `order` and the settings.
+    """
+    shared = settings | {"rate": RATE, "replayed": REPLAYED, "kept": KEPT, "least": protect.LEAST}
+    for kind in sequences.kinds:
+        method, rank, *_ = KINDS[kind]
+        source = sequences.together(backbone, method, rank, seed)
+        for order, tasks in enumerate(sequences.of_kind(kind)):
+            own = functools.partial(evaluate, kind=kind, order=order, **settings)
             name = names.sequence(backbone, kind, order, seed)
-            settings = {"kind": kind, "tasks": list(ORDERS[order]), "rate": RATE, "pool": pool}
-            settings |= {"replayed": REPLAYED, "kept": KEPT, "least": protect.LEAST}
-            yield Derived(name, source, settings=settings, evaluate=evaluate)
+            recorded = {"kind": kind, "tasks": list(tasks), **shared}
+            yield Derived(name, source, settings=recorded, evaluate=own)
 
 
 def judge(run: Run, kind: str, order: int, pool: int) -> dict[str, Any]:
-    """Learn the tasks one after another, each with an equal part of the run's steps and warm-up.
+    """Return what `judged` does, in scenes as recorded."""
+    tasks = [task for task in page.SEQUENCES.orders[order] if task in run.config.tasks]
+    study_folder = run.folder.parents[3]
+    every = shared_demonstrations(study_folder, pool, run.config, run.folder, lambda *_: None)
+
+    def demonstrate(stage: Run, shares: Mapping[str, float]) -> Run:
+        counts = {t: math.ceil(share * every[t].num_episodes) for t, share in shares.items()}
+        return dataclasses.replace(stage, episodes=some(every, counts))
+
+    return judged(run, kind, tasks, demonstrate, functools.partial(_outcomes, run))
+
+
+def judged(
+    run: Run,
+    kind: str,
+    tasks: Sequence[str],
+    demonstrate: Demonstrate,
+    outcomes: Callable[[Policy, Sequence[str]], Mapping[str, str]],
+    *,
+    whole: bool = True,
+) -> dict[str, Any]:
+    """Judge a policy while it learns tasks one after another; see `policies`.
+
+    Args:
+        run: learned all tasks together.
+        kind: one of `sequence_page.KINDS`.
+        tasks: in their order.
+        demonstrate: chooses demonstrations.
+        outcomes: judges a policy on some tasks.
+        whole: whether to judge all tasks after each one, and not just that one and the next.
+
+    Returns:
+        `outcomes` by number of tasks learned and task, such as "2/pour"; of `SINGLE` kinds of each
+        task after itself alone. `protected`: the share of directions that stay after each task.
+    """
+    found, shares, ends = {}, [], (0, len(tasks))
+    for number, (policy, share) in enumerate(policies(run, kind, tasks, demonstrate)):
+        shown = tasks if whole or number in ends else tasks[number - 1 : number + 1]
+        if kind in SINGLE:
+            shown = tasks[:number][-1:]
+        texts = outcomes(policy, shown) if shown else {}
+        found |= {f"{number}/{task}": text for task, text in texts.items()}
+        shares.append(share)
+    every = {"outcomes": found, "trainable_parameters": run.parameters[0]}
+    return every | ({"protected": shares[1:]} if kind == "protected" else {})
+
+
+def policies(
+    run: Run, kind: str, tasks: Sequence[str], demonstrate: Demonstrate
+) -> Iterator[tuple[Policy, float]]:
+    """Learn tasks one after another, each with an equal part of the run's steps and warm-up.
 
     The policy begins with new adapters on the base, its processor is that of the run, which learned
     all tasks together. `SINGLE` kinds have new adapters for each task.
 
-    Returns:
-        `outcomes` by number of tasks learned and task, such as "2/pour", in scenes as recorded; of
-        `SINGLE` kinds of each task after itself alone. `protected`: the share of directions that
-        stay after each task.
+    Yields:
+        The policy before the first task and after each, and the share of directions that stay.
     """
-    config, tasks = run.config, [task for task in ORDERS[order] if task in run.config.tasks]
-    study_folder = run.folder.parents[3]
-    every = shared_demonstrations(study_folder, pool, config, run.folder, lambda *_: None)
-    start = setup.build(config, run.folder).model
+    start = setup.build(run.config, run.folder).model
     policy = dataclasses.replace(run.policy, model=start)
-    single = kind in SINGLE
-    outcomes = {} if single else _outcomes(run, policy, 0, tasks)
     protected: protect.Protected = {}
-    shares = []
+    yield policy, 0.0
     for number, task in enumerate(tasks, 1):
-        if single:
+        if kind in SINGLE:
             policy = dataclasses.replace(policy, model=start)
-        counts = {task: every[task].num_episodes}
-        if kind == "replay":
-            counts |= {t: math.ceil(REPLAYED * every[t].num_episodes) for t in tasks[: number - 1]}
-        stage = _stage(run, kind, len(tasks))
-        stage.policy, stage.episodes = policy, some(every, counts)
+        earlier = tasks[: number - 1] if kind == "replay" else ()
+        shares = {task: 1.0} | dict.fromkeys(earlier, REPLAYED)
+        stage = demonstrate(_stage(run, kind, len(tasks)), shares)
+        stage.policy = policy
         if protected:  # the first task trains all
             stage.fixed = protect.fixed(policy.model, protected)
-        policy = learned(stage)
+        policy = loop.trained(stage)
         if kind == "protected":
             protected = protect.in_use(stage, policy.model, policy.processor, protected)
-            shares.append(float(np.mean([rows.mean() for rows in protected.values()])))
         if kind == "retain":
-            policy = dataclasses.replace(policy, model=_interpolated(policy.model, config, number))
-        outcomes |= _outcomes(run, policy, number, [task] if single else tasks)
-    found = {"outcomes": outcomes, "trainable_parameters": run.parameters[0]}
-    return found | ({"protected": shares} if shares else {})
+            model = _interpolated(policy.model, run.config, number)
+            policy = dataclasses.replace(policy, model=model)
+        yield policy, float(np.mean([rows.mean() for rows in protected.values()] or [0.0]))
 
 
 def some(every: Demonstrations, counts: Mapping[str, int]) -> Demonstrations:
@@ -111,15 +163,6 @@ def _stage(run: Run, kind: str, count: int) -> Run:
     return dataclasses.replace(run, config=config)
 
 
-def learned(run: Run) -> Policy:
-    """Train a run on one device, without files in its folder; return its policy."""
-    with tempfile.TemporaryDirectory() as folder:
-        trained = dataclasses.replace(run, folder=Path(folder), devices=jax.devices()[:1])
-        trained.policy = run.policy
-        loop.train(trained)
-    return trained.policy
-
-
 def _interpolated(model: Backbone, config: Config, number: int) -> Backbone:
     """Merge `KEPT` of what LoRA has learned into the base, and return it with new adapters."""
     graphdef, adapters, frozen = adaptation.split(model)
@@ -130,9 +173,9 @@ def _interpolated(model: Backbone, config: Config, number: int) -> Backbone:
     return adaptation.adapt(merged, rules.rules(config), rngs=nnx.Rngs(key))
 
 
-def _outcomes(run: Run, policy: Policy, number: int, tasks: list[str]) -> dict[str, str]:
-    """Return the outcomes of a policy after a number of tasks."""
+def _outcomes(run: Run, policy: Policy, tasks: Sequence[str]) -> dict[str, str]:
+    """Return the outcomes of a policy by task."""
     shown = dataclasses.replace(run, config=dataclasses.replace(run.config, tasks=tuple(tasks)))
     shown.policy = padded(policy, run.config.targets)
     found = scenes.judge(shown, ("recorded",))["outcomes"]
-    return {f"{number}/{name.partition('/')[2]}": text for name, text in found.items()}
+    return {name.partition("/")[2]: text for name, text in found.items()}

@@ -1,10 +1,8 @@
 """Heal a form of a run's policy: its adapters train on, with the run's objective and data."""
 
 import dataclasses
-import tempfile
 from pathlib import Path
 
-import jax
 from rich.console import Console
 
 import lorasp_jax
@@ -121,11 +119,9 @@ def train_on(
         ValueError: see `loop.train`.
     """
     config, console = _config(run.config, steps), Console(stderr=True)
-    with tempfile.TemporaryDirectory() as folder:
-        healed = dataclasses.replace(run, config=config, folder=Path(folder), console=console)
-        healed.policy, healed.devices, healed.objective = policy, jax.devices()[:1], objective
-        loop.train(healed)
-    return healed.policy
+    learner = dataclasses.replace(run, config=config, console=console, objective=objective)
+    learner.policy = policy
+    return loop.trained(learner)
 
 
 def _config(config: Config, steps: int) -> Config:

@@ -6,19 +6,25 @@ import json
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from lorasp_jax import peft
+from lorasp_jax.data import cache as caches
+from lorasp_jax.data import open_source
 from lorasp_jax.extras.judge import __main__ as judging
-from lorasp_jax.extras.study import progress, statistics
+from lorasp_jax.extras.study import Derived, progress, statistics
 from lorasp_jax.extras.study import results as files
 from lorasp_jax.extras.study.progress import describe_config
-from lorasp_jax.training.run_folder import MetricsLog, changed_settings
-from studies.metaworld import judge, page, study
-from studies.metaworld.tasks import EXTREME, GROUPS, HELD_OUT, SETS
+from lorasp_jax.training.run_folder import CACHE, MetricsLog, changed_settings
+from studies.metaworld import dataset, judge, page, sequences, study
+from studies.metaworld.tasks import EXTREME, GROUPS, HELD_OUT, INSTRUCTIONS, SETS
+from studies.where_it_pays import sequences as learning
+from studies.where_it_pays.sequence_page import KINDS
 from tests import ROOT
-from tests.runs import make_run
+from tests.runs import CONFIG, make_run
 
 STUDY = study.get_study("accelerator")
 RESULTS = files.load(ROOT / "studies/metaworld/results.json")
@@ -110,6 +116,20 @@ def test_tables_show_what_has_run():
         assert not re.search(r"\d\.\d", table)
 
 
+def forgetting(kind, tasks):
+    """Outcomes of a policy by number of learned tasks and task, of those that are judged.
+
+    Of a task's episodes, 10 % succeed in the base, 20 % right before it, 80 % right after it, and
+    60 % at the end, or 70 % with a kind of LoRA-SP.
+    """
+    end = 0.6 if KINDS[kind][0] == "lora" else 0.7
+    found = {}
+    for k, task in enumerate(tasks, 1):
+        rates = {0: 0.1, len(tasks): end, k: 0.8} | ({k - 1: 0.2} if k > 1 else {})
+        found |= {f"{done}/{task}": "1" * round(20 * r) for done, r in rates.items()}
+    return {name: digits.ljust(20, "0") for name, digits in found.items()}
+
+
 @pytest.mark.usefixtures("few_draws")
 def test_tables_compare_numbers_of_tasks_and_ranks():
     """LoRA-SP leads r = 64 by 10 points with 5 tasks and 30 with 50, alone by none."""
@@ -117,6 +137,11 @@ def test_tables_compare_numbers_of_tasks_and_ranks():
     results = {}
     for cell in STUDY.cells:
         _, kind, method, _ = cell.name.split("/")
+        if isinstance(cell, Derived):
+            tasks = page.SEQUENCES.orders[int(method[1])]
+            results[cell.name] = {"outcomes": forgetting(kind, tasks)}
+            results[cell.name] |= {"protected": [0.25, 0.5]} if kind == "protected" else {}
+            continue
         rate = wins.get(kind, 40) if method.startswith("lora_sp") else 50 if kind in wins else 40
         stage = study.STAGES[kind]
         digits = ("1" * (rate // 10)).ljust(10, "0") * 10
@@ -130,6 +155,88 @@ def test_tables_compare_numbers_of_tasks_and_ranks():
     assert shared[3] == ["5", "50.0", "50.0", "60.0", "+10.0", "+10.0", "+20.0", "+10.0"]
     assert ranks[2][:4] == ["4", "50.0", "80.0", "+30.0"]
     assert ranks[8][1:4] == ["0.0", "0.0", "+0.0"]
+    rows = {row[0]: row[1:] for row in _rows(made["sequences"])}
+    assert rows["LoRA, all tasks together"] == ["40.0", *["–"] * 7, "3"]
+    lora = ["62.0", "+22.0", "80.0", "80.0", "+20.0", "–", "+10.0", "–", "3"]
+    assert rows["LoRA"] == lora
+    lora_sp = ["71.0", "+31.0", "80.0", "80.0", "+10.0", "−10.0", "+10.0", "–", "3"]
+    assert rows["LoRA-SP"] == lora_sp
+    protected = [*lora_sp[:5], "+0.0", "+10.0", "50 %", "3"]
+    assert rows["LoRA-SP, used directions protected"] == protected
+    assert rows["one LoRA per task, r = 64"] == ["80.0", "+40.0", "80.0", *["–"] * 5, "3"]
+
+
+def test_sequences_begin_with_what_learned_the_same_tasks_together():
+    cells = [cell for cell in STUDY.cells if isinstance(cell, Derived)]
+    assert len(cells) == 2 * 3 * (2 * 6 + 1)
+    for cell in cells:
+        backbone, kind, order, seed = cell.name.split("/")
+        method = {"lora": "lora_r64", "lora_sp": "lora_sp"}[KINDS[kind][0]]
+        assert cell.source == f"{backbone}/together/{method}/{seed}"
+        tasks = SETS["first10"][:: -1 if order == "o1" else 1]
+        assert cell.settings["tasks"] == [*tasks]
+        optim = STUDY[cell.source].config(RESULTS).optim
+        assert optim.steps == len(tasks) * study.STEPS_ALONE
+        assert optim.learning_rate == cell.settings["rate"]
+
+
+@pytest.fixture
+def demonstrated(tmp_path):
+    """The cache of a run of three tasks, of which each has two episodes of its own lengths."""
+    tasks, rng = page.SEQUENCES.orders[0][:3], np.random.default_rng(0)
+    writer = dataset.Writer(tmp_path / "data", 8)
+    for length, task in enumerate(tasks, 3):
+        picture = dataset.png(np.full((8, 8, 3), length, np.uint8))
+        numbers = rng.uniform(-1, 1, (2, length, 4)).astype(np.float32)
+        writer.add_task(INSTRUCTIONS[task], [([picture] * length, *numbers)] * 2)
+    writer.close()
+    folder = tmp_path / "pi0/together/lora_r64/s0" / CACHE
+    folder.parent.mkdir(parents=True)
+    caches.write([open_source(tmp_path / "data")], folder, lambda *_: None)
+
+
+@pytest.mark.usefixtures("demonstrated")
+@pytest.mark.parametrize("kind", ["sequential", "replay", "single"])
+def test_a_sequence_learns_each_task_from_its_demonstrations(kind, tmp_path, monkeypatch):
+    tasks, drawn, shown = page.SEQUENCES.orders[0][:3], [], []
+    made = make_run(tmp_path / "run", dataclasses.replace(CONFIG, peft=peft.LoRA(rank=2)))
+    made.folder = tmp_path / "pi0" / kind / "o0" / "s0"
+
+    def train(stage):
+        drawn.append(
+            sorted({int(stage.dataset.image["corner2"][i, 0, 0, 0]) for i in starts(stage)})
+        )
+        drawn[-1].append(stage.steps.num_starts)
+        return stage.policy
+
+    def evaluate(run, tasks, episodes, first_seed):
+        assert (run.policy.processor, episodes, first_seed) == (made.policy.processor, 5, 0)
+        shown.append([*tasks])
+        return dict.fromkeys(tasks, "01")
+
+    monkeypatch.setattr(sequences, "outcomes", evaluate)
+    three = dataclasses.replace(page.SEQUENCES, orders=(tasks,))
+    monkeypatch.setattr(page, "SEQUENCES", three)
+    monkeypatch.setattr(learning.loop, "trained", train)
+    built = SimpleNamespace(model=made.policy.model)
+    monkeypatch.setattr(learning.setup, "build", lambda *_: built)
+    found = sequences.judge(made, kind, 0, 5)["outcomes"]
+    first, second, third = tasks
+    if kind == "replay":  # one of the two episodes of each earlier task
+        assert drawn == [[3, 6], [3, 4, 3 + 8], [3, 4, 5, 3 + 4 + 10]]
+    else:
+        assert drawn == [[3, 6], [4, 8], [5, 10]]
+    if kind == "single":
+        assert shown == [[first], [second], [third]]
+        assert [*found] == [f"1/{first}", f"2/{second}", f"3/{third}"]
+    else:
+        assert shown == [[*tasks], [first, second], [second, third], [*tasks]]
+        assert {f"1/{second}", f"0/{third}", f"3/{first}"} < {*found}
+
+
+def starts(stage):
+    """Return the steps at which a run's windows may start."""
+    return stage.steps.start(np.arange(stage.steps.num_starts))
 
 
 def _rows(table):
@@ -163,7 +270,7 @@ def test_rate_is_that_of_the_best_pilot():
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
-    """A run whose judge and server write down their options."""
+    """A run whose judge asks the server once, and writes down its options and the reply's shape."""
     made = make_run(tmp_path / "run")
     log = MetricsLog(made.folder)
     log.write(1, {"active_rank/vision": 3.25, "active_rank/vision/q_proj": 9.0, "task": 1.0})
@@ -171,15 +278,25 @@ def run(tmp_path, monkeypatch):
     (tmp_path / "python").write_text(
         f"#!{sys.executable}\n"
         "import json, pathlib, sys\n"
-        "if sys.argv[2].endswith('serving'):\n"
-        "    sys.exit()\n"
-        f"pathlib.Path({str(tmp_path)!r}, 'judge.txt').write_text(json.dumps(sys.argv[3:]))\n"
+        "import numpy as np\n"
+        "from lorasp_jax.extras.judge import __main__ as judging\n"
+        "from lorasp_jax.extras.serving.client import PolicyClient\n"
+        "options = judging.parser('').parse_args(sys.argv[3:])\n"
+        "with PolicyClient(options.server) as server:\n"
+        "    picture = np.zeros((32, 32, 3), np.uint8)\n"
+        "    images = dict.fromkeys(server.metadata['cameras'], picture)\n"
+        "    state = np.zeros(7, np.float32)\n"
+        "    request = {'image': images, 'state': state, 'prompt': 'press the button'}\n"
+        "    actions = np.asarray(server.infer(request)['actions'])\n"
+        "    said = [sys.argv[3:], [*actions.shape], server.metadata['denoise_steps']]\n"
+        f"pathlib.Path({str(tmp_path)!r}, 'judge.txt').write_text(json.dumps(said))\n"
         "tasks = {'door-lock': {'outcomes': [True, False]}}\n"
-        "pathlib.Path(sys.argv[-1]).write_text(json.dumps({'tasks': tasks}))\n"
+        "options.out.write_text(json.dumps({'tasks': tasks}))\n"
     )
     (tmp_path / "python").chmod(0o755)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv(judge.PYTHON, str(tmp_path / "python"))
-    monkeypatch.setattr(judge.sys, "executable", str(tmp_path / "python"))
+    monkeypatch.setattr(judge, "PROCESSES", 1)
     return made
 
 
@@ -188,9 +305,12 @@ def test_a_policy_is_served_and_judged(run, tmp_path):
     assert found["outcomes"] == {"door-lock": "10"}
     assert found["active_rank"] == {"vision": 3.25}
     assert 0 < found["trainable_parameters"] < found["total_parameters"]
-    options = judging.parser("").parse_args(json.loads((tmp_path / "judge.txt").read_text()))
+    given, shape, steps = json.loads((tmp_path / "judge.txt").read_text())
+    options = judging.parser("").parse_args(given)
     assert (options.tasks, options.episodes, options.seed) == ([*HELD_OUT], 2, 7)
     assert options.out == run.folder / "judged.json"
+    assert shape == [run.policy.model.config.chunk, 7]
+    assert steps == {"run": run.config.evaluation.denoise_steps}
     assert judge.judge("ml5", 2, 7, run) == found  # again, although there is a file
     (tmp_path / "judge.txt").unlink()
     assert judge.judge("ml45", 0, 0, run)["outcomes"] == {}

@@ -61,7 +61,7 @@ def forgetting(kind, order):
     Of a task's episodes, 10 % succeed in the base, 20 % after other tasks, 80 % right after it,
     then 90 %, and 60 % at the end, or 70 % with a kind of LoRA-SP.
     """
-    tasks = sequence_page.ORDERS[order]
+    tasks = page.SEQUENCES.orders[order]
     if kind in sequence_page.SINGLE:
         return {f"{k}/{task}": episodes(0.6 + k / 20) for k, task in enumerate(tasks, 1)}
     end = 0.6 if sequence_page.KINDS[kind][0] == "lora" else 0.7
@@ -82,7 +82,7 @@ def results():
         text = episodes(0.5 + 0.2 * cell.name.endswith("0.003"))
         if kind in ("form_half", "recipe_relu", "planned", "second"):
             text = episodes(0.25 if "/lora/" in cell.name else 0.75)
-        outcomes = {f"{s}/{t}": text for s in page.SCENES for t in sequence_page.ORDERS[0]}
+        outcomes = {f"{s}/{t}": text for s in page.SCENES for t in page.SEQUENCES.orders[0]}
         if kind in sequence_page.KINDS:
             outcomes = forgetting(kind, int(cell.name.split("/")[2][1]))
         found[cell.name] = {
@@ -106,7 +106,7 @@ def test_policies_differ_in_what_their_names_say(results):
             if method in sequence_page.KINDS:
                 kind = [sequence_page.KINDS[method][0], "r16" if "16" in method else "r64"]
                 assert cell.source.split("/")[1:3] == kind
-                assert cell.settings["tasks"] == [*sequence_page.ORDERS[int(rank[0][1])]]
+                assert cell.settings["tasks"] == [*page.SEQUENCES.orders[int(rank[0][1])]]
             continue
         config = cell.config if isinstance(cell.config, Config) else cell.config(results)
         assert config.model.backbone == backbone
@@ -237,8 +237,8 @@ def test_a_sequence_learns_task_after_task(kind, tmp_path, monkeypatch):
         shown.append([np.array(params["router"]["w1"]), np.array(params["bank"]["u"])])
         return {"outcomes": {f"{scene}/{x}": "01" for scene in scenes for x in run.config.tasks}}
 
-    real = sequences.learned
-    monkeypatch.setattr(sequences, "learned", train)
+    real = sequences.loop.trained
+    monkeypatch.setattr(sequences.loop, "trained", train)
     monkeypatch.setattr(sequences.scenes, "judge", evaluate)
     monkeypatch.setattr(sequences.setup, "build", lambda *_: SimpleNamespace(model=start))
     monkeypatch.setattr(sequences, "shared_demonstrations", lambda *_: every)
