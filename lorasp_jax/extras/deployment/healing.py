@@ -7,7 +7,6 @@ from rich.console import Console
 
 import lorasp_jax
 from lorasp_jax.config import Config
-from lorasp_jax.models.backbone import BackboneConfig
 from lorasp_jax.peft import AdaLoRA
 from lorasp_jax.training import dataset, export, loop, rules, start
 from lorasp_jax.training.demonstrations import are_cached, demonstrations
@@ -69,14 +68,14 @@ def check_datasets(run: Path) -> None:
         )
 
 
-def with_data(config: Config, run: Path, model: BackboneConfig, task: str = "") -> Run:
-    """Return a finished run with its data, of a task alone if it is given.
+def with_data(config: Config, run: Path, policy: lorasp_jax.policies.Policy, task: str = "") -> Run:
+    """Return a finished run with its data, of a task alone if it is given, for its policy.
 
     Raises:
         ValueError: the data are gone, or none of the recordings that the run has learned are of the
             task.
     """
-    data = start.with_data(config, run, model, demonstrations)
+    data = start.with_data(config, run, policy.model.config, demonstrations)
     if data.recordings and task:
         dataset.limit(data, task)
     return data
@@ -93,7 +92,7 @@ def heal(
     Raises:
         ValueError: see `check`, `with_data` and `loop.train`; or the policy lacks an instruction.
     """
-    data = with_data(check(run, task), run, policy.model.config, task)
+    data = with_data(check(run, task), run, policy, task)
     if not data.recordings:  # whose steps refer to all instructions, as the policy does
         spoken = [phrase for group in data.episodes.values() for phrase in group.instructions]
         steps_, rows = data.steps, policy.processor.prompts.rows(spoken)

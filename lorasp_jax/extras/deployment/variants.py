@@ -10,7 +10,6 @@ import numpy as np
 from flax import nnx
 
 import lorasp_jax
-from envs.datasets.episodes import Episodes
 from lorasp_jax.base import compilation_cache as cache
 from lorasp_jax.base.files import check_local
 from lorasp_jax.extras.deployment import healing
@@ -175,8 +174,8 @@ def save(run: Path, name: str, out: Path, heal: int = 0, task: str = "") -> None
         phrases = data[task].instructions if task else ()
     else:
         healing.check_datasets(run)
-        data = healing.with_data(config, run, policy.model.config, task)
-        phrases = _spoken(data.episodes[task]) if task else ()
+        data = healing.with_data(config, run, policy, task)
+        phrases = _spoken(data, task) if task else ()
     train = functools.partial(healing.heal, run=run, steps=heal, task=task) if heal else None
     deployed = in_form(policy, form, data, train)
     if task:
@@ -189,8 +188,9 @@ def _is_simulated(run: Path) -> bool:
     return bool(read_json(run / "results.json", records.RESULTS)["tasks"])
 
 
-def _spoken(episodes: Episodes) -> list[str]:
-    """Return the instructions of recordings, which refer to those of all tasks."""
+def _spoken(run: Run, task: str) -> list[str]:
+    """Return the instructions of a task of a run on recordings, whose table has those of all."""
+    episodes = run.episodes[task]
     return [episodes.instructions[row] for row in np.unique(episodes.instruction)]
 
 
