@@ -6,7 +6,7 @@ import functools
 import hashlib
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -127,15 +127,15 @@ def report(source: Source, console: Console) -> None:
     if len(summary.phrases) > _MAX_INSTRUCTIONS:
         console.print(f"         and {len(summary.phrases) - _MAX_INSTRUCTIONS} more")
     console.print(_value_table(summary))
-    for hint in [*hints(summary), *prompt_hints(summary.phrases)]:
+    for hint in [*hints(summary.state, summary.grippers), *prompt_hints(summary.phrases)]:
         console.print(hint, style="yellow", soft_wrap=True, highlight=False, markup=False)
 
 
-def hints(summary: Summary) -> list[str]:
-    """Return hints about probable unit errors in a recording."""
-    is_gripper = np.isin(np.arange(summary.state.shape[1]), summary.grippers)
-    joints = np.abs(summary.state[:, ~is_gripper]).max(initial=0)
-    gripper = np.abs(summary.state[:, is_gripper]).max()
+def hints(state: np.ndarray, grippers: Sequence[int]) -> list[str]:
+    """Return hints about probable unit errors in states `[N, J+1]`; some numbers are grippers'."""
+    is_gripper = np.isin(np.arange(state.shape[1]), grippers)
+    joints = np.abs(state[:, ~is_gripper]).max(initial=0)
+    gripper = np.abs(state[:, is_gripper]).max()
     texts = []
     if joints > 2 * math.pi:
         texts.append(

@@ -30,7 +30,8 @@ def open_sources(
     paths = [os.fspath(where) for where in wheres]
     real = [_real(path) for path in paths]
     if twice := [path for path, where in zip(paths, real, strict=True) if real.count(where) > 1]:
-        raise ValueError(f"{twice[0]} is named twice, also as {twice[1]}")
+        other = f", also as {twice[1]}" * (twice[1] != twice[0])
+        raise ValueError(f"{twice[0]} is named twice{other}")
     short = [_name(path) for path in paths]
     names = dict(zip(short if len({*short}) == len(short) else paths, paths, strict=True))
     return Joined({name: open_source(path, keys) for name, path in names.items()}, cameras, fit)

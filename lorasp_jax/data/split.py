@@ -49,8 +49,9 @@ def held_out(
     count = round(number if number >= 1 else max(number * len(tasks), number > 0))
     if number < 0 or (number % 1 and number > 1) or 0 < count >= len(tasks):
         raise ValueError(
-            f"data.validation must be a share below 1 or a number of episodes below {len(tasks)}, "
-            f"which is how many {'there are' if among is None else 'succeeded'}, got {choice[0]}"
+            f"data.validation must leave some of the {len(tasks)} episodes that "
+            f"{'there are' if among is None else 'succeeded'}: a share below 1 or a number, got "
+            f"{choice[0]}"
         )
     chosen = _spread(count, tasks, phrases)
     if count and not chosen:

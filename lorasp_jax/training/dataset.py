@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import shutil
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,13 +15,13 @@ from envs.datasets.episodes import Episodes, concatenate
 from envs.names import names
 from lorasp_jax.base.bars import bars
 from lorasp_jax.config import Config, DataConfig
-from lorasp_jax.data import cache
+from lorasp_jax.data import cache, inspection
 from lorasp_jax.data.batches import Mixture, Steps
 from lorasp_jax.data.cache import Cache
 from lorasp_jax.data.joined import Part, parts_of
 from lorasp_jax.data.keys import Keys
 from lorasp_jax.data.opening import open_sources
-from lorasp_jax.data.source import Progress, Source, same_period
+from lorasp_jax.data.source import Progress, Source, grippers, same_period
 from lorasp_jax.data.split import held_out
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.policies.images import resize_with_pad, to_unit
@@ -122,7 +123,7 @@ def _resized(image: jax.Array, model: BackboneConfig) -> jax.Array:
 
 def load(run: Run, source: Source, free_bytes: float) -> None:
     """Load the dataset of a run; stream it if it is larger than `free_bytes`."""
-    data = run.config.data
+    data, made = run.config.data, not (run.folder / CACHE).exists()
     with bars(run.console, "steps") as progress:
         bar = progress.add_task(f"reading {' '.join(data.source)}", total=None)
         report = lambda done, total: progress.update(bar, completed=done, total=total)  # noqa: E731
@@ -156,7 +157,12 @@ def load(run: Run, source: Source, free_bytes: float) -> None:
     if cache.parts[1:]:
         identity["datasets"] = shares(run.dataset, cache.parts)
     streams = sum(x.nbytes for x in jax.tree.leaves(run.dataset)) > free_bytes
-    run.streams = record_dataset(run.folder, identity, streams=streams)
+    try:
+        run.streams = record_dataset(run.folder, identity, streams=streams)
+    except ValueError:
+        if made and processes.is_first():  # the next attempt must read the dataset again
+            shutil.rmtree(run.folder / CACHE, ignore_errors=True)
+        raise
     run.config = dataclasses.replace(
         run.config, robot=metadata["robot"], tasks=tuple(metadata["tasks"])
     )
@@ -184,12 +190,18 @@ def _describe(run: Run, cache: Cache, datasets: Sequence[Mapping[str, Any]]) -> 
     console = run.console
     location = "streamed from disk" if run.streams else "held on the device"
     console.print(f"{cache.num_steps} steps in {len(cache)} episodes, {location}")
-    for part, each in zip(cache.parts, datasets, strict=False):
+    assert run.dataset is not None
+    starts = slice(None) if run.dataset.starts is None else run.dataset.starts
+    learned = cache.dataset[np.unique(cache.episodes[starts])]
+    for index, (part, each) in enumerate(zip(cache.parts, datasets, strict=False)):
         text = (
-            f"  {100 * each['share']:.1f} % of the windows from {part.name}: {part.episodes} "
-            f"episodes, {each['windows']} windows, cameras {', '.join(part.cameras)}"
+            f"  {100 * each['share']:.1f} % of the windows from {part.name}: "
+            f"{(learned == index).sum()} episodes, {each['windows']} windows, cameras "
+            f"{', '.join(part.cameras)}"
         )
         console.print(text, markup=False, soft_wrap=True)
+    for text in _doubts(cache):
+        console.print(f"warning: {text}", style="yellow", markup=False, soft_wrap=True)
     if datasets and run.config.data.statistics == "each":
         console.print(
             "each dataset is normalized by its own statistics; the policy acts for "
@@ -202,6 +214,16 @@ def _describe(run: Run, cache: Cache, datasets: Sequence[Mapping[str, Any]]) -> 
         console.print(f"held out of training: {len(run.held_out)} episodes ({names})")
     if recipe := run.augmentation:
         console.print(f"images change while training, by the recipe of {recipe.preset}")
+
+
+def _doubts(cache: Cache) -> Iterator[str]:
+    """Say which datasets seem to have other units or another robot than they should."""
+    for index, part in enumerate(cache.parts):
+        rows = cache.dataset[cache.episodes] == index
+        hints = inspection.hints(np.asarray(cache.steps.state)[rows], grippers(cache, "state"))
+        yield from (f"{part.name}: {text} to lorasp-jax inspect --save" for text in hints)
+    if cache.parts[1:] and " + " in (robot := cache.metadata["robot"]):
+        yield f"the robots are {robot}: their joints must have the same order, signs and units"
 
 
 def as_cache(source: Source, folder: Path, progress: Progress) -> Cache:
@@ -266,22 +288,28 @@ def without(steps: Steps, held_out: Collection[int]) -> Steps:
     return dataclasses.replace(steps, starts=starts)
 
 
-def limit(run: Run, task: str) -> None:
-    """Limit the recordings of a run to one of its tasks, without what the run has held out.
+def limit(run: Run, task: str) -> list[str]:
+    """Limit the recordings of a run to a task or an instruction; return their instructions.
+
+    What the run has held out stays so.
 
     Raises:
         ValueError: none of its episodes to train on are of the task.
     """
     assert run.recordings is not None
     assert run.dataset is not None
-    if task not in run.episodes:
-        raise ValueError(f"{run.folder} trained on no episode of {task}")
-    cache, steps = run.recordings, run.dataset
-    others = [n for n in range(len(cache)) if cache.episode(n, ()).task != task]
+    cache, steps, spoken = run.recordings, run.dataset, {}
+    for number in range(len(cache)):
+        episode = cache.episode(number, ())
+        phrase = episode.instructions[int(episode.instruction[0])]
+        if task in (episode.task, phrase):
+            spoken[number] = phrase
     starts = np.arange(len(steps.end), dtype=np.int32) if steps.starts is None else steps.starts
-    starts = starts[~np.isin(cache.episodes, others)[starts]]
+    starts = starts[np.isin(cache.episodes, [*spoken])[starts]]
+    if not len(starts):
+        raise ValueError(f"{run.folder} trained on no episode of {task}")
     run.dataset = mixed(dataclasses.replace(steps, starts=starts, mixture=None), run.config.data)
-    run.episodes = {task: run.episodes[task]}
+    return [*dict.fromkeys(spoken.values())]
 
 
 def corrected_only(steps: Steps, cache: Cache, episodes: Collection[int]) -> Steps:

@@ -81,6 +81,8 @@ def parse(arguments: Sequence[str], program: str = "python train.py") -> Command
     given = frozenset(option.lstrip("-").replace("-", "_") for option in options)
     given |= {"peft"} if known.method else set()
     given |= {"plan"} if known.plan else set()
+    if "tasks" in given and config.data.source:
+        raise ValueError("--tasks names simulated tasks, but --data.source decides them: drop it")
     return Command(config, known.resume, known.dry_run, known.wandb, known.fit, given)
 
 

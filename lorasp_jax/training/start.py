@@ -73,10 +73,16 @@ def with_data(
         folder: the run's.
         model: config of its backbone.
         collect: loads or collects its demonstrations.
+
+    Raises:
+        ValueError: its recordings are gone, or are others.
     """
     run = Run(config, folder, Console(quiet=True), base_hash="")
     if config.data.source:
-        dataset.load(run, dataset.open_dataset(config, model, folder), free_bytes=0.0)
+        try:
+            dataset.load(run, dataset.open_dataset(config, model, folder), free_bytes=0.0)
+        except ValueError as error:
+            raise ValueError(f"the recordings of {folder} cannot be read: {error}") from error
         return run
     run.episodes = collect(with_replayed(config), folder, lambda *_: None)
     return run

@@ -29,7 +29,7 @@ def test_summary(source):
         "pick up the red cube and place it in the basket": 2,
         "press the green button": 2,
     }
-    assert not inspection.hints(found)
+    assert not inspection.hints(found.state, found.grippers)
 
 
 def test_another_period_than_that_of_training_is_said(source, monkeypatch):
@@ -42,8 +42,7 @@ def test_another_period_than_that_of_training_is_said(source, monkeypatch):
 
 def test_a_gripper_alone_has_no_joints(source):
     found = inspection.summarize(source)
-    alone = dataclasses.replace(found, state=2 + found.state[:, 6:], grippers=[0])
-    (hint,) = inspection.hints(alone)
+    (hint,) = inspection.hints(2 + found.state[:, 6:], [0])
     assert "--gripper millimetres" in hint
 
 
@@ -65,12 +64,10 @@ def test_dimensions_have_names(actions, source):
 def test_wrong_units_give_hints(source):
     found = inspection.summarize(source)
     scale = np.array([57.3] * 6 + [1000], np.float32)
-    degrees, millimetres = inspection.hints(dataclasses.replace(found, state=found.state * scale))
+    degrees, millimetres = inspection.hints(found.state * scale, found.grippers)
     assert "--angles degrees" in degrees
     assert "--gripper millimetres" in millimetres
-    two_arms = dataclasses.replace(found, state=np.tile(found.state * [*[1] * 6, 100], 2))
-    two_arms = dataclasses.replace(two_arms, grippers=[6, 13])
-    (hint,) = inspection.hints(two_arms)
+    (hint,) = inspection.hints(np.tile(found.state * [*[1] * 6, 100], 2), [6, 13])
     assert "--gripper millimetres" in hint
 
 

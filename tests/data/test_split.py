@@ -35,7 +35,7 @@ def test_a_task_of_one_episode_is_learned_from():
 @pytest.mark.parametrize(
     ("choice", "named"),
     [
-        (["30"], "below 30.*30"),
+        (["30"], "leave some of the 30 episodes that there are.*got 30"),
         (["0.01", "x"], "episode_29"),
         (["1.5"], r"1\.5"),
         (["-1"], "-1"),

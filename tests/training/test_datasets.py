@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import shutil
 from pathlib import Path
 
 import jax
@@ -29,7 +30,7 @@ from lorasp_jax.training.loop import train
 from lorasp_jax.training.overrides import parse
 from lorasp_jax.training.replay import replayed_tasks
 from lorasp_jax.training.run import Run
-from lorasp_jax.training.run_folder import read_json, to_json, write_json
+from lorasp_jax.training.run_folder import CACHE, read_json, to_json, write_json
 from tests import ROOT
 from tests.models.random_models import random_backbone
 from tests.runs import CONFIG, Terminate, leaves, random_episodes
@@ -146,7 +147,8 @@ def test_the_run_says_what_it_learns_from(run, tmp_path):
     printed = run.console.file.getvalue()
     count = run.steps.num_starts
     far = int((run.steps.dataset[run.steps.starts] == 1).sum())
-    assert f"75.0 % of the windows from near: 3 episodes, {count - far} windows" in printed
+    assert f"75.0 % of the windows from near: 2 episodes, {count - far} windows" in printed
+    assert "warning: far" not in printed
     assert "cameras side\n" in printed
     assert re.search(r"acts for near .*--dataset", printed)
     facts = read_json(run.folder / "dataset.json")["facts"]["datasets"]
@@ -157,6 +159,37 @@ def test_the_run_says_what_it_learns_from(run, tmp_path):
     (run.folder / "metrics.jsonl").unlink()
     assert "far.toml" in page
     assert re.search(rf"<td>far</td>.*>3</td>.*>{far}</td>.*>25\.0 %</td>", page)
+
+
+def test_other_units_and_robots_are_said(sources, tmp_path, monkeypatch):
+    degrees = dataclasses.replace(recorded(1, 57.3), robot="so101")
+    rlds.write(degrees, tmp_path / "degrees")
+    both = config((sources[0], str(tmp_path / "degrees")), statistics="shared")
+    printed = prepare(tmp_path, monkeypatch, "", config=both).console.file.getvalue()
+    said = [line for line in printed.splitlines() if line.startswith("warning: ")]
+    assert not any(line.startswith("warning: near: joint angles") for line in said)
+    joints, gripper, robots = (line for line in said if not line.startswith("warning: near"))
+    assert joints.startswith("warning: degrees: joint angles reach ")
+    assert joints.endswith("add --angles degrees to lorasp-jax inspect --save")
+    assert gripper.startswith("warning: degrees: the gripper opens to ")
+    assert "the robots are piper + so101: their joints must have the same order" in robots
+
+
+def test_a_dataset_that_was_changed_and_restored_is_read_again(sources, tmp_path, monkeypatch):
+    folder, source = tmp_path / "run", tmp_path / "near"
+    folder.mkdir()
+    shutil.copytree(sources[0], source)
+    own = config((str(source),), statistics="shared")
+    steps = prepare(folder, monkeypatch, "", config=own).steps
+    shutil.rmtree(folder / CACHE)
+    shutil.move(source, tmp_path / "original")
+    rlds.write(recorded(5, 1.0), source)
+    with pytest.raises(ValueError, match="dataset differs"):
+        prepare(folder, monkeypatch, "", config=own)
+    shutil.rmtree(source)
+    shutil.move(tmp_path / "original", source)
+    again = prepare(folder, monkeypatch, "", config=own)
+    jax.tree.map(np.testing.assert_array_equal, again.steps, steps)
 
 
 def test_it_resumes_to_the_bit_also_streamed(run, sources, tmp_path, monkeypatch):

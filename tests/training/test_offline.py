@@ -358,7 +358,7 @@ def test_recap_learns_from_failures_with_corrections(tmp_path):
     ("validation", "sentence"),
     [
         (("episode_1",), "names episode_1, which did not succeed, so --learn filtered cannot"),
-        (("1",), "number of episodes below 0, which is how many succeeded, got 1"),
+        (("1",), "must leave some of the 0 episodes that succeeded"),
     ],
 )
 def test_failures_are_not_held_out(validation, sentence, tmp_path):

@@ -68,6 +68,7 @@ def test_fit_knows_which_settings_are_given():
         (["--confg", "configs/multitask.py"], "--config is required"),
         ([*MULTITASK, "--method", "lorra"], "lorra.*lora_sp"),
         ([*MULTITASK, "--dry-run", "--resume"], "cannot be combined"),
+        ([*MULTITASK, "--data.source=mine", "--tasks", "fold"], "decides them: drop it"),
         ([*MULTITASK, "--resume", "always"], "--resume: invalid choice: 'always'.*auto"),
     ],
 )

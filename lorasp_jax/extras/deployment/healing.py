@@ -27,7 +27,7 @@ def check(run: Path, task: str = "") -> Config:
     """Return the config of a finished run that can be healed.
 
     If a task is given and the run has demonstrations, it has that task alone; recordings are one
-    dataset, of which `with_data` takes a part.
+    dataset, of which `dataset.limit` takes a part.
 
     Raises:
         ValueError: it is not finished, has learned something other than its data, has adapters that
@@ -64,21 +64,8 @@ def check_datasets(run: Path) -> None:
     if names := export.datasets(export.describe(run)):
         raise ValueError(
             f"the datasets of {run} have statistics or cameras of their own: a form of its policy "
-            f"would act for {names[0]}, but learn from all"
+            f"would act for {names[0]}, but learn from all; train with --data.statistics shared"
         )
-
-
-def with_data(config: Config, run: Path, policy: lorasp_jax.policies.Policy, task: str = "") -> Run:
-    """Return a finished run with its data, of a task alone if it is given, for its policy.
-
-    Raises:
-        ValueError: the data are gone, or none of the recordings that the run has learned are of the
-            task.
-    """
-    data = start.with_data(config, run, policy.model.config, demonstrations)
-    if data.recordings and task:
-        dataset.limit(data, task)
-    return data
 
 
 def heal(
@@ -90,13 +77,17 @@ def heal(
     alone are the data.
 
     Raises:
-        ValueError: see `check`, `with_data` and `loop.train`; or the policy lacks an instruction.
+        ValueError: see `check`, `dataset.limit` and `loop.train`; or the policy lacks one of the
+            instructions.
     """
-    data = with_data(check(run, task), run, policy, task)
-    if not data.recordings:  # whose steps refer to all instructions, as the policy does
+    data = start.with_data(check(run, task), run, policy.model.config, demonstrations)
+    if data.recordings:
+        if task:
+            dataset.limit(data, task)
+    else:  # whose steps refer to all instructions, as the policy does
         spoken = [phrase for group in data.episodes.values() for phrase in group.instructions]
-        steps_, rows = data.steps, policy.processor.prompts.rows(spoken)
-        data.dataset = dataclasses.replace(steps_, instruction=rows[steps_.instruction])
+        learned, rows = data.steps, policy.processor.prompts.rows(spoken)
+        data.dataset = dataclasses.replace(learned, instruction=rows[learned.instruction])
     return train_on(policy, data, steps)
 
 

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 from flax import nnx
 
 import lorasp_jax
@@ -14,9 +13,9 @@ from lorasp_jax.base import compilation_cache as cache
 from lorasp_jax.base.files import check_local
 from lorasp_jax.extras.deployment import healing
 from lorasp_jax.extras.study.held_out import held_out_demonstrations
-from lorasp_jax.training import activations, export, records, rules, start
+from lorasp_jax.training import activations, dataset, export, records, rules, start
 from lorasp_jax.training.base import in_bf16, quantized
-from lorasp_jax.training.demonstrations import Demonstrations
+from lorasp_jax.training.demonstrations import Demonstrations, demonstrations
 from lorasp_jax.training.finished_run import recorded_config
 from lorasp_jax.training.fixed_batches import Keyed, forward, keyed_batches
 from lorasp_jax.training.run import Run
@@ -104,7 +103,9 @@ def in_form(
     """
     model = in_bf16(policy.model)
     policy = dataclasses.replace(policy, model=model)
-    policy = dataclasses.replace(policy, model=FORMS[form](model, _batches(policy, data)))
+    batches = [] if form == "whole" else _batches(policy, data)
+    policy = dataclasses.replace(policy, model=FORMS[form](model, batches))
+    del batches  # training needs its memory
     if heal:
         policy = heal(policy)
     if form == "merged":
@@ -142,8 +143,11 @@ def check_run(run: Path, task: str = "", *, simulated: bool = False) -> None:
     if not any(map(is_bank, rules.methods(config))):
         name = rules.describe(config)
         raise ValueError(f"{run} was trained with {name}: only LoRA-SP runs have variants")
-    if task and task not in config.tasks:
-        raise ValueError(f"{run} has no task {task!r}: choose one of {', '.join(config.tasks)}")
+    spoken = () if _is_simulated(run) else export.describe(run)["policy"]["instructions"]
+    if task and task not in (*config.tasks, *spoken):
+        more = ", or one of its instructions" * bool(spoken)
+        known = f"{', '.join(config.tasks)}{more}"
+        raise ValueError(f"{run} has no task {task!r}: choose one of {known}")
 
 
 def save(run: Path, name: str, out: Path, heal: int = 0, task: str = "") -> None:
@@ -153,11 +157,11 @@ def save(run: Path, name: str, out: Path, heal: int = 0, task: str = "") -> None
     int8 or nf4 is quantized whenever the folder is loaded. `heal` is the number of steps by which
     the adapters of the form train on, see `healing.heal`. With a `task` of the run, that task's
     demonstrations alone calibrate and heal the form, which then has its instructions alone. If the
-    tasks cannot be simulated, the run's recordings calibrate.
+    tasks cannot be simulated, the run's recordings calibrate, and `task` may be an instruction.
 
     Raises:
-        ValueError: the variant is unknown, the folder exists, or the run cannot be healed; see also
-            `healing.with_data` and `healing.check_datasets`.
+        ValueError: the variant is unknown, the folder exists, the run cannot be healed, or its data
+            are gone; see also `dataset.limit` and `healing.check_datasets`.
     """
     form, base = check(name).split("-")
     check_local(out)
@@ -167,15 +171,16 @@ def save(run: Path, name: str, out: Path, heal: int = 0, task: str = "") -> None
         healing.check(run, task)
     cache.enable()
     policy, config = export.load_policy(run), recorded_config(run, simulated=False)
-    tasks = (task,) if task else ()
-    if _is_simulated(run):  # those on which `measurement` calibrates
+    tasks, data, phrases = (task,) if task else (), {}, ()
+    if not _is_simulated(run):
+        healing.check_datasets(run)
+        if task or form != "whole":
+            data = start.with_data(config, run, policy.model.config, demonstrations)
+            phrases = dataset.limit(data, task) if task else ()
+    elif task or form != "whole":  # those on which `measurement` calibrates
         config = dataclasses.replace(config, tasks=tasks or config.tasks)
         data = held_out_demonstrations(run / "deployment", config)
         phrases = data[task].instructions if task else ()
-    else:
-        healing.check_datasets(run)
-        data = healing.with_data(config, run, policy, task)
-        phrases = _spoken(data, task) if task else ()
     train = functools.partial(healing.heal, run=run, steps=heal, task=task) if heal else None
     deployed = in_form(policy, form, data, train)
     if task:
@@ -186,12 +191,6 @@ def save(run: Path, name: str, out: Path, heal: int = 0, task: str = "") -> None
 def _is_simulated(run: Path) -> bool:
     """Return whether the tasks of a finished run were evaluated in simulation."""
     return bool(read_json(run / "results.json", records.RESULTS)["tasks"])
-
-
-def _spoken(run: Run, task: str) -> list[str]:
-    """Return the instructions of a task of a run on recordings, whose table has those of all."""
-    episodes = run.episodes[task]
-    return [episodes.instructions[row] for row in np.unique(episodes.instruction)]
 
 
 def _with_instructions(

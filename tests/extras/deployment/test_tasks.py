@@ -225,7 +225,7 @@ def recorded(run, tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("task", ["", "pour"])
+@pytest.mark.parametrize("task", ["", "pour", TASKS["pour"][0]])
 def test_recordings_calibrate_and_heal(recorded, tmp_path, monkeypatch, task):
     """Not simulated demonstrations, nor episodes that are held out, nor those of other tasks."""
     seen = []
@@ -245,11 +245,27 @@ def test_recordings_calibrate_and_heal(recorded, tmp_path, monkeypatch, task):
     for run in seen:
         steps, cache = run.steps, run.recordings
         learned = {*cache.episodes[steps.starts].tolist()}
-        every = {*range(pour if task else 0, len(cache))}
-        assert learned == every - {spared}
+        every = {*range(pour if task else 0, len(cache))} - {spared}
+        if task not in ("", *TASKS):  # one of its instructions
+            rows = OWN["pour"].instruction
+            every &= {pour + n for n in range(len(rows)) if rows[n] == 0}
+        assert learned == every
     served = export.load_policy(folder)
-    texts = TASKS[task] if task else (*TASKS["press"], *TASKS["pour"])
+    texts = TASKS.get(task, (task,)) if task else (*TASKS["press"], *TASKS["pour"])
     assert {*served.processor.prompts.instructions} == {*texts}
+
+
+def test_the_form_as_trained_needs_no_data(recorded, tmp_path, capsys):
+    changed = shutil.copytree(recorded, tmp_path / "run")
+    config = read_json(changed / "config.json")
+    gone = config | {"data": config["data"] | {"source": "gone"}}
+    write_json(changed / "config.json", gone)
+    assert command.main([str(changed), "--save", "whole-int8", "--out", str(tmp_path / "a")]) == 0
+    capsys.readouterr()
+    error = refuse(capsys, changed, "--save", "half-bf16", "--out", tmp_path / "b")
+    assert f"the recordings of {changed} cannot be read: gone does not exist" in error
+    error = refuse(capsys, changed, "--save", "half-bf16", "--out", tmp_path / "b", "--task", "x")
+    assert "has no task 'x': choose one of press, pour, or one of its instructions" in error
 
 
 def test_refusals_of_recordings(recorded, tmp_path, capsys):
