@@ -221,7 +221,8 @@ def _doubts(cache: Cache) -> Iterator[str]:
     for index, part in enumerate(cache.parts):
         rows = cache.dataset[cache.episodes] == index
         hints = inspection.hints(np.asarray(cache.steps.state)[rows], grippers(cache, "state"))
-        yield from (f"{part.name}: {text} to lorasp-jax inspect --save" for text in hints)
+        name = f"{part.name}: " * bool(cache.parts[1:])  # a single one has that of the cache
+        yield from (f"{name}{text} to lorasp-jax inspect --save" for text in hints)
     if cache.parts[1:] and " + " in (robot := cache.metadata["robot"]):
         yield f"the robots are {robot}: their joints must have the same order, signs and units"
 

@@ -173,6 +173,10 @@ def test_other_units_and_robots_are_said(sources, tmp_path, monkeypatch):
     assert joints.endswith("add --angles degrees to lorasp-jax inspect --save")
     assert gripper.startswith("warning: degrees: the gripper opens to ")
     assert "the robots are piper + so101: their joints must have the same order" in robots
+    (tmp_path / "alone").mkdir()
+    alone = config((str(tmp_path / "degrees"),), statistics="shared")
+    printed = prepare(tmp_path / "alone", monkeypatch, "", config=alone).console.file.getvalue()
+    assert "warning: joint angles reach " in printed
 
 
 def test_a_dataset_that_was_changed_and_restored_is_read_again(sources, tmp_path, monkeypatch):
