@@ -9,7 +9,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-import lorasp_jax
 from lorasp_jax.data.batches import Batch
 from lorasp_jax.extras.deployment import healing, measurement, variants
 from lorasp_jax.extras.study import Derived
@@ -18,14 +17,13 @@ from lorasp_jax.models import flow_matching
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.transformer.layers import ModelAux, merge_action_aux
 from lorasp_jax.policies.policy import Policy
-from lorasp_jax.training.base import in_bf16
 from lorasp_jax.training.demonstrations import Demonstrations
 from lorasp_jax.training.run import Run
 from studies.few.judge import judge as judge_scenes
 from studies.where_it_pays import names, page, sequences
 
 Heal = Callable[[Policy], Policy]
-_FORMS = {"taught": "merged", "by_task": "merged"}
+_FORMS = {"taught": "merged", "by_task": "merged", "lora": "merged"}
 """How forms are made that are not `variants.FORMS`."""
 
 
@@ -67,9 +65,6 @@ def judge(run: Run, form: str, steps: int, pool: int) -> dict[str, Any]:
 
 
 def _in_form(policy: Policy, form: str, held_out: Demonstrations, heal: Heal | None) -> Policy:
-    if form == "lora":
-        policy = heal(policy) if heal else policy
-        return dataclasses.replace(policy, model=in_bf16(lorasp_jax.merge(policy.model)))
     kind, _, base = (_FORMS.get(form) or form).partition("_")
     return variants.on_base(variants.in_form(policy, kind, held_out, heal), base or "bf16")
 

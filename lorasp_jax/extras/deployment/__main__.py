@@ -21,12 +21,12 @@ def parser(program: str) -> argparse.ArgumentParser:
     """Return the argument parser of this command."""
     parser = argparse.ArgumentParser(
         prog=program,
-        description="Compare forms in which a LoRA-SP run can be deployed, or save one of them.",
-        epilog="variants: whole, pruned, half, lora or merged, then -bf16, -int8 or -nf4, such as "
-        "half-int8. See docs/deployment.md.",
+        description="Compare forms in which a run can be deployed, or save one of them.",
+        epilog="variants: whole, pruned, half, lora or merged (only whole and merged if the method "
+        "is not LoRA-SP), then -bf16, -int8 or -nf4, such as half-int8. See docs/deployment.md.",
     )
     add = parser.add_argument
-    add("run", type=Path, help="folder of a finished LoRA-SP run, such as runs/multitask")
+    add("run", type=Path, help="folder of a finished run, such as runs/multitask")
     add("--variants", nargs="+", default=[], metavar="VARIANT", help="default: all")
     text = "episodes per task (default: as in the run's evaluation)"
     add("--episodes", type=int, default=0, metavar="N", help=text)
@@ -59,11 +59,14 @@ def _run(options: argparse.Namespace) -> None:
     from lorasp_jax.extras.study import Study
     from lorasp_jax.extras.study.workers import run_here
 
-    chosen = dict.fromkeys((variants.WHOLE, *map(variants.check, options.variants)))
+    checked = (variants.check(name, options.run) for name in options.variants)
+    chosen = dict.fromkeys((variants.WHOLE, *checked))
     tasks, prefix = ((options.task,), f"{options.task}/") if options.task else ((), "")
     cells = measurement.cells(options.run, options.episodes, prefix, tasks)
     study = Study("deployment", cells, measure=measurement.measure)
-    names = [prefix + name for name in (chosen if options.variants else variants.VARIANTS)]
+    names = [
+        prefix + name for name in (chosen if options.variants else variants.of_run(options.run))
+    ]
     say = functools.partial(print, file=sys.stderr)
     results = run_here(study, options.run / study.name, names, say)
     print(measurement.table(results, prefix), end="")

@@ -43,6 +43,7 @@ def check(run: Path, task: str = "") -> Config:
         "it is distilled to few flow steps, which its data do not teach": "distill" in recorded,
         "its prompts say which actions are good (--learn recap)": config.learn == "recap",
         "its protected directions would not stay": bool(config.protect),
+        "it trained its base and has no adapters": rules.trains_base(config),
         "ada_lora has spent its rank budget": any(
             isinstance(method, AdaLoRA) for method in rules.methods(config)
         ),

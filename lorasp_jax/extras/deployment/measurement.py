@@ -37,7 +37,7 @@ def cells(
     """Return a cell for each variant of a run, evaluated on the same layouts.
 
     Args:
-        run: folder of a finished LoRA-SP run.
+        run: folder of a finished run.
         episodes: episodes per task; 0: as many as in the run's evaluation.
         prefix: what the names of the cells begin with, before those of the variants.
         tasks: of the run on which to calibrate and evaluate; (): all.

@@ -1,4 +1,4 @@
-"""Make and save the deployment variants of a LoRA-SP policy: forms of adapters times bases."""
+"""Make and save the deployment variants of a policy: forms of its adapters times bases."""
 
 import dataclasses
 import functools
@@ -9,6 +9,7 @@ from typing import Any, Literal
 from flax import nnx
 
 import lorasp_jax
+from lorasp_jax.adapters import adaptation
 from lorasp_jax.base import compilation_cache as cache
 from lorasp_jax.base.files import check_local
 from lorasp_jax.extras.deployment import healing
@@ -28,11 +29,6 @@ Batches = Sequence[Keyed]
 """Batches with the keys of their losses."""
 
 
-def _whole(model: nnx.Module, batches: Batches) -> nnx.Module:
-    del batches
-    return model
-
-
 def _pruned(model: nnx.Module, batches: Batches) -> nnx.Module:
     return lorasp_jax.prune(model, batches, for_kernel=True, forward=forward)[0]
 
@@ -46,7 +42,7 @@ def _distilled(model: nnx.Module, batches: Batches) -> nnx.Module:
 
 
 FORMS: dict[str, Callable[[nnx.Module, Batches], nnx.Module]] = {
-    "whole": _whole,
+    "whole": lambda model, _: model,
     "pruned": _pruned,
     "half": _half,
     "lora": _distilled,
@@ -61,29 +57,43 @@ BASES: dict[str, Literal["int8", "nf4"] | None] = {"bf16": None, "int8": "int8",
 WHOLE = "whole-bf16"
 """The variant that others are compared with."""
 VARIANTS = (WHOLE, *(f"{f}-{b}" for f in FORMS for b in BASES if f"{f}-{b}" != WHOLE))
+"""All of LoRA-SP's."""
 
 
 def transform(
     name: str, policy: lorasp_jax.policies.Policy, episodes: Demonstrations
 ) -> lorasp_jax.policies.Policy:
-    """Return a variant of a LoRA-SP policy, calibrated on episodes by task; all count alike."""
+    """Return a variant of a policy, calibrated on episodes by task; all count alike."""
     form, base = name.split("-")
     return on_base(in_form(policy, form, episodes), base)
 
 
-def check(name: str) -> str:
-    """Return the name of a variant.
+def check(name: str, run: Path) -> str:
+    """Return the name of a variant of a run.
 
     Raises:
-        ValueError: unknown variant.
+        ValueError: the run has no such variant.
     """
-    if name not in VARIANTS:
-        raise ValueError(f"unknown variant {name!r}: choose one of {', '.join(VARIANTS)}")
+    if name not in (known := of_run(run)):
+        raise ValueError(f"unknown variant {name!r}: choose one of {', '.join(known)}")
     return name
 
 
-def is_bank(method: Any) -> bool:
-    """Return whether a method has LoRA-SP's bank of directions."""
+def of_run(run: Path) -> tuple[str, ...]:
+    """Return the variants of a finished run.
+
+    Without LoRA-SP's bank, there is nothing to prune or to distill: adapters stay whole or are
+    merged, those of LoRA-MoE and a base that was trained itself only stay whole.
+    """
+    methods = rules.methods(recorded_config(run, simulated=False))
+    if any(map(_is_bank, methods)):
+        return VARIANTS
+    fixed = any(method.trains_base or isinstance(method, lorasp_jax.LoRAMoE) for method in methods)
+    forms = ("whole",) if fixed else ("whole", "merged")
+    return tuple(f"{form}-{base}" for form in forms for base in BASES)
+
+
+def _is_bank(method: Any) -> bool:
     return isinstance(method, lorasp_jax.LoRASP | lorasp_jax.LoRASPRelease)
 
 
@@ -96,21 +106,25 @@ def in_form(
     """Return a policy whose adapters have another form, and whose frozen weights are in bf16.
 
     Args:
-        policy: a LoRA-SP policy; not modified.
-        form: one of `FORMS`.
+        policy: not modified.
+        form: one of `FORMS`; without a bank, "whole" or "merged".
         data: calibrates; episodes by task, of which all tasks count alike, or a run whose data do.
         heal: trains the adapters before they are merged, such as `healing.heal`; None: do not.
     """
     model = in_bf16(policy.model)
     policy = dataclasses.replace(policy, model=model)
-    batches = [] if form == "whole" else _batches(policy, data)
-    policy = dataclasses.replace(policy, model=FORMS[form](model, batches))
-    del batches  # training needs its memory
+    if needs_data(policy, form):
+        policy = dataclasses.replace(policy, model=FORMS[form](model, _batches(policy, data)))
     if heal:
         policy = heal(policy)
     if form == "merged":
         policy = dataclasses.replace(policy, model=in_bf16(lorasp_jax.merge(policy.model)))
     return policy
+
+
+def needs_data(policy: lorasp_jax.policies.Policy, form: str) -> bool:
+    """Return whether data calibrate a form of a policy."""
+    return form != "whole" and any(map(_is_bank, adaptation.methods(policy.model).values()))
 
 
 def _batches(policy: lorasp_jax.policies.Policy, data: Demonstrations | Run) -> Batches:
@@ -127,7 +141,7 @@ def on_base(policy: lorasp_jax.policies.Policy, base: str) -> lorasp_jax.policie
 
 
 def check_run(run: Path, task: str = "", *, simulated: bool = False) -> None:
-    """Raise ValueError unless a run is finished and has LoRA-SP layers.
+    """Raise ValueError unless a run is finished.
 
     Variants are only compared if its tasks can be `simulated`. A run that has learned its noise is
     refused, too: other weights need other noise; and so is a `task`, if given, that is none of its
@@ -140,9 +154,6 @@ def check_run(run: Path, task: str = "", *, simulated: bool = False) -> None:
             "with the run by lorasp-jax evaluate"
         )
     start.refuse_actor(run, "make variants of the run that it started from")
-    if not any(map(is_bank, rules.methods(config))):
-        name = rules.describe(config)
-        raise ValueError(f"{run} was trained with {name}: only LoRA-SP runs have variants")
     spoken = () if _is_simulated(run) else export.describe(run)["policy"]["instructions"]
     if task and task not in (*config.tasks, *spoken):
         more = ", or one of its instructions" * bool(spoken)
@@ -163,7 +174,7 @@ def save(run: Path, name: str, out: Path, heal: int = 0, task: str = "") -> None
         ValueError: the variant is unknown, the folder exists, the run cannot be healed, or its data
             are gone; see also `dataset.limit` and `healing.check_datasets`.
     """
-    form, base = check(name).split("-")
+    form, base = check(name, run).split("-")
     check_local(out)
     if out.exists():
         raise ValueError(f"{out} exists already: choose another --out")
@@ -174,10 +185,10 @@ def save(run: Path, name: str, out: Path, heal: int = 0, task: str = "") -> None
     tasks, data, phrases = (task,) if task else (), {}, ()
     if not _is_simulated(run):
         healing.check_datasets(run)
-        if task or form != "whole":
+        if task or needs_data(policy, form):
             data = start.with_data(config, run, policy.model.config, demonstrations)
             phrases = dataset.limit(data, task) if task else ()
-    elif task or form != "whole":  # those on which `measurement` calibrates
+    elif task or needs_data(policy, form):  # those on which `measurement` calibrates
         config = dataclasses.replace(config, tasks=tasks or config.tasks)
         data = held_out_demonstrations(run / "deployment", config)
         phrases = data[task].instructions if task else ()

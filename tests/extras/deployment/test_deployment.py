@@ -18,7 +18,7 @@ from lorasp_jax.extras.deployment import measurement, variants
 from lorasp_jax.extras.deployment.measurement import call_milliseconds
 from lorasp_jax.extras.serving import loading
 from lorasp_jax.extras.study import held_out, results, run_cell
-from lorasp_jax.peft import LoRA
+from lorasp_jax.peft import LoRA, LoRAMoE
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Offline
@@ -190,8 +190,26 @@ def test_refusals(run, dummy_base, tmp_path, capsys):
     assert f"{tmp_path} is not a finished run" in unfinished
     lora = finished_run(tmp_path / "lora", dummy_base, LoRA(rank=2))
     error = refuse(capsys, lora, *save[1:], out)
-    assert "was trained with LoRA: only LoRA-SP runs have variants" in error
+    assert error.endswith("whole-bf16, whole-int8, whole-nf4, merged-bf16, merged-int8, merged-nf4")
+    moe = finished_run(tmp_path / "moe", dummy_base, LoRAMoE(rank=2))
+    error = refuse(capsys, moe, "--save", "merged-bf16", "--out", out)
+    assert error.endswith(
+        "unknown variant 'merged-bf16': choose one of whole-bf16, whole-int8, whole-nf4"
+    )
     assert not out.exists()
+
+
+@pytest.mark.parametrize("name", ["whole-nf4", "merged-bf16"])
+def test_lora_is_saved_without_data(dummy_base, tmp_path, monkeypatch, name):
+    monkeypatch.setattr(held_out, "demonstrations", None)
+    lora, out = finished_run(tmp_path / "lora", dummy_base, LoRA(rank=2)), tmp_path / "policy"
+    assert command.main([str(lora), "--save", name, "--out", str(out)]) == 0
+    served, policy = loading.load_run(str(out)).policy, export.load_policy(lora)
+    assert bool(adaptation.methods(served.model)) == (name == "whole-nf4")
+    as_trained = variants.on_base(variants.in_form(policy, "whole", {}), name.split("-")[1])
+    np.testing.assert_allclose(actions(served), actions(as_trained), atol=0.02)
+    bare = dataclasses.replace(policy, model=models.load(dummy_base))
+    assert np.abs(actions(served) - actions(bare)).max() > 0.1
 
 
 def test_quantized_base_of_a_policy_is_checked(run, tmp_path):
