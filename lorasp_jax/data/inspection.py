@@ -4,9 +4,8 @@ import collections
 import dataclasses
 import functools
 import hashlib
-import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from lorasp_jax.base.user_cache import user_cache
 from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.config import AugmentConfig, Config
 from lorasp_jax.data.augmentation import Augment, on_wrist, recipe
-from lorasp_jax.data.source import Source, describe_left_out, grippers, same_period
+from lorasp_jax.data.source import Source, describe_left_out, grippers, hints, same_period
 from lorasp_jax.data.video import downscale
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.policies.offline_tokenizer import num_tokens
@@ -129,23 +128,6 @@ def report(source: Source, console: Console) -> None:
     console.print(_value_table(summary))
     for hint in [*hints(summary.state, summary.grippers), *prompt_hints(summary.phrases)]:
         console.print(hint, style="yellow", soft_wrap=True, highlight=False, markup=False)
-
-
-def hints(state: np.ndarray, grippers: Sequence[int]) -> list[str]:
-    """Return hints about probable unit errors in states `[N, J+1]`; some numbers are grippers'."""
-    is_gripper = np.isin(np.arange(state.shape[1]), grippers)
-    joints = np.abs(state[:, ~is_gripper]).max(initial=0)
-    gripper = np.abs(state[:, is_gripper]).max()
-    texts = []
-    if joints > 2 * math.pi:
-        texts.append(
-            f"joint angles reach {joints:.4g} rad; if they are in degrees, add --angles degrees"
-        )
-    if gripper > 1:
-        texts.append(
-            f"the gripper opens to {gripper:.4g} m; if that is in mm, add --gripper millimetres"
-        )
-    return texts
 
 
 def prompt_hints(phrases: Iterable[str]) -> list[str]:

@@ -1,7 +1,10 @@
 """The interface that all dataset formats share."""
 
+import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, Protocol
+
+import numpy as np
 
 from envs.datasets.episodes import Episodes
 
@@ -62,6 +65,23 @@ def grippers(source: Source, kind: str = "action") -> list[int]:
     """Return which dimensions of states or actions are grippers: the last, if nothing says so."""
     known: dict[str, list[int]] = getattr(source, "grippers", {})
     return known.get(kind) or [getattr(source.episode(0, ()), kind).shape[-1] - 1]
+
+
+def hints(state: np.ndarray, of_grippers: Sequence[int]) -> list[str]:
+    """Return hints about probable unit errors in states `[N, J+1]`; some numbers are grippers'."""
+    is_gripper = np.isin(np.arange(state.shape[1]), of_grippers)
+    joints = np.abs(state[:, ~is_gripper]).max(initial=0)
+    gripper = np.abs(state[:, is_gripper]).max()
+    texts = []
+    if joints > 2 * math.pi:
+        texts.append(
+            f"joint angles reach {joints:.4g} rad; if they are in degrees, add --angles degrees"
+        )
+    if gripper > 1:
+        texts.append(
+            f"the gripper opens to {gripper:.4g} m; if that is in mm, add --gripper millimetres"
+        )
+    return texts
 
 
 def dimensions(source: Source) -> dict[str, dict[str, Any]]:

@@ -1,6 +1,5 @@
 """Activations of a model on the data of a run."""
 
-import functools
 import re
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -10,11 +9,11 @@ from flax import nnx
 
 from lorasp_jax.adapters import paths
 from lorasp_jax.adapters.compress import calibration
-from lorasp_jax.data.batches import Batch, encode, sample_batch
+from lorasp_jax.data.batches import Batch, encode
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.policies.processor import Processor
-from lorasp_jax.training import rules
+from lorasp_jax.training import fixed_batches, rules
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Run
 
@@ -55,7 +54,6 @@ def batch_sampler(run: Run, processor: Processor, chunk: int) -> Callable[[jax.A
     if run.streams:
         stream = Stream(run.steps, batch_size=size, chunk=chunk, seed=run.config.seed)
         return lambda key: encode(key, next(stream), processor, state_noise=noise)
-    steps, sizes = jax.device_put(run.steps), {"batch_size": size, "chunk": chunk}
-    # The steps are an argument, as a constant of their size takes long to compile.
-    draw = jax.jit(functools.partial(sample_batch, **sizes, state_noise=noise))
-    return lambda key: draw(key, steps, processor)
+    steps = jax.device_put(run.steps)
+    sizes = {"batch_size": size, "chunk": chunk, "state_noise": noise}
+    return lambda key: fixed_batches.sample(key, steps, processor, **sizes)

@@ -15,13 +15,13 @@ from envs.datasets.episodes import Episodes, concatenate
 from envs.names import names
 from lorasp_jax.base.bars import bars
 from lorasp_jax.config import Config, DataConfig
-from lorasp_jax.data import cache, inspection
+from lorasp_jax.data import cache
 from lorasp_jax.data.batches import Mixture, Steps
 from lorasp_jax.data.cache import Cache
 from lorasp_jax.data.joined import Part, parts_of
 from lorasp_jax.data.keys import Keys
 from lorasp_jax.data.opening import open_sources
-from lorasp_jax.data.source import Progress, Source, grippers, same_period
+from lorasp_jax.data.source import Progress, Source, grippers, hints, same_period
 from lorasp_jax.data.split import held_out
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.policies.images import resize_with_pad, to_unit
@@ -190,9 +190,8 @@ def _describe(run: Run, cache: Cache, datasets: Sequence[Mapping[str, Any]]) -> 
     console = run.console
     location = "streamed from disk" if run.streams else "held on the device"
     console.print(f"{cache.num_steps} steps in {len(cache)} episodes, {location}")
-    assert run.dataset is not None
-    starts = slice(None) if run.dataset.starts is None else run.dataset.starts
-    learned = cache.dataset[np.unique(cache.episodes[starts])]
+    assert run.chosen is not None
+    learned = np.delete(cache.dataset, [*run.held_out, *run.chosen.left_out])
     for index, (part, each) in enumerate(zip(cache.parts, datasets, strict=False)):
         text = (
             f"  {100 * each['share']:.1f} % of the windows from {part.name}: "
@@ -220,9 +219,9 @@ def _doubts(cache: Cache) -> Iterator[str]:
     """Say which datasets seem to have other units or another robot than they should."""
     for index, part in enumerate(cache.parts):
         rows = cache.dataset[cache.episodes] == index
-        hints = inspection.hints(np.asarray(cache.steps.state)[rows], grippers(cache, "state"))
+        texts = hints(np.asarray(cache.steps.state)[rows], grippers(cache, "state"))
         name = f"{part.name}: " * bool(cache.parts[1:])  # a single one has that of the cache
-        yield from (f"{name}{text} to lorasp-jax inspect --save" for text in hints)
+        yield from (f"{name}{text} to lorasp-jax inspect --save" for text in texts)
     if cache.parts[1:] and " + " in (robot := cache.metadata["robot"]):
         yield f"the robots are {robot}: their joints must have the same order, signs and units"
 
@@ -305,7 +304,7 @@ def limit(run: Run, task: str) -> list[str]:
         phrase = episode.instructions[int(episode.instruction[0])]
         if task in (episode.task, phrase):
             spoken[number] = phrase
-    starts = np.arange(len(steps.end), dtype=np.int32) if steps.starts is None else steps.starts
+    starts = steps.start(np.arange(steps.num_starts, dtype=np.int32))
     starts = starts[np.isin(cache.episodes, [*spoken])[starts]]
     if not len(starts):
         raise ValueError(f"{run.folder} trained on no episode of {task}")
@@ -319,7 +318,7 @@ def corrected_only(steps: Steps, cache: Cache, episodes: Collection[int]) -> Ste
         return steps
     assert cache.corrected is not None
     rows, end = np.isin(cache.episodes, [*episodes]), np.asarray(steps.end)
-    starts = np.arange(len(end), dtype=np.int32) if steps.starts is None else steps.starts
+    starts = steps.start(np.arange(steps.num_starts, dtype=np.int32))
     end = np.where(rows, offline.run_ends(cache.corrected, end), end)
     kept = starts[(~rows | cache.corrected)[starts]]
     return dataclasses.replace(steps, starts=kept, end=end)

@@ -17,7 +17,7 @@ Keyed = tuple[jax.Array, Batch]
 """A batch with the key of its loss."""
 
 _SIZES = ("batch_size", "chunk", "state_noise")
-_sample = jax.jit(sample_batch, static_argnames=_SIZES)  # seeds share its programs
+sample = jax.jit(sample_batch, static_argnames=_SIZES)  # seeds share its programs
 
 
 def sampler(policy: Policy, episodes: Episodes, batch_size: int) -> Sample:
@@ -31,7 +31,7 @@ def sampler(policy: Policy, episodes: Episodes, batch_size: int) -> Sample:
     rows, steps = policy.processor.prompts.rows(episodes.instructions), flatten([episodes])
     steps = jax.device_put(dataclasses.replace(steps, instruction=rows[steps.instruction]))
     sizes = {"batch_size": batch_size, "chunk": policy.model.config.chunk, "state_noise": 0.0}
-    return lambda key: _sample(key, steps, policy.processor, **sizes)
+    return lambda key: sample(key, steps, policy.processor, **sizes)
 
 
 def keyed_batches(

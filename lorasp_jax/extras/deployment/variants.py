@@ -113,7 +113,7 @@ def in_form(
     """
     model = in_bf16(policy.model)
     policy = dataclasses.replace(policy, model=model)
-    if needs_data(policy, form):
+    if _needs_data(policy, form):
         policy = dataclasses.replace(policy, model=FORMS[form](model, _batches(policy, data)))
     if heal:
         policy = heal(policy)
@@ -122,7 +122,7 @@ def in_form(
     return policy
 
 
-def needs_data(policy: lorasp_jax.policies.Policy, form: str) -> bool:
+def _needs_data(policy: lorasp_jax.policies.Policy, form: str) -> bool:
     """Return whether data calibrate a form of a policy."""
     return form != "whole" and any(map(_is_bank, adaptation.methods(policy.model).values()))
 
@@ -183,15 +183,16 @@ def save(run: Path, name: str, out: Path, heal: int = 0, task: str = "") -> None
     cache.enable()
     policy, config = export.load_policy(run), recorded_config(run, simulated=False)
     tasks, data, phrases = (task,) if task else (), {}, ()
-    if not _is_simulated(run):
+    if not (simulated := _is_simulated(run)):
         healing.check_datasets(run)
-        if task or needs_data(policy, form):
+    if task or _needs_data(policy, form):
+        if simulated:  # on what `measurement` calibrates
+            config = dataclasses.replace(config, tasks=tasks or config.tasks)
+            data = held_out_demonstrations(run / "deployment", config)
+            phrases = data[task].instructions if task else ()
+        else:
             data = start.with_data(config, run, policy.model.config, demonstrations)
             phrases = dataset.limit(data, task) if task else ()
-    elif task or needs_data(policy, form):  # those on which `measurement` calibrates
-        config = dataclasses.replace(config, tasks=tasks or config.tasks)
-        data = held_out_demonstrations(run / "deployment", config)
-        phrases = data[task].instructions if task else ()
     train = functools.partial(healing.heal, run=run, steps=heal, task=task) if heal else None
     deployed = in_form(policy, form, data, train)
     if task:
