@@ -95,6 +95,13 @@ class ServedPolicies:
         self.metadata: dict[str, Any] = dict(next(iter(policies.values())).description.metadata)
         self._adapters = {name: Adapter(name, policy) for name, policy in policies.items()}
         self._default = next(iter(policies))
+        if route != "name" and (doubtful := routing.shared(self.instructions)):
+            text, names = next(iter(doubtful.items()))
+            _log.warning(
+                "several adapters have the same instructions (%d, such as %r of %s): requests with "
+                "these must name the adapter",
+                *(len(doubtful), text, " and ".join(names)),
+            )
         self._change = threading.Lock()
         sizes = [set(policy.description.batch_sizes) for policy in policies.values()]
         self.sizes: tuple[int, ...] = tuple(sorted(set.intersection(*sizes)))
