@@ -12,12 +12,14 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
+from envs.datasets.episodes import joint_names
 from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.compress.quantization import Kind
 from lorasp_jax.adapters.io import native
 from lorasp_jax.base import hub
 from lorasp_jax.base.digest import digest
+from lorasp_jax.data.source import dimension_names
 from lorasp_jax.models import backbone, noise_actor
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.noise_actor import NoiseActor
@@ -38,6 +40,8 @@ QUANTIZED = "quantized"
 """Key of the kind of a base that is quantized after loading."""
 STEPS = "denoise_steps"
 """Key of the flow steps of a run, in its config and in the files of its variants."""
+DIMENSIONS = ("names", "units")
+"""Keys of the names and units of a run's states and actions, as far as they are known."""
 
 
 class Export(Callback):
@@ -124,6 +128,7 @@ def _metadata(run: Run) -> dict[str, Any]:
         "tasks": list(run.episodes),
         "control_dt": first.control_dt,
         "physics_dt": first.physics_dt,
+        **_dimensions(run),
         "policy": {
             "backbone": config.model.backbone,
             "config": dataclasses.asdict(run.policy.model.config),
@@ -136,6 +141,17 @@ def _metadata(run: Run) -> dict[str, Any]:
             **(robots[default] if default else _robot(processor)),
             **({"dataset": default, "datasets": robots} if robots else {}),
         },
+    }
+
+
+def _dimensions(run: Run) -> dict[str, dict[str, list[str]]]:
+    """Describe `DIMENSIONS`; datasets have names at most, as no format records units."""
+    if run.recordings and not run.simulated:
+        return {"names": names} if (names := dimension_names(run.recordings)) else {}
+    joints = len(run.policy.processor.state_slots) - 1
+    both = [*joint_names(joints), "gripper"], [*(["rad"] * joints), "m"]
+    return {
+        key: dict.fromkeys(("state", "action"), x) for key, x in zip(DIMENSIONS, both, strict=True)
     }
 
 
