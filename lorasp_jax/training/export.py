@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -74,6 +75,7 @@ def write_variant(
     *,
     tasks: Sequence[str] = (),
     quantized: Kind | None = None,
+    calibration: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
     """Write a policy made from a run's, with frozen weights in bf16, for `load_policy`.
 
@@ -84,6 +86,7 @@ def write_variant(
         source: folder of the run.
         tasks: what the policy is for; (): the run's tasks.
         quantized: how to quantize the base whenever the policy is loaded.
+        calibration: what calibrated the policy, which is recorded; {}: nothing.
 
     Raises:
         ValueError: the policy has learned its initial noise, which is that of its weights.
@@ -101,6 +104,7 @@ def write_variant(
     }
     metadata |= {"policy": fields, QUANTIZED: quantized, STEPS: denoise_steps(source)}
     metadata |= {"tasks": list(tasks)} if tasks else {}
+    metadata |= {"calibration": dict(calibration)} if calibration else {}
     if adaptation.methods(policy.model):
         base = native.read_description(source)["base"]
         native.save_adapters(folder, policy.model, base=base, metadata=metadata)

@@ -164,7 +164,8 @@ def test_forms(run):
 def test_a_saved_variant_is_served(run, tmp_path, capsys, name):
     out = tmp_path / "policy"
     assert command.main([str(run), "--save", name, "--out", str(out)]) == 0
-    assert capsys.readouterr().out == f"written: {out}\n"
+    said = "64 windows of 3 episodes (21 frames) of simulated demonstrations of press"
+    assert capsys.readouterr().out == f"written: {out}, calibrated on {said}\n"
     loaded = loading.load_run(str(out))
     assert loaded.metadata == SIMULATED
     assert loaded.denoise_steps == export.denoise_steps(run) == STEPS
