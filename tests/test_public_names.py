@@ -31,7 +31,7 @@ PUBLIC = {
     "lorasp_jax.policies": "Policy Processor PromptTable statistics_files tokenizer",
     "lorasp_jax.data": "Stream cache open_source",
     "lorasp_jax.training": "load_policy",
-    "lorasp_jax.evaluation": "Result evaluate make_rollout",
+    "lorasp_jax.evaluation": "Result evaluate make_rollout measure_held_out",
     "lorasp_jax.extras.study": "Cell Derived Study",
     "envs": """
         Env Episodes Randomization State Trajectory collect interop

@@ -79,7 +79,8 @@ def hints(state: np.ndarray, of_grippers: Sequence[int]) -> list[str]:
         )
     if gripper > 1:
         texts.append(
-            f"the gripper opens to {gripper:.4g} m; if that is in mm, add --gripper millimetres"
+            f"the gripper opens to {gripper:.4g} m; percent may stay, but if that is in mm, add "
+            "--gripper millimetres"
         )
     return texts
 

@@ -167,7 +167,7 @@ def load(run: Run, source: Source, free_bytes: float) -> None:
         run.config, robot=metadata["robot"], tasks=tuple(metadata["tasks"])
     )
     _describe(run, cache, identity.get("datasets", []))
-    offline.describe(chosen, cache, learn, run.console)
+    offline.describe(chosen, cache, run.held_out, learn, run.console)
 
 
 def _labels(cache: Cache, data: DataConfig) -> tuple[list[str], list[str]]:

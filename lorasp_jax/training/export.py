@@ -6,18 +6,21 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
 
+from envs.datasets.episodes import joint_names
 from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.compress.quantization import Kind
 from lorasp_jax.adapters.io import native
 from lorasp_jax.base import hub
 from lorasp_jax.base.digest import digest
+from lorasp_jax.data.source import dimension_names
 from lorasp_jax.models import backbone, noise_actor
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.noise_actor import NoiseActor
@@ -38,6 +41,8 @@ QUANTIZED = "quantized"
 """Key of the kind of a base that is quantized after loading."""
 STEPS = "denoise_steps"
 """Key of the flow steps of a run, in its config and in the files of its variants."""
+DIMENSIONS = ("names", "units")
+"""Keys of the names and units of a run's states and actions, as far as they are known."""
 
 
 class Export(Callback):
@@ -70,6 +75,7 @@ def write_variant(
     *,
     tasks: Sequence[str] = (),
     quantized: Kind | None = None,
+    calibration: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
     """Write a policy made from a run's, with frozen weights in bf16, for `load_policy`.
 
@@ -80,6 +86,7 @@ def write_variant(
         source: folder of the run.
         tasks: what the policy is for; (): the run's tasks.
         quantized: how to quantize the base whenever the policy is loaded.
+        calibration: what calibrated the policy, which is recorded; {}: nothing.
 
     Raises:
         ValueError: the policy has learned its initial noise, which is that of its weights.
@@ -97,6 +104,7 @@ def write_variant(
     }
     metadata |= {"policy": fields, QUANTIZED: quantized, STEPS: denoise_steps(source)}
     metadata |= {"tasks": list(tasks)} if tasks else {}
+    metadata |= {"calibration": dict(calibration)} if calibration else {}
     if adaptation.methods(policy.model):
         base = native.read_description(source)["base"]
         native.save_adapters(folder, policy.model, base=base, metadata=metadata)
@@ -124,6 +132,7 @@ def _metadata(run: Run) -> dict[str, Any]:
         "tasks": list(run.episodes),
         "control_dt": first.control_dt,
         "physics_dt": first.physics_dt,
+        **_dimensions(run),
         "policy": {
             "backbone": config.model.backbone,
             "config": dataclasses.asdict(run.policy.model.config),
@@ -136,6 +145,17 @@ def _metadata(run: Run) -> dict[str, Any]:
             **(robots[default] if default else _robot(processor)),
             **({"dataset": default, "datasets": robots} if robots else {}),
         },
+    }
+
+
+def _dimensions(run: Run) -> dict[str, dict[str, list[str]]]:
+    """Describe `DIMENSIONS`; datasets have names at most, as no format records units."""
+    if run.recordings and not run.simulated:
+        return {"names": names} if (names := dimension_names(run.recordings)) else {}
+    joints = len(run.policy.processor.state_slots) - 1
+    both = [*joint_names(joints), "gripper"], [*(["rad"] * joints), "m"]
+    return {
+        key: dict.fromkeys(("state", "action"), x) for key, x in zip(DIMENSIONS, both, strict=True)
     }
 
 

@@ -85,8 +85,10 @@ def check(chosen: Chosen, cache: Cache, held_out: Sequence[int], learn: str) -> 
             raise ValueError(f"no episode of {task} succeeded, so --learn {learn} cannot learn it")
 
 
-def describe(chosen: Chosen, cache: Cache, learn: str, console: Console) -> None:
-    """Print how many episodes count as what."""
+def describe(
+    chosen: Chosen, cache: Cache, held_out: Sequence[int], learn: str, console: Console
+) -> None:
+    """Print how many episodes count as what; warn if those of one side all failed."""
     wins, failures, unknown = ((chosen.outcome == value).sum() for value in (1, 0, -1))
     if not (failures or chosen.left_out or chosen.corrected):
         return
@@ -98,8 +100,23 @@ def describe(chosen: Chosen, cache: Cache, learn: str, console: Console) -> None
     if learn == "imitation":
         text = "failures are imitated, too: --learn filtered leaves them out"
         console.print(text, style="yellow", highlight=False)
+        if doubt := _only_failures(chosen, held_out):
+            console.print(f"warning: {doubt}", style="yellow", highlight=False, soft_wrap=True)
     elif names:
         console.print(f"demonstrations: {', '.join(names)}", highlight=False, markup=False)
+
+
+def _only_failures(chosen: Chosen, held_out: Sequence[int]) -> str:
+    """Say whether all episodes that are held out, or all others, failed; "" if not."""
+    failed = chosen.outcome == 0
+    if np.delete(failed, [*held_out]).all():
+        return "all episodes to learn from failed: record successes, or hold out other episodes"
+    if held_out and failed[[*held_out]].all():
+        return (
+            "all held-out episodes failed, so the adapters that best imitate failures count as the "
+            "best: name others with --data.validation"
+        )
+    return ""
 
 
 def _any(chosen: Chosen, cache: Cache, index: int) -> bool:

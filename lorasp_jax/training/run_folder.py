@@ -208,8 +208,8 @@ def record_dataset(folder: Path, facts: Mapping[str, Any], *, streams: bool) -> 
         return streams
     if recorded["facts"] != current["facts"]:
         raise ValueError(
-            f"the dataset differs from the one {folder} was started with: restore the original or "
-            "use another --name"
+            f"the dataset differs from the one {folder} was started with: restore the original, or "
+            "train on this one under another --name"
         )
     return streams or recorded["streams"]
 

@@ -11,7 +11,9 @@ from rich.console import Console
 
 from envs.datasets import rlds
 from lorasp_jax.config import DataConfig, ModelConfig
+from lorasp_jax.data import cache
 from lorasp_jax.data.batches import flatten, sample_batch
+from lorasp_jax.data.opening import open_source
 from lorasp_jax.evaluation.callback import NoEvaluation
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
@@ -63,6 +65,25 @@ def test_prepare(tmp_path, monkeypatch):
     (tmp_path / "dataset.json").unlink()
     assert prepare(tmp_path, monkeypatch, "removed, but cached", small // 64).streams
     assert prepare(tmp_path, monkeypatch, "removed, but cached", small).streams  # as at the start
+
+
+def test_an_export_says_what_numbers_are(tmp_path, monkeypatch):
+    """Of simulated episodes names and units; of recordings the names, if they have any."""
+    group = random_episodes("press", 0)
+    rlds.write(group, tmp_path / "rlds")
+    simulated = export._metadata(prepare(tmp_path / "a", monkeypatch, tmp_path / "rlds"))
+    assert simulated["names"]["state"] == [*(f"joint_{n}" for n in range(1, 7)), "gripper"]
+    assert simulated["units"]["action"] == [*(6 * ["rad"]), "m"]
+    rlds.write(dataclasses.replace(group, physics_dt=0.0), tmp_path / "real")
+    unnamed = export._metadata(prepare(tmp_path / "b", monkeypatch, tmp_path / "real"))
+    assert not {"names", "units"} & unnamed.keys()
+    source = open_source(tmp_path / "real")
+    source.names = {kind: [*"abcdefg"] for kind in ("state", "action")}
+    cache.write([source], tmp_path / "named", lambda *_: None)
+    (tmp_path / "c").mkdir()
+    named = export._metadata(prepare(tmp_path / "c", monkeypatch, tmp_path / "named"))
+    assert named["names"] == source.names
+    assert "units" not in named
 
 
 def test_a_wrist_camera_in_the_place_of_another_is_noticed(tmp_path, monkeypatch):

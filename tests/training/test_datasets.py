@@ -179,6 +179,23 @@ def test_other_units_and_robots_are_said(sources, tmp_path, monkeypatch):
     assert "warning: joint angles reach " in printed
 
 
+def test_a_gripper_in_percent_is_learned_like_another(tmp_path, monkeypatch):
+    """Training sees the same numbers, and the policy acts in percent."""
+    seen, acts = [], []
+    for unit in (1.0, 100.0):
+        scale, group = np.array([*6 * [1], unit], np.float32), recorded(0, 1.0)
+        scaled = {name: scale * getattr(group, name) for name in ("state", "action")}
+        rlds.write(dataclasses.replace(group, **scaled), tmp_path / f"{unit}")
+        own = config((str(tmp_path / f"{unit}"),), statistics="shared")
+        (tmp_path / f"run{unit}").mkdir()
+        run = prepare(tmp_path / f"run{unit}", monkeypatch, "", config=own)
+        raw = draw(jax.random.key(1), jax.device_put(run.steps), batch_size=8, chunk=4)
+        seen.append(encode(jax.random.key(2), raw, run.policy.processor, state_noise=0.1))
+        acts.append(run.policy.processor.decode(seen[0].actions, raw.state) / scale)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), *seen)
+    np.testing.assert_allclose(*acts, atol=1e-5)
+
+
 def test_a_dataset_that_was_changed_and_restored_is_read_again(sources, tmp_path, monkeypatch):
     folder, source = tmp_path / "run", tmp_path / "near"
     folder.mkdir()

@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import re
 import time
 
 import jax
@@ -165,6 +166,26 @@ def test_imitation_of_failures_is_said(folder):
     run = prepare(folder, "imitation")
     assert run.steps.num_starts == EPISODES * STEPS
     assert "failures are imitated, too" in run.console.file.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "held_out", "sentence"),
+    [
+        ([1, 0, 1], 1, "all held-out episodes failed, so the adapters"),
+        ([0, 0, 1], 2, "all episodes to learn from failed: "),
+        ([1, 0, 1], 0, ""),
+        ([-1, 0, -1], 0, ""),
+    ],
+)
+def test_imitation_says_if_one_side_has_failures_alone(outcomes, held_out, sentence, tmp_path):
+    """But holds out what it was told to."""
+    rlds.write(labelled(0, outcomes), tmp_path / "data")
+    data = DataConfig(str(tmp_path / "data"), validation=(f"episode_{held_out}",))
+    run = prepare(tmp_path, "imitation", data=data, targets=("action_out",))
+    assert run.held_out == [held_out]
+    said = re.findall("warning: (all .*)", run.console.file.getvalue())
+    assert len(said) == bool(sentence)
+    assert "".join(said).startswith(sentence)
 
 
 def test_it_resumes_to_the_bit(folder, tmp_path):

@@ -53,8 +53,11 @@ def _run(options: argparse.Namespace) -> None:
     variants.check_run(options.run, options.task, simulated=not options.save)
     if options.save:
         settings = {"heal": options.heal or 0, "task": options.task}
-        variants.save(options.run, options.save, options.out, **settings)
-        print(f"written: {options.out}")
+        found = variants.save(options.run, options.save, options.out, **settings)
+        text = (
+            ", calibrated on {windows} windows of {episodes} episodes ({frames} frames) of {data}"
+        )
+        print(f"written: {options.out}{text.format(**found) if found else ''}")
         return
     from lorasp_jax.extras.study import Study
     from lorasp_jax.extras.study.workers import run_here

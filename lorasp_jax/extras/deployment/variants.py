@@ -6,12 +6,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from flax import nnx
 
 import lorasp_jax
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.base import compilation_cache as cache
 from lorasp_jax.base.files import check_local
+from lorasp_jax.config import Config
 from lorasp_jax.extras.deployment import healing
 from lorasp_jax.extras.study.held_out import held_out_demonstrations
 from lorasp_jax.training import activations, dataset, export, records, rules, start
@@ -161,8 +163,11 @@ def check_run(run: Path, task: str = "", *, simulated: bool = False) -> None:
         raise ValueError(f"{run} has no task {task!r}: choose one of {known}")
 
 
-def save(run: Path, name: str, out: Path, heal: int = 0, task: str = "") -> None:
-    """Make one variant of a run and write it to a new folder.
+def save(run: Path, name: str, out: Path, heal: int = 0, task: str = "") -> dict[str, Any]:
+    """Make one variant of a run, write it to a new folder, and return what calibrated it.
+
+    That is the `data`, its `episodes` and `frames`, and the number of `windows` drawn from them; {}
+    if nothing did.
 
     The folder has the adapters and refers to the run's base, or has the merged weights. A base in
     int8 or nf4 is quantized whenever the folder is loaded. `heal` is the number of steps by which
@@ -193,11 +198,29 @@ def save(run: Path, name: str, out: Path, heal: int = 0, task: str = "") -> None
         else:
             data = start.with_data(config, run, policy.model.config, demonstrations)
             phrases = dataset.limit(data, task) if task else ()
+    calibration = _described(config, data) if _needs_data(policy, form) else {}
     train = functools.partial(healing.heal, run=run, steps=heal, task=task) if heal else None
     deployed = in_form(policy, form, data, train)
     if task:
         deployed = _with_instructions(deployed, phrases)
-    export.write_variant(out, deployed, run, tasks=tasks, quantized=BASES[base])
+    more: Any = {"quantized": BASES[base], "calibration": calibration}
+    export.write_variant(out, deployed, run, tasks=tasks, **more)
+    return calibration
+
+
+def _described(config: Config, data: Demonstrations | Run) -> dict[str, Any]:
+    """Describe what calibrates a form, as `save` returns it."""
+    if isinstance(data, Run):
+        cache, starts = data.recordings, data.steps.start(np.arange(data.steps.num_starts))
+        assert cache is not None
+        source = " + ".join(config.data.source)
+        count, frames = len(np.unique(cache.episodes[starts])), len(starts)
+        windows = activations.BATCHES * config.optim.batch_size
+    else:
+        groups, source = data.values(), f"simulated demonstrations of {', '.join(data)}"
+        count, frames = (sum(getattr(g, n) for g in groups) for n in ("num_episodes", "num_steps"))
+        windows = BATCHES * BATCH_SIZE * len(data)
+    return {"data": source, "episodes": count, "frames": frames, "windows": windows}
 
 
 def _is_simulated(run: Path) -> bool:

@@ -85,12 +85,13 @@ def load_run(
         said = RecordedPolicy.read(folder, base=base, dataset=dataset)
         policy = Policy(model(said), said.processor(words))
     recorded = hub.resolve_portable(described["policy"]["tokenizer"])
+    dimensions = {key: described[key] for key in export.DIMENSIONS if key in described}
     config = read_json(Path(folder) / CONFIG_FILE, {"optim": {}})
     return Loaded(
         policy,
         load_tokenizer(words or recorded),
         continues=bool(config["optim"].get("rtc_max_delay")) if config else None,
-        metadata={key: described.get(key) for key in ("robot", "control_dt")},
+        metadata={key: described.get(key) for key in ("robot", "control_dt")} | dimensions,
         denoise_steps=export.denoise_steps(folder),
     )
 

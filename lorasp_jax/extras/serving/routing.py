@@ -42,6 +42,15 @@ def exact(prompt: str, instructions: Instructions) -> str:
     return found[0] if found else ""
 
 
+def shared(instructions: Instructions) -> dict[str, list[str]]:
+    """Return the instructions that several adapters have, and which; `exact` refuses these."""
+    owners: dict[str, dict[str, str]] = {}
+    for name, texts in instructions.items():
+        for text in texts:
+            owners.setdefault(_plain(text), {})[name] = text
+    return {next(iter(x.values())): [*x] for x in owners.values() if len(x) > 1}
+
+
 def nearest(
     prompt: str, instructions: Instructions, embed: Callable[[str], np.ndarray]
 ) -> tuple[str, str]:

@@ -23,6 +23,7 @@ from lorasp_jax.extras.serving.exported import (
 )
 from lorasp_jax.extras.serving.policies import CACHED_PROMPTS, Answer, CompiledPolicy
 from lorasp_jax.extras.serving.requests import PolicySpec, Request
+from lorasp_jax.training.export import DIMENSIONS
 
 _log = logging.getLogger(__name__)
 
@@ -56,7 +57,6 @@ class ServedPolicies:
 
     Attributes:
         spec: what requests must have, and what is returned.
-        metadata: what the first policy's run says of its robot.
         sizes: batch sizes, ascending.
         routing: how requests without a name find their adapter, one of `routing.MODES`.
     """
@@ -92,9 +92,15 @@ class ServedPolicies:
         self._prompt, self._load = prompt, load
         self.routing = route
         self.spec: PolicySpec = common_spec(_descriptions(policies), execution)
-        self.metadata: dict[str, Any] = dict(next(iter(policies.values())).description.metadata)
         self._adapters = {name: Adapter(name, policy) for name, policy in policies.items()}
         self._default = next(iter(policies))
+        if route != "name" and (doubtful := routing.shared(self.instructions)):
+            text, names = next(iter(doubtful.items()))
+            _log.warning(
+                "several adapters have the same instructions (%d, such as %r of %s): requests with "
+                "these must name the adapter",
+                *(len(doubtful), text, " and ".join(names)),
+            )
         self._change = threading.Lock()
         sizes = [set(policy.description.batch_sizes) for policy in policies.values()]
         self.sizes: tuple[int, ...] = tuple(sorted(set.intersection(*sizes)))
@@ -112,6 +118,13 @@ class ServedPolicies:
     def adapters(self) -> list[Adapter]:
         """The present adapters, the default first."""
         return [*self._adapters.values()]
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """What the runs say of their robot, and `DIMENSIONS` of each adapter that knows them."""
+        said = {str(each): each.policy.description.metadata for each in self.adapters}
+        own = {key: {n: x[key] for n, x in said.items() if key in x} for key in DIMENSIONS}
+        return _of_robot(said[self._default]) | {key: x for key, x in own.items() if x}
 
     @property
     def denoise_steps(self) -> dict[str, int]:
@@ -264,6 +277,11 @@ class ServedPolicies:
         return policy.run(batch)
 
 
+def _of_robot(metadata: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what all policies of a server must say alike; recordings may differ in names."""
+    return {key: value for key, value in metadata.items() if key not in DIMENSIONS}
+
+
 def draw_noise(key: jax.Array, index: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     """Draw the noise of one request, f32 of a shape.
 
@@ -290,6 +308,8 @@ def common_spec(policies: Mapping[str, Description], execution: str = "naive") -
     for name, description in policies.items():
         for key in (*shared, "metadata"):
             a, b = getattr(expected, key), getattr(description, key)
+            if key == "metadata":
+                a, b = _of_robot(a), _of_robot(b)
             if a != b:
                 raise ValueError(
                     f"{first} and {name} cannot be served together: their {key} is {a} and {b}"

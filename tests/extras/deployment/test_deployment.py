@@ -25,6 +25,7 @@ from lorasp_jax.policies.tokenizer import Offline
 from lorasp_jax.training import export
 from lorasp_jax.training.run_folder import to_json, write_json
 from tests.cases import mostly_slow
+from tests.extras.serving.test_policies import SIMULATED
 from tests.runs import CONFIG, RESULTS, make_run, random_episodes
 from tests.studies.paper.updates import add_noise
 
@@ -163,9 +164,10 @@ def test_forms(run):
 def test_a_saved_variant_is_served(run, tmp_path, capsys, name):
     out = tmp_path / "policy"
     assert command.main([str(run), "--save", name, "--out", str(out)]) == 0
-    assert capsys.readouterr().out == f"written: {out}\n"
+    said = "64 windows of 3 episodes (21 frames) of simulated demonstrations of press"
+    assert capsys.readouterr().out == f"written: {out}, calibrated on {said}\n"
     loaded = loading.load_run(str(out))
-    assert loaded.metadata == {"robot": "piper", "control_dt": 0.1}
+    assert loaded.metadata == SIMULATED
     assert loaded.denoise_steps == export.denoise_steps(run) == STEPS
     served = loaded.policy
     policy, kind = export.load_policy(run), name.split("-")[1]

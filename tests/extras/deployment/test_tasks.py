@@ -30,7 +30,7 @@ from tests.extras.deployment.test_deployment import (  # noqa: F401  (a fixture)
 from tests.extras.serving.adapter_runs import TEXTS, serve_runs
 from tests.extras.serving.test_policies import actions as answer
 from tests.extras.serving.test_policies import request
-from tests.runs import leaves, random_episodes
+from tests.runs import CONFIG, leaves, random_episodes
 
 TASKS = {task: TEXTS[task] for task in ("press", "pour")}
 
@@ -250,6 +250,13 @@ def test_recordings_calibrate_and_heal(recorded, tmp_path, monkeypatch, task):
             rows = OWN["pour"].instruction
             every &= {pour + n for n in range(len(rows)) if rows[n] == 0}
         assert learned == every
+    calibration = export.describe(folder)["calibration"]
+    assert calibration == {
+        "data": str(recorded.parent / "joined"),
+        "episodes": len(learned),
+        "frames": int(np.isin(cache.episodes, [*learned]).sum()),
+        "windows": 8 * CONFIG.optim.batch_size,
+    }
     served = export.load_policy(folder)
     texts = TASKS.get(task, (task,)) if task else (*TASKS["press"], *TASKS["pour"])
     assert {*served.processor.prompts.instructions} == {*texts}
@@ -261,7 +268,8 @@ def test_the_form_as_trained_needs_no_data(recorded, tmp_path, capsys):
     gone = config | {"data": config["data"] | {"source": "gone"}}
     write_json(changed / "config.json", gone)
     assert command.main([str(changed), "--save", "whole-int8", "--out", str(tmp_path / "a")]) == 0
-    capsys.readouterr()
+    assert capsys.readouterr().out == f"written: {tmp_path / 'a'}\n"
+    assert "calibration" not in export.describe(tmp_path / "a")
     error = refuse(capsys, changed, "--save", "half-bf16", "--out", tmp_path / "b")
     assert f"the recordings of {changed} cannot be read: gone does not exist" in error
     error = refuse(capsys, changed, "--save", "half-bf16", "--out", tmp_path / "b", "--task", "x")

@@ -30,6 +30,7 @@ from lorasp_jax.training.run_folder import to_json, write_json
 from tests import ROOT
 from tests.cases import mostly_slow
 from tests.extras.serving.stand_in import StandIn, observation
+from tests.extras.serving.test_policies import SIMULATED
 from tests.models.random_models import with_noise
 from tests.runs import CONFIG
 
@@ -48,7 +49,7 @@ def run(finished):
 
 def test_a_run_is_loaded(run):
     loaded = loading.load_run(str(run))
-    assert (loaded.metadata, loaded.continues) == ({"robot": "piper", "control_dt": 0.1}, None)
+    assert (loaded.metadata, loaded.continues) == (SIMULATED, None)
     assert loaded.policy.processor.prompts.instructions[0] == "press the button"
 
 

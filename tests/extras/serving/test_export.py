@@ -16,7 +16,7 @@ from lorasp_jax.training import load_policy
 from lorasp_jax.training.run_folder import to_json, write_json
 from studies.paper import transforms
 from tests.extras.serving.test_exported import arguments, in_process
-from tests.extras.serving.test_policies import make_policy
+from tests.extras.serving.test_policies import SIMULATED, make_policy
 from tests.runs import CONFIG, random_episodes
 
 
@@ -71,8 +71,7 @@ def test_the_command_exports_what_the_run_says(run, trained, tmp_path, capsys, m
     monkeypatch.setattr(exporting, "write", write)
     assert call(capsys, run, "--out", tmp_path / "policy", "--max-batch", 3)[0] == 0
     assert given.pop("instructions")[0] == "press the button"
-    metadata = {"robot": "piper", "control_dt": 0.1}
-    assert given == {"continues": True, "num_steps": 5, "max_batch": 3, "metadata": metadata}
+    assert given == {"continues": True, "num_steps": 5, "max_batch": 3, "metadata": SIMULATED}
     assert call(capsys, run, "--out", tmp_path / "quick", "--denoise-steps", 2)[0] == 0
     assert given["num_steps"] == 2
 

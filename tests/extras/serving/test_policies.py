@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lorasp_jax.extras.serving import policies
+from lorasp_jax.extras.serving import policies, server
 from lorasp_jax.extras.serving.loading import Loaded
 from lorasp_jax.extras.serving.policies import CompiledPolicy, batch_sizes
 from lorasp_jax.extras.serving.requests import Request
@@ -26,6 +26,11 @@ from tests.models.random_models import random_backbone
 INSTRUCTIONS = ("press the button", "push the button")
 WORDS = tokenizer.Offline()
 STEPS = 2
+_JOINTS = [*(f"joint_{n}" for n in range(1, 7)), "gripper"], [*(6 * ["rad"]), "m"]
+SIMULATED = {"robot": "piper", "control_dt": 0.1} | {
+    key: {"state": x, "action": x} for key, x in zip(("names", "units"), _JOINTS, strict=True)
+}
+"""What a run on simulated demonstrations says of its robot."""
 
 
 def make_policy(
@@ -162,6 +167,22 @@ def test_a_chunk_continues_what_remains_of_the_previous_one(execution, served):
     done = dataclasses.replace(sent[1], executed=spec.chunk, delay=0)
     alone = actions(served, request(spec, 0), request(spec, 1))
     np.testing.assert_allclose(actions(continuing, request(spec, 0), done), alone, atol=1e-5)
+
+
+def test_names_and_units_are_said_of_each_adapter():
+    """They may differ, unlike the robot."""
+    robot = {"robot": "piper", "control_dt": 0.1}
+    recorded = robot | {"names": {"state": ["a.pos"], "action": ["a.pos"]}}
+    said = SIMULATED, recorded, robot
+    made = {
+        name: CompiledPolicy(Loaded(make_policy(), WORDS, None, each))
+        for name, each in zip("abc", said, strict=True)
+    }
+    found = server.describe(ServedPolicies(made))
+    assert found["names"] == {"a": SIMULATED["names"], "b": recorded["names"]}
+    assert found["units"] == {"a": SIMULATED["units"]}
+    assert found["robot"] == "piper"
+    assert not {"names", "units"} & server.describe(ServedPolicies({"c": made["c"]})).keys()
 
 
 def test_programs_are_shared_and_compiled_in_advance():

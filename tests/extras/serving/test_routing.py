@@ -13,7 +13,7 @@ from lorasp_jax.extras.serving.served import ServedPolicies
 from lorasp_jax.policies.tokenizer import Offline
 from tests import ROOT
 from tests.extras.serving.adapter_runs import TEXTS, serve_runs, write_run
-from tests.extras.serving.test_policies import actions, request
+from tests.extras.serving.test_policies import actions, compiled, make_policy, request
 
 TASKS = {task.TASK.name: task.TASK.instructions for task in (press, pick_place, open_pot, pour)}
 PARAPHRASES = {
@@ -171,6 +171,20 @@ def test_only_policies_on_a_shared_base_are_nearest(finished, tmp_path):
     served = serve_runs({"press": run}, share=False, max_batch=1, route="nearest")
     with pytest.raises(ValueError, match="needs policies that share a base"):
         served.route(request(served.spec, 0, "press it"))
+
+
+def test_instructions_of_several_adapters_are_said_at_the_start_if_they_choose(caplog):
+    known = {"a": ["Go.", "stop"], "b": ["go", "wait"], "c": ["stop", "Go"]}
+    assert routing.shared(known) == {"Go.": ["a", "b", "c"], "stop": ["a", "c"]}
+    policies = {"press": make_policy(), "again": make_policy(seed=1)}
+    compiled(policies)
+    assert not caplog.messages
+    compiled(policies, route="exact")
+    (said,) = caplog.messages
+    assert "(2, such as 'press the button' of press and again): requests with these must" in said
+    apart = policies | {"again": make_policy(instructions=("open the pot",))}
+    compiled(apart, route="exact")
+    assert len(caplog.messages) == 1
 
 
 def test_nothing_is_near_where_nothing_is_known(embed):
