@@ -77,9 +77,7 @@ def check(chosen: Chosen, cache: Cache, held_out: Sequence[int], learn: str) -> 
         return
     good = (chosen.outcome == 1) | chosen.helped
     good[[*held_out]] = False
-    episodes = [cache.episode(number, ()) for number in range(len(cache))]
-    tasks = np.array([episode.task for episode in episodes])
-    phrases = np.array([episode.instruction[0] for episode in episodes])
+    tasks, phrases = cache.tasks, cache.phrases
     for task in cache.metadata["tasks"]:
         if not good[(tasks == task) | np.isin(phrases, phrases[tasks == task])].any():
             raise ValueError(f"no episode of {task} succeeded, so --learn {learn} cannot learn it")
