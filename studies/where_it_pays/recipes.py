@@ -79,16 +79,12 @@ def cells(
 
 def judge_changed(run: Run, name: str, pool: int) -> dict[str, Any]:
     """Train the run's policy anew, with one of `CHANGES` of its new adapters."""
-    episodes = shared_demonstrations(run.folder.parents[2], pool, run.config, run.folder, _silent)
+    episodes = shared_demonstrations(run.folder.parents[2], pool, run.config)
     learner = dataclasses.replace(run, episodes=episodes)
     model = CHANGES[name](learner, setup.build(run.config, run.folder).model)
     learner.policy = replace(run.policy, model=model)
     learner.policy = loop.trained(learner)
     return judge_scenes(learner)
-
-
-def _silent(*_: Any) -> None:
-    """Report no progress."""
 
 
 def _eva(run: Run, model: Backbone) -> Backbone:

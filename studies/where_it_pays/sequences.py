@@ -65,8 +65,7 @@ def derived(
 def judge(run: Run, kind: str, order: int, pool: int) -> dict[str, Any]:
     """Return what `judged` does, in scenes as recorded."""
     tasks = [task for task in page.SEQUENCES.orders[order] if task in run.config.tasks]
-    study_folder = run.folder.parents[3]
-    every = shared_demonstrations(study_folder, pool, run.config, run.folder, lambda *_: None)
+    every = shared_demonstrations(run.folder.parents[3], pool, run.config)
 
     def demonstrate(stage: Run, shares: Mapping[str, float]) -> Run:
         counts = {t: math.ceil(share * every[t].num_episodes) for t, share in shares.items()}
