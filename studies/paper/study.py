@@ -23,11 +23,12 @@ import numpy as np
 from envs import Randomization
 from lorasp_jax.config import Config, DataConfig, EvaluationConfig, ModelConfig, OptimConfig
 from lorasp_jax.extras.study import Cell, Derived, Study
+from lorasp_jax.extras.study.results import best_pilot, best_rate
 from lorasp_jax.extras.study.study import Results
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP, Method
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training.demonstrations import Demonstrations
-from studies.paper import naming, page, transforms
+from studies.paper import page, transforms
 from studies.paper.claims import make_claims
 from studies.paper.measures import measure
 
@@ -127,7 +128,7 @@ def _pilots(backbone: str, family: str) -> Iterator[Cell]:
     needs = _pilot_names(backbone, "lora_sp") if family == "ada_lora" else ()
 
     def config(rate: float, results: Results) -> Config:
-        rank = _mean_rank(results, [naming.best_pilot(results, needs)]) if needs else 0.0
+        rank = _mean_rank(results, [best_pilot(results, needs)]) if needs else 0.0
         method = _method(family, rank)
         return _config(backbone, method, rate, PILOT_SEED)
 
@@ -167,7 +168,7 @@ def _new_scene(backbone: str) -> Iterator[Cell]:
     group, pilots = f"{backbone}/panda/full", _pilot_names(backbone, "full")
 
     def config(seed: int, results: Results) -> Config:
-        rate, before = _best_rate(results, pilots), seed == SEEDS[0]
+        rate, before = best_rate(results, pilots), seed == SEEDS[0]
         made = _config(backbone, FullFineTuning(), rate, seed, before=before)
         return replace(made, robot="panda", scene=NEW_SCENE)
 
@@ -190,7 +191,7 @@ def _trained(
     pilots = _pilot_names(backbone, _family(method))
 
     def config(results: Results) -> Config:
-        rate = _best_rate(results, pilots)
+        rate = best_rate(results, pilots)
         peft = _method(method, _mean_rank(results, needs) if needs else 0.0)
         made = _config(backbone, peft, rate, seed, tasks or CONFIG.tasks, before=before)
         if method != "lora_sp_no_spectral":
@@ -244,11 +245,6 @@ def _method(name: str, mean_rank: float) -> Method:
         "dora": lambda: DoRA(rank=rank),
     }
     return made[name]()
-
-
-def _best_rate(results: Results, pilots: Sequence[str]) -> float:
-    """Return the learning rate of the best pilot cell."""
-    return naming.rate(naming.best_pilot(results, pilots))
 
 
 def _mean_rank(results: Results, cells: Sequence[str]) -> float:

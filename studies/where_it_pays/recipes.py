@@ -16,6 +16,7 @@ from lorasp_jax.config import AuxiliaryConfig, Config
 from lorasp_jax.dense import AdaptedLayer, AdapterParam
 from lorasp_jax.extras.study import Cell, Derived
 from lorasp_jax.extras.study.held_out import shared_demonstrations
+from lorasp_jax.extras.study.results import best_rate
 from lorasp_jax.extras.study.study import Results
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.peft import LoRA, LoRASP, Method
@@ -25,7 +26,6 @@ from lorasp_jax.training import activations, loop, rules, setup
 from lorasp_jax.training.run import Run
 from studies.few.judge import judge as judge_scenes
 from studies.where_it_pays import names
-from studies.where_it_pays.judge import best_rate
 
 _BANK = LoRASP(rank=names.WIDE)
 RECIPES: Mapping[str, tuple[Method, dict[str, Any]]] = {
