@@ -197,8 +197,5 @@ def _estimate(
 
 def outcomes(found: Iterable[Mapping[str, Any]], scene: str) -> np.ndarray:
     """Stack the episodes of some policies in a scene, bool `[S, T, N]`."""
-    texts = [
-        {case: text for case, text in result["outcomes"].items() if case.startswith(f"{scene}/")}
-        for result in found
-    ]
-    return statistics.outcomes([[{"outcomes": text}] for text in texts])
+    every = (result["outcomes"].items() for result in found)
+    return statistics.stacked([{k: o for k, o in x if k.startswith(f"{scene}/")} for x in every])

@@ -175,7 +175,7 @@ def _base_table(results: Results, backbone: str) -> str:
     rows = []
     for kind, methods in BASE_ROWS.items():
         if base := results.get(names.base(backbone, kind)):
-            rate = page.percent(statistics.success(statistics.outcomes([[base]])))
+            rate = page.percent(statistics.success(statistics.stacked([base["outcomes"]])))
             rows.append([kind, "the base itself, on the Panda", rate, *[page.NONE] * 3, "1"])
         for method, label in methods.items():
             both = ran(results, *(_policies_on(backbone, kind, x) for x in (method, "lora")))

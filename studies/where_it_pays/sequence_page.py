@@ -172,8 +172,7 @@ def _rates(seeds: Seeds, order: Sequence[str]) -> Rates:
 
 def _outcomes(seeds: Seeds, keys: Mapping[str, str]) -> np.ndarray:
     """Stack some outcomes, bool `[S, T, N]`, given their keys by task."""
-    texts = [{task: seed["outcomes"][key] for task, key in keys.items()} for seed in seeds]
-    return statistics.outcomes([[{"outcomes": text}] for text in texts])
+    return statistics.stacked([{t: seed["outcomes"][k] for t, k in keys.items()} for seed in seeds])
 
 
 def _mean_minus(joint: np.ndarray, *ends: np.ndarray) -> np.ndarray:
