@@ -23,6 +23,7 @@ import numpy as np
 from envs import Randomization
 from lorasp_jax.config import Config, DataConfig, EvaluationConfig, ModelConfig, OptimConfig
 from lorasp_jax.extras.study import Cell, Derived, Study
+from lorasp_jax.extras.study.page import BACKBONES
 from lorasp_jax.extras.study.results import best_pilot, best_rate
 from lorasp_jax.extras.study.study import Results
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP, Method
@@ -31,6 +32,7 @@ from lorasp_jax.training.demonstrations import Demonstrations
 from studies.paper import page, transforms
 from studies.paper.claims import make_claims
 from studies.paper.measures import measure
+from studies.paper.tables import RANK
 
 MakeMethod = Callable[[Results], Method]
 PILOT_SEED = 1000
@@ -62,12 +64,9 @@ CONFIG = Config(
     checkpoint_every=1250,
 )
 """What all cells share; method, rate and seed are replaced."""
-BACKBONES = ("pi0", "smolvla")
 ABLATED = "smolvla"
 """The backbone of Tables III and IV."""
 SEEDS = (0, 1, 2)
-RANK = 64
-"""R, the size of LoRA-SP's bank."""
 RANKS = (2, 4, 8, 16, 32)
 """LoRA's ranks besides R."""
 METHODS = (
@@ -85,7 +84,7 @@ def get_study(scale: str) -> Study:
         raise ValueError(f"the study has the scale accelerator, got {scale!r}")
     cells = tuple(cell for backbone in BACKBONES for cell in _cells(backbone))
     cells += tuple(cell for backbone in BACKBONES for cell in _new_scene(backbone))
-    claims = make_claims([cell.name for cell in cells], RANK, BACKBONES)
+    claims = make_claims([cell.name for cell in cells], RANK, [*BACKBONES])
     return Study("paper", cells, measure=measure, page=functools.partial(page.blocks, claims))
 
 
