@@ -22,7 +22,7 @@ from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.peft import LoRA, LoRASP, Method
 from lorasp_jax.peft.auxiliary import Aux
 from lorasp_jax.peft.method import Params
-from lorasp_jax.training import activations, loop, rules, setup
+from lorasp_jax.training import activations, fixed_batches, loop, rules, setup
 from lorasp_jax.training.run import Run
 from studies.few.judge import judge as judge_scenes
 from studies.where_it_pays import names
@@ -90,7 +90,7 @@ def judge_changed(run: Run, name: str, pool: int) -> dict[str, Any]:
 def _eva(run: Run, model: Backbone) -> Backbone:
     """Begin with the leading directions of each layer's inputs x (EVA, arXiv 2410.07170)."""
     batches = activations.sampled(run, run.policy.processor, model.config.chunk)
-    moments = calibration.input_moments(model, batches, ".*", activations.loss)
+    moments = calibration.input_moments(model, batches, ".*", fixed_batches.forward)
     return _changed(model, lambda path, layer: _with_leading(layer, moments[path]))
 
 
