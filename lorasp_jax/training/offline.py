@@ -92,16 +92,13 @@ def describe(chosen: Chosen, cache: Cache, learn: str, console: Console) -> None
     if cache.corrected is not None:
         text += f", {cache.corrected.sum()} corrected steps"
     console.print(text, highlight=False)
-    names = [part.name for i, part in enumerate(cache.parts) if _any(chosen, cache, i)]
+    shown = {*cache.dataset[chosen.demonstrated].tolist()}
+    names = [part.name for index, part in enumerate(cache.parts) if index in shown]
     if learn == "imitation":
         text = "failures are imitated, too: --learn filtered leaves them out"
         console.print(text, style="yellow", highlight=False)
     elif names:
         console.print(f"demonstrations: {', '.join(names)}", highlight=False, markup=False)
-
-
-def _any(chosen: Chosen, cache: Cache, index: int) -> bool:
-    return bool(chosen.demonstrated[cache.dataset == index].any())
 
 
 def run_ends(corrected: np.ndarray, end: np.ndarray) -> np.ndarray:
