@@ -23,26 +23,12 @@ from rich.console import Console
 
 import lorasp_jax
 from benchmarks.measuring import machine, print_table
+from benchmarks.peers.stacks import Stack
 from lorasp_jax import peft
 from lorasp_jax.adapters.adaptation import adapt
 
 LOSS_WEIGHT = 1e-2
 PHASES = ("trace s", "lower s", "compile s", "total s")
-
-
-class Stack(nnx.Module):
-    """A sequence of dense layers, not scanned."""
-
-    def __init__(self, depth: int, width: int, dtype: Any) -> None:
-        """Initialize the weights."""
-        options = {"dtype": dtype, "param_dtype": dtype, "rngs": nnx.Rngs(0)}
-        self.layers = nnx.List([nnx.Linear(width, width, **options) for _ in range(depth)])
-
-    def __call__(self, x: jax.Array) -> jax.Array:
-        """Apply all layers; x and the result are [T, D]."""
-        for layer in self.layers:
-            x = nnx.relu(layer(x))
-        return x
 
 
 def models(base: Stack, x: jax.Array, rank: int) -> Iterator[tuple[str, Any, Any]]:

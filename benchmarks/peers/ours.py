@@ -172,7 +172,7 @@ def stack(job: Job) -> Iterator[Row]:
     sizes = workloads.STACK[job.size]
     name, _, base = job.variant.partition(" on ")
     adapter = [("layers", METHODS[name](rank=sizes.rank))]
-    model: Any = lorasp_jax.adapt(stacks.Stack(sizes), adapter, rngs=nnx.Rngs(0))
+    model: Any = lorasp_jax.adapt(stacks.Stack(sizes.depth, sizes.width), adapter, rngs=nnx.Rngs(0))
     if base:
         model = lorasp_jax.quantize(model, [("layers", "nf4")]).model
     yield from stacks.rows(model, stacks.inputs(sizes), job)

@@ -22,7 +22,8 @@ def measure(job: Job) -> Iterator[Row]:
     provider = qwix.LoraProvider(
         module_path=".*", rank=sizes.rank, alpha=2.0 * sizes.rank, **options
     )
-    model = qwix.apply_lora_to_model(stacks.Stack(sizes), provider, x, rngs=nnx.Rngs(0))
+    base = stacks.Stack(sizes.depth, sizes.width)
+    model = qwix.apply_lora_to_model(base, provider, x, rngs=nnx.Rngs(0))
     yield from stacks.rows(model, x, job)
 
 

@@ -18,10 +18,9 @@ from benchmarks.peers.worker import Job, Row
 class Stack(nnx.Module):
     """A sequence of dense layers, not scanned."""
 
-    def __init__(self, sizes: workloads.Stack) -> None:
-        """Initialize the weights in bf16."""
-        options = {"dtype": jnp.bfloat16, "param_dtype": jnp.bfloat16, "rngs": nnx.Rngs(0)}
-        width, depth = sizes.width, sizes.depth
+    def __init__(self, depth: int, width: int, dtype: Any = jnp.bfloat16) -> None:
+        """Initialize the weights."""
+        options = {"dtype": dtype, "param_dtype": dtype, "rngs": nnx.Rngs(0)}
         self.layers = nnx.List([nnx.Linear(width, width, **options) for _ in range(depth)])
 
     def __call__(self, x: jax.Array) -> jax.Array:

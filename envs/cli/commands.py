@@ -86,8 +86,7 @@ def play(options: argparse.Namespace, console: Console) -> None:
     options.out.parent.mkdir(parents=True, exist_ok=True)
     with writing.atomic_file(options.out) as temporary:
         video.write_video(temporary, views, fps=1 / episode.control_dt)
-    text = episode.instructions[int(episode.instruction[0])]
-    console.print(f"{options.out}: {len(views)} steps, {text!r}")
+    console.print(f"{options.out}: {len(views)} steps, {episode.phrases[0]!r}")
 
 
 def _env(options: argparse.Namespace, task: str) -> envs.Env:

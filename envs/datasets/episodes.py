@@ -96,6 +96,11 @@ class Episodes:
         """Total number of valid control steps."""
         return int(np.sum(self.length))
 
+    @property
+    def phrases(self) -> list[str]:
+        """The instruction of each episode, `[E]`."""
+        return [self.instructions[int(index)] for index in self.instruction]
+
     def select(self, indices: Sequence[int] | Array) -> Self:
         """Select episodes by index, in this order."""
         return jax.tree.map(lambda x: x[np.asarray(indices)], self)

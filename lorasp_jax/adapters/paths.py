@@ -7,6 +7,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import jax
 from flax import nnx
 
 from lorasp_jax.adapters.layers import nnx_layers
@@ -37,6 +38,14 @@ def locate(root: nnx.List[Any], kind: type | tuple[type, ...]) -> list[Location]
         for name, child in vars(module).items()
         if isinstance(child, kind)
     ]
+
+
+def by_path(tree: Any) -> dict[str, Any]:
+    """Return the leaves of a dict or an `nnx.State` by "/"-joined path, in tree order."""
+    leaves = jax.tree_util.tree_leaves_with_path(
+        nnx.to_pure_dict(tree) if isinstance(tree, nnx.State) else tree
+    )
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
 @contextlib.contextmanager

@@ -143,7 +143,6 @@ class _Writer:
         self._metadata = self._metadata or _metadata(episode)
         _check_compatible(self._metadata, episode)
         length = int(episode.length[0])
-        phrase = episode.instructions[int(episode.instruction[0])]
         lists = (self._tasks, [episode.task]), (self._instructions, episode.instructions)
         for known, new in lists:
             known += [text for text in new if text not in known]
@@ -153,7 +152,7 @@ class _Writer:
         steps |= {_IMAGE + name: images for name, images in episode.image.items()}
         for name, array in steps.items():
             self._extend(name, np.asarray(array)[0, :length])
-        row = {"length": length, "instruction": self._instructions.index(phrase)}
+        row = {"length": length, "instruction": self._instructions.index(episode.phrases[0])}
         row["task"] = self._tasks.index(episode.task)
         row["success"] = UNLABELLED if episode.success is None else int(episode.success[0])
         for name, value in row.items():
@@ -270,6 +269,16 @@ class Cache:
     def episodes(self) -> np.ndarray:
         """Number of the episode of each step, `[N]`."""
         return np.repeat(np.arange(len(self)), self._columns["length"])
+
+    @property
+    def tasks(self) -> np.ndarray:
+        """The task of each episode, text `[E]`."""
+        return np.array(self.metadata["tasks"])[self._columns["task"]]
+
+    @property
+    def phrases(self) -> np.ndarray:
+        """The instruction of each episode, text `[E]`."""
+        return np.array(self.instructions)[self._columns["instruction"]]
 
     def part_of(self, task: str) -> Part:
         """Return the first dataset with a task."""

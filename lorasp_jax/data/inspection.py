@@ -70,7 +70,7 @@ def summarize(source: Source) -> Summary:
         ValueError: an episode is damaged.
     """
     episodes = [source.episode(number, ()) for number in range(len(source))]
-    phrases = collections.Counter(e.instructions[int(e.instruction[0])] for e in episodes)
+    phrases = collections.Counter(e.phrases[0] for e in episodes)
     labels = [labelled(e) for e in episodes]
     outcomes = [int(e.success[0]) for e in labels if e.success is not None]
     return Summary(
@@ -214,8 +214,7 @@ def _row(source: Source, number: int, preset: str, *, titles: bool) -> np.ndarra
             }
         frames.append(np.pad(side_by_side(padded), [(0, 2), (0, 2), (0, 0)]))
     images = np.concatenate(frames, axis=1)
-    phrase = episode.instructions[int(episode.instruction[0])]
-    text = f"{number}: {phrase} ({episode.num_steps} steps)"
+    text = f"{number}: {episode.phrases[0]} ({episode.num_steps} steps)"
     return np.concatenate([_text(text, images.shape[1]), images])
 
 

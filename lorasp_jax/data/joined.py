@@ -152,8 +152,7 @@ class Joined:
         part, names = self.parts[index], self.cameras if cameras is None else cameras
         own = [name for name in names if name in part.cameras]
         found = self.sources[part.name].episode(number - self._ends[index] + part.episodes, own)
-        phrase = found.instructions[int(found.instruction[0])]
-        row = self._same["instructions"].index(phrase)
+        row = self._same["instructions"].index(found.phrases[0])
         images = {name: self._images(found, name) for name in names}
         changed = {"image": images, "instruction": np.array([row], np.int32)}
         return dataclasses.replace(found, **changed, **self._same)

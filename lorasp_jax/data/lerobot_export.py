@@ -83,7 +83,7 @@ class _Writer:
         if number and (features, episode.robot) != (self._features, self._robot):
             raise ValueError(f"episode {number} has another robot or other shapes than the first")
         self._features, self._robot = features, episode.robot
-        task = episode.instructions[int(episode.instruction[0])]
+        task = episode.phrases[0]
         arrays = {
             "observation.state": np.asarray(episode.state[0, :length]),
             "action": np.asarray(episode.action[0, :length]),

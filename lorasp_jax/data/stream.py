@@ -19,11 +19,7 @@ _PREFETCH = 4  # batches
 
 
 class Stream:
-    """An endless iterator of `RawBatch` batches in host memory.
-
-    Attributes:
-        position: index of the next batch, counted from the start of training.
-    """
+    """An endless iterator of `RawBatch` batches in host memory."""
 
     def __init__(
         self,
@@ -43,13 +39,11 @@ class Stream:
                 number.
             chunk: C, the number of actions in a window.
             seed: seed of the shuffling; every epoch has a different order.
-            start: `position` to resume from.
+            start: index of the first batch, counted from the start of training.
             process: index of this process, and number of processes; each gets an equal share of a
                 batch.
         """
         index, count = process
-        self.position: int = start
-
         share = batch_size // count
         rows = slice(index * share, (index + 1) * share)
 
@@ -65,10 +59,8 @@ class Stream:
         return self
 
     def __next__(self) -> RawBatch:
-        """Return the batch at `position` and advance."""
-        raw = next(self._iterator)
-        self.position += 1
-        return raw
+        """Return the next batch."""
+        return next(self._iterator)
 
 
 def _order(steps: Steps, seed: int) -> Any:

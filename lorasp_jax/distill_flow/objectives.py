@@ -34,12 +34,10 @@ class Endpoint:
     reflow's regression on fixed pairs (arXiv 2209.03003).
 
     Attributes:
-        num_steps: k, flow steps of the student.
-        teacher_steps: n, those of the teacher.
+        num_steps: k, flow steps of the student; the teacher takes n = `NUM_STEPS`.
     """
 
     num_steps: int
-    teacher_steps: int = NUM_STEPS
 
     def __call__(
         self, student: Backbone, teacher: Backbone, batch: Batch, noise: jax.Array, _: jax.Array
@@ -47,7 +45,7 @@ class Endpoint:
         """Return errors `[B, C, A]` and the adapters' aux, see `training.step.Objective`."""
         prefix, aux, options = _shared(teacher, batch)
         sample = {"noise": noise, **options}
-        target, _aux = teacher.run_flow(prefix, num_steps=self.teacher_steps, **sample)
+        target, _aux = teacher.run_flow(prefix, num_steps=NUM_STEPS, **sample)
         chunk, action_aux = student.run_flow(prefix, num_steps=self.num_steps, **sample)
         errors = jnp.square(chunk - jax.lax.stop_gradient(target))
         return errors, merge_action_aux(aux, action_aux)

@@ -16,7 +16,7 @@ from flax import nnx
 
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io import native
-from lorasp_jax.models.checkpoints.native import by_path
+from lorasp_jax.adapters.paths import by_path
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.inputs import OURS
 from lorasp_jax.models.observation import Observation
@@ -110,7 +110,7 @@ class SharedBase:
         self._bare = nnx.eval_shape(lambda: self.config.create(nnx.Rngs(0)))
         self._shapes: dict[Any, Any] = {frozenset(): self._bare}
         self._structures: dict[Any, _Structure] = {}
-        stacked = by_path(nnx.to_pure_dict(nnx.state(quantize(model))))
+        stacked = by_path(nnx.state(quantize(model)))
         self._arrays: dict[str, jax.Array] = {
             name: jnp.asarray(part)
             for whole, array in stacked.items()
@@ -158,7 +158,7 @@ class SharedBase:
 
     def attach_model(self, model: Any, bare: Any) -> SharedSampler:
         """Return a sampler for a model that was adapted from `bare`, from which this base is."""
-        base, arrays = (by_path(nnx.to_pure_dict(nnx.state(each))) for each in (bare, model))
+        base, arrays = (by_path(nnx.state(each)) for each in (bare, model))
         own = {n: np.asarray(a) for n, a in arrays.items() if base.get(n) is not a}
         return self.attach(adaptation.methods(model), own)
 
@@ -198,7 +198,7 @@ class SharedBase:
             graphdef, state = nnx.split(self._adapted(methods))
             prepare = lambda state: unstacked(self._quantize(nnx.merge(graphdef, state)))  # noqa: E731
             graphdef, state = nnx.split(nnx.eval_shape(prepare, state))
-            names = tuple(by_path(nnx.to_pure_dict(state)))
+            names = tuple(by_path(state))
             places: dict[str, tuple[int, int | None]] = {}
             for k, (name, array) in enumerate(arrays.items()):
                 parts = _by_layer(name, array)

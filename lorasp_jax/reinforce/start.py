@@ -73,7 +73,8 @@ def resolve(config: ReinforceConfig, given: Collection[str]) -> ReinforceConfig:
     if "distill" in read_json(start / CONFIG_FILE):
         raise ValueError(f"{start} is distilled, which learning would undo: learn, then distill")
     kept = (*KEPT, *(ADAPTERS if config.online.adapters == "continue" else ()))
-    ranges = {name: getattr(config.scene, name) for name in _scene_fields(given)}
+    drawn = [name.partition(".")[2] for name in given if name.startswith("scene.")]
+    ranges = {name: getattr(config.scene, name) for name in drawn}
     scene = dataclasses.replace(recorded.scene, **ranges)  # another scene may be learned
     completed = with_kept(config, start, recorded, [x for x in kept if x != "scene"], given)
     completed = dataclasses.replace(completed, scene=scene)
@@ -87,10 +88,6 @@ def resolve(config: ReinforceConfig, given: Collection[str]) -> ReinforceConfig:
     acting = {name: x for name, x in acting.items() if f"evaluation.{name}" not in given}
     evaluation = dataclasses.replace(config.evaluation, **acting)
     return dataclasses.replace(completed, tasks=tasks, evaluation=evaluation)
-
-
-def _scene_fields(given: Collection[str]) -> list[str]:
-    return [name.partition(".")[2] for name in given if name.startswith("scene.")]
 
 
 def _check_mergeable(start: Path, recorded: Config) -> None:

@@ -204,7 +204,7 @@ def improve(
     taken = rows[-1]["within"] and not rows[-1]["in_a_row"]
     kl = _change(programs, state, frozen, batch, evenly(useful, size)) if taken else np.inf
     rate = adapted(state.rate, kl, config.online.max_kl)
-    return dataclasses.replace(state, rate=rate), _stack(rows)
+    return dataclasses.replace(state, rate=rate), jax.tree.map(lambda *x: np.stack(x), *rows)
 
 
 def evenly(rows: np.ndarray, count: int) -> np.ndarray:
@@ -219,7 +219,3 @@ def _change(
     mean = programs.means(state.adapters, frozen, batch.chunks, index)
     kl = programs.divergence(mean, batch.means[index], frozen, batch.chunks, index)
     return float(jnp.mean(kl, where=batch.valid[index]))
-
-
-def _stack(rows: list[Metrics]) -> dict[str, np.ndarray]:
-    return jax.tree.map(lambda *x: np.stack(x), *rows)

@@ -264,10 +264,6 @@ def _memory(gib: float) -> str:
     return f"{gib:.2f} GiB" if gib >= 1 else f"{1024 * gib:.1f} MiB"
 
 
-def _has_rank(rows: figures.Rows) -> bool:
-    return any(name.startswith("active_rank/") for row in rows for name in row)
-
-
 def _rules(results: dict[str, Any]) -> Iterable[str]:
     """Show what each rule of `adapt` trains, if the run is finished."""
     if "rules" not in results:
@@ -298,7 +294,7 @@ def _active_rank(
     results: dict[str, Any], rows: figures.Rows, folder: Path, config: dict[str, Any]
 ) -> Iterable[str]:
     """Show active rank in training and in closed loop, if a method has one."""
-    if not _has_rank(rows):
+    if not any(name.startswith("active_rank/") for row in rows for name in row):
         return
     rank = _largest_rank(folder, config)
     yield "<h2>Active rank</h2>"

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import jax
 from flax import nnx
@@ -32,20 +31,14 @@ def input_moments(run: Run, model: Backbone, processor: Processor) -> dict[str, 
     layers = [layer.path for layer in paths.locate_matmul_layers(nnx.List([model]))]
     pattern = "|".join(f"^{re.escape(path)}$" for path in layers if needs(path))
     batches = sampled(run, processor, model.config.chunk)
-    return calibration.input_moments(model, batches, pattern, loss)
+    return calibration.input_moments(model, batches, pattern, fixed_batches.forward)
 
 
-def sampled(run: Run, processor: Processor, chunk: int) -> Iterator[tuple[jax.Array, Batch]]:
+def sampled(run: Run, processor: Processor, chunk: int) -> Iterator[fixed_batches.Keyed]:
     """Yield `BATCHES` random keys and training batches."""
     sample = batch_sampler(run, processor, chunk)
     for key in jax.random.split(RandomStream.STATISTICS.key(run.config.seed), BATCHES):
         yield key, sample(key)
-
-
-def loss(model: Backbone, sampled: tuple[jax.Array, Batch]) -> Any:
-    """Forward pass of `calibration`."""
-    key, batch = sampled
-    return model.loss(key, batch.observation, batch.actions, action_mask=batch.action_mask)
 
 
 def batch_sampler(run: Run, processor: Processor, chunk: int) -> Callable[[jax.Array], Batch]:

@@ -109,8 +109,7 @@ def advantages(cache: Cache, chosen: Chosen, config: Config, observed: np.ndarra
 def _tasks(cache: Cache) -> tuple[np.ndarray, np.ndarray]:
     """Return the task of each episode, `[E]`, and the longest episode of each task, in steps."""
     length = np.bincount(cache.episodes)
-    names = [cache.episode(number, ()).task for number in range(len(cache))]
-    task = np.unique(names, return_inverse=True)[1]
+    task = np.unique(cache.tasks, return_inverse=True)[1]
     return task, np.array([length[task == index].max() for index in range(task.max() + 1)])
 
 

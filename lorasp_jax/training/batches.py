@@ -7,11 +7,10 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 
-from lorasp_jax.config import Config
 from lorasp_jax.data.batches import RawBatch, Steps, draw, fit_to_size, flatten, nbytes
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.training.cost.speed import Speed
-from lorasp_jax.training.demonstrations import Demonstrations, in_thread
+from lorasp_jax.training.demonstrations import fresh_demonstrations, in_thread
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.random_streams import StepKeys
@@ -19,9 +18,6 @@ from lorasp_jax.training.run import Run
 
 MAX_BYTES = 2**28
 """Largest size of the batches of one call, unless a single batch is larger."""
-
-CollectGeneration = Callable[[Config, int], Demonstrations]
-"""Collects demonstrations per task for generation 1, 2, ... (see `fresh_demonstrations`)."""
 
 
 class DrawnBatches:
@@ -150,20 +146,15 @@ class StreamedBatches:
 Batches: TypeAlias = DrawnBatches | StreamedBatches
 
 
-def make_batches(
-    run: Run, mesh: jax.sharding.Mesh, start: int, collect: CollectGeneration, speed: Speed
-) -> Batches:
-    """Return the batches of the run's data from step `start` on.
-
-    `collect` is called only if `data.fresh_every` is set.
-    """
+def make_batches(run: Run, mesh: jax.sharding.Mesh, start: int, speed: Speed) -> Batches:
+    """Return the batches of the run's data from step `start` on."""
     if run.streams:
         return StreamedBatches(run, mesh, start, speed)
 
     def generation(number: int) -> Steps:
         steps = run.steps
         if number:
-            episodes = collect(run.config, number)
+            episodes = fresh_demonstrations(run.config, number)
             steps = fit_to_size(flatten(list(episodes.values())), len(steps.end))
         return processes.device_put(steps, meshes.replicated(mesh))
 

@@ -176,13 +176,11 @@ def _labels(cache: Cache, data: DataConfig) -> tuple[list[str], list[str]]:
     Tasks of different datasets are different ones.
     """
     last = len(cache) - cache.parts[-1].episodes if data.replay else len(cache)
-    episodes = [cache.episode(number, ()) for number in range(last)]
-    phrases = [each.instructions[int(each.instruction[0])] for each in episodes]
-    tasks = [each.task for each in episodes]
+    tasks, phrases = cache.tasks.tolist(), cache.phrases.tolist()
     if cache.parts[1:]:
-        pairs = zip(tasks, cache.dataset, strict=False)
+        pairs = zip(tasks, cache.dataset, strict=True)
         tasks = [f"{task} of {cache.parts[index].name}" for task, index in pairs]
-    return tasks, phrases
+    return tasks[:last], phrases[:last]
 
 
 def _describe(run: Run, cache: Cache, datasets: Sequence[Mapping[str, Any]]) -> None:
@@ -298,18 +296,14 @@ def limit(run: Run, task: str) -> list[str]:
     """
     assert run.recordings is not None
     assert run.dataset is not None
-    cache, steps, spoken = run.recordings, run.dataset, {}
-    for number in range(len(cache)):
-        episode = cache.episode(number, ())
-        phrase = episode.instructions[int(episode.instruction[0])]
-        if task in (episode.task, phrase):
-            spoken[number] = phrase
+    cache, steps = run.recordings, run.dataset
+    chosen = (cache.tasks == task) | (cache.phrases == task)
     starts = steps.start(np.arange(steps.num_starts, dtype=np.int32))
-    starts = starts[np.isin(cache.episodes, [*spoken])[starts]]
+    starts = starts[chosen[cache.episodes[starts]]]
     if not len(starts):
         raise ValueError(f"{run.folder} trained on no episode of {task}")
     run.dataset = mixed(dataclasses.replace(steps, starts=starts, mixture=None), run.config.data)
-    return [*dict.fromkeys(spoken.values())]
+    return [*dict.fromkeys(cache.phrases[chosen].tolist())]
 
 
 def corrected_only(steps: Steps, cache: Cache, episodes: Collection[int]) -> Steps:

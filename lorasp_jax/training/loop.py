@@ -16,10 +16,9 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.base.bars import bars
 from lorasp_jax.config import Config, OptimConfig
 from lorasp_jax.policies.policy import Policy
-from lorasp_jax.training.batches import CollectGeneration, make_batches
+from lorasp_jax.training.batches import make_batches
 from lorasp_jax.training.checkpoint import Checkpoints
 from lorasp_jax.training.cost.speed import Speed
-from lorasp_jax.training.demonstrations import fresh_demonstrations
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.guard import summarize
@@ -36,17 +35,10 @@ class RunError(ValueError):
     """The run cannot continue; the message states the reason and a remedy."""
 
 
-def train(
-    run: Run,
-    callbacks: Sequence[Callback] = (),
-    *,
-    resume: bool = False,
-    collect: CollectGeneration = fresh_demonstrations,
-) -> None:
+def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False) -> None:
     """Train the adapters of `run.policy`, then set `run.policy` to the trained policy.
 
-    With `resume`, it continues from the newest checkpoint, if there is one. `collect` collects new
-    demonstrations if `data.fresh_every` is set.
+    With `resume`, it continues from the newest checkpoint, if there is one.
 
     Raises:
         RunError: too many consecutive steps were skipped, or an update was non-finite.
@@ -59,7 +51,7 @@ def train(
     restored = checkpoints.restore(shapes) if resume else None
     state = restored or initial()
     run.policy = policy(state)
-    program = make_program(int(state.step), collect)
+    program = make_program(int(state.step))
     if restored is None:
         program.compile(state, _log_interval(run.config, int(state.step)))  # in the background
         _call(callbacks, run, "on_start")
@@ -123,9 +115,9 @@ def _split(
     def policy(state: TrainState) -> Policy:
         return Policy(nnx.merge(graphdef, state.eval_adapters, frozen.parameters), processor)
 
-    def make_program(start: int, collect: CollectGeneration) -> Program:
+    def make_program(start: int) -> Program:
         speed = Speed.of(run.config, run.policy.model.config)
-        batches = make_batches(run, mesh, start, collect, speed)
+        batches = make_batches(run, mesh, start, speed)
         return Program(jit_steps(run, graphdef, optimizer, shardings), frozen, batches, speed)
 
     return shapes, initial, policy, make_program

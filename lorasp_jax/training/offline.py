@@ -77,9 +77,7 @@ def check(chosen: Chosen, cache: Cache, held_out: Sequence[int], learn: str) -> 
         return
     good = (chosen.outcome == 1) | chosen.helped
     good[[*held_out]] = False
-    episodes = [cache.episode(number, ()) for number in range(len(cache))]
-    tasks = np.array([episode.task for episode in episodes])
-    phrases = np.array([episode.instruction[0] for episode in episodes])
+    tasks, phrases = cache.tasks, cache.phrases
     for task in cache.metadata["tasks"]:
         if not good[(tasks == task) | np.isin(phrases, phrases[tasks == task])].any():
             raise ValueError(f"no episode of {task} succeeded, so --learn {learn} cannot learn it")
@@ -96,7 +94,8 @@ def describe(
     if cache.corrected is not None:
         text += f", {cache.corrected.sum()} corrected steps"
     console.print(text, highlight=False)
-    names = [part.name for i, part in enumerate(cache.parts) if _any(chosen, cache, i)]
+    shown = {*cache.dataset[chosen.demonstrated].tolist()}
+    names = [part.name for index, part in enumerate(cache.parts) if index in shown]
     if learn == "imitation":
         text = "failures are imitated, too: --learn filtered leaves them out"
         console.print(text, style="yellow", highlight=False)
@@ -117,10 +116,6 @@ def _only_failures(chosen: Chosen, held_out: Sequence[int]) -> str:
             "best: name others with --data.validation"
         )
     return ""
-
-
-def _any(chosen: Chosen, cache: Cache, index: int) -> bool:
-    return bool(chosen.demonstrated[cache.dataset == index].any())
 
 
 def run_ends(corrected: np.ndarray, end: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.peft.lora_sp.bank import BankMethod
 from lorasp_jax.peft.method import Params
 from lorasp_jax.policies.processor import Processor
-from lorasp_jax.training import activations, records, rules, start
+from lorasp_jax.training import activations, fixed_batches, records, rules, start
 from lorasp_jax.training.demonstrations import Demonstrations, are_cached
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.export import RecordedPolicy
@@ -130,7 +130,7 @@ def directions(run: Run, model: Backbone, collect: Callable[..., Demonstrations]
 def in_use(run: Run, model: Backbone, inputs: Processor, earlier: Protected) -> Protected:
     """Return the directions that a model uses on the data of a run, and those of `earlier`."""
     batches = activations.sampled(run, inputs, model.config.chunk)
-    used = pruning.usage(model, [*batches], activations.loss)
+    used = pruning.usage(model, [*batches], fixed_batches.forward)
     return {path: (shares >= LEAST) | earlier.get(path, False) for path, shares in used.items()}
 
 

@@ -240,18 +240,17 @@ def _prompts_and_joints(
     if source is None:
         joints = environments[0].robot.num_joints
         phrases = [phrase for env in environments for phrase in env.instructions]
-        phrases += [phrase for phrase in more if phrase not in phrases]
-        return PromptTable.of(tokenizer, phrases, model, num_joints=joints), joints
-    first = source.episode(0, ())
-    joints = first.state.shape[-1] - 1
+    else:
+        first = source.episode(0, ())
+        joints, phrases = first.state.shape[-1] - 1, [*first.instructions]
+    phrases += [phrase for phrase in more if phrase not in phrases]
     try:
-        phrases = [*first.instructions, *(x for x in more if x not in first.instructions)]
-        options: Any = {"num_joints": joints, "endings": endings}
-        table = PromptTable.of(tokenizer, phrases, model, **options)
+        return PromptTable.of(tokenizer, phrases, model, num_joints=joints, endings=endings), joints
     except ValueError as error:
+        if source is None:
+            raise
         need = "need a different --model.tokenizer or --model.max-tokens"
         raise ValueError(f"the dataset's instructions {need}: {error}") from error
-    return table, joints
 
 
 def check_sizes(config: Config, chunk: int) -> None:

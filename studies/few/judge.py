@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
@@ -68,6 +68,16 @@ def judge(run: Run, scenes: Iterable[str] = SCENES, *, cropped: bool = False) ->
         "trainable_parameters": trainable,
         "total_parameters": total,
     }
+
+
+def outcomes(run: Run, scene: str, tasks: Sequence[str] = ()) -> dict[str, str]:
+    """Return the outcomes of a run's policy in a scene by task; by default, of its own tasks."""
+    shown = dataclasses.replace(
+        run, config=dataclasses.replace(run.config, tasks=tuple(tasks or run.config.tasks))
+    )
+    shown.policy = run.policy
+    found = judge(shown, (scene,))["outcomes"]
+    return {name.partition("/")[2]: text for name, text in found.items()}
 
 
 @functools.cache

@@ -10,6 +10,7 @@ from scipy import stats
 
 from lorasp_jax.extras.study import Study, page, statistics
 from lorasp_jax.extras.study.page import BACKBONES
+from lorasp_jax.extras.study.results import ran
 from lorasp_jax.extras.study.statistics import Estimate
 from lorasp_jax.extras.study.study import Results
 from studies.few import figure
@@ -53,11 +54,6 @@ def cell(backbone: str, method: str, kind: str, count: int, seed: int) -> str:
 def kind(augment: str, steps: int) -> str:
     """Return the part of a name that says the augmentation and, unless usual, the steps."""
     return augment if steps == STEPS else f"{augment}_{steps}"
-
-
-def success(result: Mapping[str, Any], scene: str = "recorded") -> float:
-    """Return the success rate of a policy over all tasks of a scene."""
-    return float(outcomes([result], scene).mean())
 
 
 def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
@@ -116,10 +112,8 @@ def _difference_table(results: Results, backbone: str) -> str:
             continue
         cells = []
         for n in COUNTS:
-            both = [[cell(backbone, m, "none", n, s) for m in (method, STEPPED)] for s in SEEDS]
-            ran = [pair for pair in both if all(name in results for name in pair)]
-            columns = zip(*ran, strict=True)
-            pair = [outcomes([results[name] for name in names], "recorded") for names in columns]
+            both = ([cell(backbone, m, "none", n, s) for s in SEEDS] for m in (method, STEPPED))
+            pair = [outcomes(found, "recorded") for found in ran(results, *both)]
             cells.append(statistics.bootstrap(lambda x, y: (x - y).mean(-1), *pair))
         rows.append([label, *map(page.points, cells)])
     head = [f"{BACKBONES[backbone]}, points", *(f"N = {n}" for n in COUNTS)]
@@ -172,7 +166,7 @@ def _error_table(results: Results, backbone: str) -> str:
         found = [results[name] for name in group]
         row = [label]
         for scene in SCENES:
-            rates = [success(result, scene) for result in found]
+            rates = [outcomes([result], scene).mean() for result in found]
             for measure in ("action_error", "loss"):
                 row.append(_correlation([result[measure] for result in found], rates))
         rows.append(row)
@@ -203,8 +197,5 @@ def _estimate(
 
 def outcomes(found: Iterable[Mapping[str, Any]], scene: str) -> np.ndarray:
     """Stack the episodes of some policies in a scene, bool `[S, T, N]`."""
-    texts = [
-        {case: text for case, text in result["outcomes"].items() if case.startswith(f"{scene}/")}
-        for result in found
-    ]
-    return statistics.outcomes([[{"outcomes": text}] for text in texts])
+    every = (result["outcomes"].items() for result in found)
+    return statistics.stacked([{k: o for k, o in x if k.startswith(f"{scene}/")} for x in every])

@@ -22,6 +22,7 @@ from lorasp_jax.config import (
     OptimConfig,
 )
 from lorasp_jax.extras.study import Cell, Study
+from lorasp_jax.extras.study.results import best_rate, rate_of
 from lorasp_jax.extras.study.study import Results
 from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP, Method
 from studies.few import page
@@ -123,8 +124,7 @@ def _cells(scale: Scale, backbone: str) -> Iterator[Cell]:
     for method in METHODS:
         if method not in TUNED_AS:
             for name in _pilots(backbone, method):
-                rate = float(name.rpartition("/")[2])
-                config = make(method, scale.pilot_count, PILOT_SEED, rate=rate)
+                config = make(method, scale.pilot_count, PILOT_SEED, rate=rate_of(name))
                 yield Cell(name, config, (), f"{backbone}/{method}", evaluate=_pilot, pool=pool)
     kinds = [(m, a, scale.counts, {"augment": _PRESETS[a]}) for m in METHODS for a in page.AUGMENT]
     kinds += [
@@ -170,8 +170,7 @@ def _tuned(
     results: Results,
 ) -> Config:
     """Return a config with the rate of the best pilot."""
-    best = max(pilots, key=lambda pilot: page.success(results[pilot]))
-    return make(method, count, seed, rate=float(best.rpartition("/")[2]), **changes)
+    return make(method, count, seed, rate=best_rate(results, pilots), **changes)
 
 
 def _config(

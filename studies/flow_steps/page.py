@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 from lorasp_jax.evaluation.figure_style import STYLE
 from lorasp_jax.extras.study import Study, page, statistics
 from lorasp_jax.extras.study import figure as figures
+from lorasp_jax.extras.study.page import BACKBONES
 from lorasp_jax.extras.study.statistics import Estimate
 from lorasp_jax.extras.study.study import Results
 
-BACKBONES = {"pi0": "π0", "smolvla": "SmolVLA"}
 POLICIES = {
     "lora": "LoRA, r = 64",
     "lora_sp": "LoRA-SP, R = 64",
@@ -58,8 +58,7 @@ def outcomes(
 ) -> np.ndarray:
     """Stack the episodes of a policy's seeds, bool `[S, T, N]`."""
     found = [results[f"{backbone}/{policy}/s{seed}"]["outcomes"] for seed in SEEDS]
-    texts = [{task: each[f"{steps}/{task}"] for task in tasks} for each in found]
-    return statistics.outcomes([[{"outcomes": text}] for text in texts])
+    return statistics.stacked([{t: each[f"{steps}/{t}"] for t in tasks} for each in found])
 
 
 def _estimate(results: Results, backbone: str, policy: str, steps: int, tasks: Any) -> Estimate:

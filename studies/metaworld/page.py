@@ -87,13 +87,12 @@ def _row(
     label: str, seeds: Seeds, reference: Seeds, columns: Mapping[str, Sequence[str]]
 ) -> list[str]:
     """Return the cells of a method's row; `reference` is LoRA-SP."""
-    found, order = statistics.outcomes([[cell] for cell in seeds]), sorted(seeds[0]["outcomes"])
+    found, order = _stacked(seeds), sorted(seeds[0]["outcomes"])
     rates = dict(zip(order, found.mean((0, 2)), strict=True))
     means = [np.mean([rates[task] for task in members]) for members in columns.values()]
     difference = NONE
     if reference is not seeds:
-        other = statistics.outcomes([[cell] for cell in reference])
-        difference = page.points(statistics.difference(found, other))
+        difference = page.points(statistics.difference(found, _stacked(reference)))
     trained = seeds[0]["trainable_parameters"] / seeds[0]["total_parameters"]
     rate = seeds[0]["config"]["optim"]["learning_rate"]
     facts = [f"{rate:g}", f"{100 * trained:.1f} %", _ranks(seeds)]
@@ -216,6 +215,10 @@ def _only(cell: Mapping[str, Any], tasks: Sequence[str]) -> Mapping[str, Any]:
     return {
         "outcomes": {task: cell["outcomes"][task] for task in tasks if task in cell["outcomes"]}
     }
+
+
+def _stacked(seeds: Seeds) -> np.ndarray:
+    return statistics.stacked([seed["outcomes"] for seed in seeds])
 
 
 def _filled(row: Sequence[str], head: Sequence[str]) -> list[str]:

@@ -23,6 +23,7 @@ from typing import Any
 from configs.metaworld import get_config
 from lorasp_jax.config import AugmentConfig, Config
 from lorasp_jax.extras.study import Cell, Derived, Study
+from lorasp_jax.extras.study.results import best_rate, rate_of
 from lorasp_jax.extras.study.study import Results
 from lorasp_jax.peft import AdaLoRA, FullFineTuning, LoRA, LoRASP, Method
 from studies.metaworld import page, sequences
@@ -93,7 +94,7 @@ def _cells(backbone: str) -> Iterator[Cell | Derived]:
     for method in METHODS:
         if method not in TUNED_AS:
             for name in _pilots(f"{backbone}/mt50/{method}/s0"):
-                yield _cell(name, _config(name, PILOT_SEED, float(name.rpartition("/")[2])))
+                yield _cell(name, _config(name, PILOT_SEED, rate_of(name)))
     for name in (f"{backbone}/ml45/full/s0", *_compared(backbone)):
         pilots = _pilots(name)
         base = f"{backbone}/ml45/full/s0" if "/ml5/" in name else ""
@@ -136,16 +137,6 @@ def _pilots(name: str) -> tuple[str, ...]:
     method = TUNED_AS.get(method, method)
     rates = FEWER_RATES.get(getattr(METHODS[method], "rank", 0), RATES)
     return tuple(f"{backbone}/pilot/{method}/{rate}" for rate in rates)
-
-
-def best_rate(results: Results, pilots: tuple[str, ...]) -> float:
-    """Return the learning rate of the pilot with the highest success; of equals, the first."""
-
-    def success(name: str) -> float:
-        digits = "".join(results[name]["outcomes"].values())
-        return digits.count("1") / len(digits)
-
-    return float(max(pilots, key=success).rpartition("/")[2])
 
 
 def _config(name: str, seed: int, rate: float) -> Config:

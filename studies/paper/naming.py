@@ -108,13 +108,3 @@ _LABELS = {
     "lora_cut": "LoRA, r = {rank}, cut to LoRA-SP's rank",
     "lora_sp_no_spectral": "LoRA-SP without spectral loss",
 }
-
-
-def rate(pilot: str) -> float:
-    """Return the learning rate of a pilot cell."""
-    return float(pilot.rsplit("/", 1)[1])
-
-
-def best_pilot(results: Mapping[str, Any], pilots: Sequence[str]) -> str:
-    """Return the pilot cell with the highest success, averaged over tasks; of equals, the first."""
-    return max(pilots, key=lambda name: "".join(results[name]["outcomes"].values()).count("1"))

@@ -23,13 +23,16 @@ import numpy as np
 from envs import Randomization
 from lorasp_jax.config import Config, DataConfig, EvaluationConfig, ModelConfig, OptimConfig
 from lorasp_jax.extras.study import Cell, Derived, Study
+from lorasp_jax.extras.study.page import BACKBONES
+from lorasp_jax.extras.study.results import best_pilot, best_rate
 from lorasp_jax.extras.study.study import Results
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP, Method
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training.demonstrations import Demonstrations
-from studies.paper import naming, page, transforms
+from studies.paper import page, transforms
 from studies.paper.claims import make_claims
 from studies.paper.measures import measure
+from studies.paper.tables import RANK
 
 MakeMethod = Callable[[Results], Method]
 PILOT_SEED = 1000
@@ -61,12 +64,9 @@ CONFIG = Config(
     checkpoint_every=1250,
 )
 """What all cells share; method, rate and seed are replaced."""
-BACKBONES = ("pi0", "smolvla")
 ABLATED = "smolvla"
 """The backbone of Tables III and IV."""
 SEEDS = (0, 1, 2)
-RANK = 64
-"""R, the size of LoRA-SP's bank."""
 RANKS = (2, 4, 8, 16, 32)
 """LoRA's ranks besides R."""
 METHODS = (
@@ -84,7 +84,7 @@ def get_study(scale: str) -> Study:
         raise ValueError(f"the study has the scale accelerator, got {scale!r}")
     cells = tuple(cell for backbone in BACKBONES for cell in _cells(backbone))
     cells += tuple(cell for backbone in BACKBONES for cell in _new_scene(backbone))
-    claims = make_claims([cell.name for cell in cells], RANK, BACKBONES)
+    claims = make_claims([cell.name for cell in cells], RANK, [*BACKBONES])
     return Study("paper", cells, measure=measure, page=functools.partial(page.blocks, claims))
 
 
@@ -127,7 +127,7 @@ def _pilots(backbone: str, family: str) -> Iterator[Cell]:
     needs = _pilot_names(backbone, "lora_sp") if family == "ada_lora" else ()
 
     def config(rate: float, results: Results) -> Config:
-        rank = _mean_rank(results, [naming.best_pilot(results, needs)]) if needs else 0.0
+        rank = _mean_rank(results, [best_pilot(results, needs)]) if needs else 0.0
         method = _method(family, rank)
         return _config(backbone, method, rate, PILOT_SEED)
 
@@ -167,7 +167,7 @@ def _new_scene(backbone: str) -> Iterator[Cell]:
     group, pilots = f"{backbone}/panda/full", _pilot_names(backbone, "full")
 
     def config(seed: int, results: Results) -> Config:
-        rate, before = _best_rate(results, pilots), seed == SEEDS[0]
+        rate, before = best_rate(results, pilots), seed == SEEDS[0]
         made = _config(backbone, FullFineTuning(), rate, seed, before=before)
         return replace(made, robot="panda", scene=NEW_SCENE)
 
@@ -190,7 +190,7 @@ def _trained(
     pilots = _pilot_names(backbone, _family(method))
 
     def config(results: Results) -> Config:
-        rate = _best_rate(results, pilots)
+        rate = best_rate(results, pilots)
         peft = _method(method, _mean_rank(results, needs) if needs else 0.0)
         made = _config(backbone, peft, rate, seed, tasks or CONFIG.tasks, before=before)
         if method != "lora_sp_no_spectral":
@@ -244,11 +244,6 @@ def _method(name: str, mean_rank: float) -> Method:
         "dora": lambda: DoRA(rank=rank),
     }
     return made[name]()
-
-
-def _best_rate(results: Results, pilots: Sequence[str]) -> float:
-    """Return the learning rate of the best pilot cell."""
-    return naming.rate(naming.best_pilot(results, pilots))
 
 
 def _mean_rank(results: Results, cells: Sequence[str]) -> float:

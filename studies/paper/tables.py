@@ -6,6 +6,7 @@ import numpy as np
 
 from lorasp_jax.extras.study import page, statistics
 from lorasp_jax.extras.study.page import BACKBONES, NONE
+from lorasp_jax.extras.study.results import best_pilot, rate_of
 from lorasp_jax.peft import LoRASP
 from studies.paper import naming, published
 from studies.paper.book import TASKS, Book
@@ -225,13 +226,13 @@ def rates(book: Book) -> str:
     """Return the success of each method's pilot cells, the chosen learning rate in bold."""
     methods = book.methods("pi0", "pilot")
     pilots = [n for (n,) in book.cells(f"pi0/pilot/{methods[0]}")]
-    headers = [f"{n}, {naming.rate(pilot):g}" for n in BACKBONES.values() for pilot in pilots]
+    headers = [f"{n}, {rate_of(pilot):g}" for n in BACKBONES.values() for pilot in pilots]
     rows = []
     for method in methods:
         row = [naming.label(method, RANK)]
         for backbone in BACKBONES:
             names = naming.flat(book.cells(f"{backbone}/pilot/{method}"))
-            best = naming.best_pilot(book.results, names)
+            best = best_pilot(book.results, names)
             for name in names:
                 text = f"{100 * naming.outcomes(book.results, ((name,),)).mean():.1f}"
                 row.append(f"**{text}**" if name == best else text)

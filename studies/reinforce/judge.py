@@ -109,13 +109,13 @@ def judge(run: Run, trial: Trial) -> dict[str, Any]:
     ]
     found = simulated(after)
     if trial.scene:  # its evaluation drew scenes, too
-        found["outcomes"] = _outcomes(after, "recorded")
+        found["outcomes"] = scenes.outcomes(after, "recorded")
     found |= {"progress": progress}
     if not trial.tasks:
         found["shifted"] = _shifted(run, after)
     elif trial.learning.method == "teacher":
         for when, policy in (("before", run), ("outcomes", after)):
-            found[when] = _outcomes(policy, "recorded", run.config.tasks)
+            found[when] = scenes.outcomes(policy, "recorded", run.config.tasks)
     return found
 
 
@@ -123,15 +123,5 @@ def _shifted(run: Run, after: Run) -> dict[str, str]:
     return {
         f"{when}/{task}": outcomes
         for when, policy in (("before", run), ("after", after))
-        for task, outcomes in _outcomes(policy, "shifted").items()
+        for task, outcomes in scenes.outcomes(policy, "shifted").items()
     }
-
-
-def _outcomes(run: Run, scene: str, tasks: tuple[str, ...] = ()) -> dict[str, str]:
-    """Return the outcomes of a run's policy in a scene by task; by default, of its own tasks."""
-    shown = dataclasses.replace(
-        run, config=dataclasses.replace(run.config, tasks=tasks or run.config.tasks)
-    )
-    shown.policy = run.policy
-    found = scenes.judge(shown, (scene,))["outcomes"]
-    return {name.partition("/")[2]: outcomes for name, outcomes in found.items()}

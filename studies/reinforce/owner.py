@@ -56,11 +56,11 @@ def judge(run: Run, task: str, learn: Learn, episodes: int, pool: int) -> dict[s
     The adapters are new, as `train.py --data.source` makes them; without episodes, they learn the
     demonstrations alone.
     """
-    folder, study_folder = run.folder, run.folder.parents[3]
+    folder = run.folder
     single = dataclasses.replace(run.config, tasks=(task,))
     sources = [folder / "demonstrations", *([folder / "tries"] if episodes else [])]
     if not sources[0].exists():
-        shared = shared_demonstrations(study_folder, pool, single, folder, lambda *_: None)
+        shared = shared_demonstrations(folder.parents[3], pool, single)
         rlds.write(shared[task], sources[0])
     if episodes and not sources[1].exists():
         seed = run.config.seed

@@ -81,13 +81,15 @@ def _outcomes(
     seeds: Sequence[int],
     tasks: Sequence[str] = TASKS,
     when: str = "outcomes",
+    prefix: str = "",
 ) -> np.ndarray:
     """Stack the episodes of a policy's seeds, bool `[S, T, N]`; `when` "before": of its start.
 
-    That is the start that it began from, which each computer has trained for itself.
+    That is the start that it began from, which each computer has trained for itself. With `when`
+    "shifted", they are those in a shifted scene, of which `prefix` says "before/" or "after/".
     """
     found = [results[cell(*where, policy, seed)][when] for seed in seeds]
-    return statistics.outcomes([[{"outcomes": {t: x[t] for t in tasks}}] for x in found])
+    return statistics.stacked([{task: x[prefix + task] for task in tasks} for x in found])
 
 
 def _success_table(results: Results, seeds: dict[tuple[str, int], list[int]]) -> str:
@@ -206,21 +208,11 @@ def _scene_table(results: Results) -> str:
                 recorded = "before" if when == "before" else "outcomes"
                 stacked = [
                     _outcomes(results, where, name, own, when=recorded),
-                    _shifted(results, where, name, own, when),
+                    _outcomes(results, where, name, own, when="shifted", prefix=f"{when}/"),
                 ]
                 row += [page.percent(statistics.success(x)) for x in stacked]
             rows.append(row + [page.NONE] * (5 - len(row)))
     return page.table([f"N = {COUNTS[0]}", "", "seeds", "as recorded", "shifted"], rows)
-
-
-def _shifted(
-    results: Results, where: tuple[str, int], name: str, seeds: Sequence[int], when: str
-) -> np.ndarray:
-    """Stack the episodes of a policy's seeds in a shifted scene."""
-    found = [results[cell(*where, name, seed)]["shifted"] for seed in seeds]
-    return statistics.outcomes(
-        [[{"outcomes": {t: x[f"{when}/{t}"] for t in TASKS}}] for x in found]
-    )
 
 
 def _forgetting_table(results: Results) -> str:

@@ -9,11 +9,11 @@ from typing import Any
 from configs.pretrain import get_config
 from lorasp_jax.config import Config
 from lorasp_jax.extras.study import Cell
+from lorasp_jax.extras.study.results import best_rate, rate_of
 from lorasp_jax.extras.study.study import Results
 from lorasp_jax.peft import AdaLoRA, FullFineTuning, LoRA, LoRASP, Method
 from studies.few.judge import judge
 from studies.where_it_pays import names
-from studies.where_it_pays.judge import best_rate
 
 BASES = {"second": ("small", 1, 12_000, 1e-3), "medium": ("medium", 0, 6_000, 5e-4)}
 """Kind -> size, seed, steps and rate of pretraining, else as in configs/pretrain.py."""
@@ -74,7 +74,7 @@ def _policy(
     source = names.base(backbone, kind)
 
     def config(results: Results) -> Config:
-        rate = best_rate(results, pilots) if pilots else float(name.rpartition("/")[2])
+        rate = best_rate(results, pilots) if pilots else rate_of(name)
         found = make(settings, seed=seed, rate=rate)
         where = str(Path("runs") / names.STUDY / source / "base")
         size = BASES[kind][0] if found.scale == "accelerator" else found.model.size

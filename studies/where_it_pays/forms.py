@@ -48,7 +48,7 @@ def judge(run: Run, form: str, steps: int, pool: int) -> dict[str, Any]:
     """
     settings, study_folder = run.config, run.folder.parents[3]
     held_out = held_out_demonstrations(study_folder, settings)
-    every = shared_demonstrations(study_folder, pool, settings, run.folder, lambda *_: None)
+    every = shared_demonstrations(study_folder, pool, settings)
     groups = [(task,) for task in settings.tasks] if form == "by_task" else [settings.tasks]
     options = {"objective": Taught(run.policy.model) if form == "taught" else None}
     options |= {"steps": max(steps // len(groups), 1)}

@@ -11,13 +11,11 @@ from flax import nnx
 from lorasp_jax.adapters import paths
 from lorasp_jax.dense import AdaptedLayer, AdapterParam
 from lorasp_jax.evaluation.callback import training_ranks
-from lorasp_jax.extras.study.study import Results
 from lorasp_jax.models import presets
 from lorasp_jax.peft import LoRA
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training.run import Run
 from studies.few import judge as scenes
-from studies.few.page import success
 from studies.where_it_pays import names
 
 
@@ -53,8 +51,3 @@ def padded(policy: Policy, targets: Sequence[str]) -> Policy:
 
 def _matches(patterns: Sequence[str], path: str) -> bool:
     return any(re.search(pattern, path) for pattern in patterns)
-
-
-def best_rate(results: Results, pilots: Sequence[str]) -> float:
-    """Return the learning rate, the last part of the name, of the pilot with the most success."""
-    return float(max(pilots, key=lambda name: success(results[name])).rpartition("/")[2])

@@ -1,9 +1,4 @@
-"""Names of the policies that are compared, and the results of those that have run."""
-
-from collections.abc import Mapping, Sequence
-from typing import Any
-
-from lorasp_jax.extras.study.study import Results
+"""Names of the policies that are compared."""
 
 STUDY = "where_it_pays"
 METHODS = {"lora": "LoRA", "lora_sp": "LoRA-SP"}
@@ -41,9 +36,3 @@ def base(backbone: str, kind: str) -> str:
 def on_base(backbone: str, kind: str, method: str, name: str) -> str:
     """Return the name of a policy on one of `bases.BASES`; `name` is its seed, or a pilot's."""
     return f"{backbone}/{kind}/{method}/{name}"
-
-
-def ran(results: Results, *policies: Sequence[str]) -> list[list[Mapping[str, Any]]]:
-    """Return the results of policies, given their names by seed, for seeds that all have run."""
-    whole = [names for names in zip(*policies, strict=True) if all(n in results for n in names)]
-    return [[results[names[i]] for names in whole] for i in range(len(policies))]

@@ -12,6 +12,7 @@ from lorasp_jax.evaluation.figure_style import STYLE
 from lorasp_jax.extras.study import Study, page, statistics
 from lorasp_jax.extras.study import figure as figures
 from lorasp_jax.extras.study.page import BACKBONES
+from lorasp_jax.extras.study.results import ran
 from lorasp_jax.extras.study.study import Results
 from studies.few.page import SCENES, outcomes
 from studies.where_it_pays import names, sequence_page
@@ -149,12 +150,12 @@ def _form_table(results: Results, backbone: str) -> str:
     for name, (_, label) in FORMS.items():
         row, size, count = [label], page.NONE, 0
         for healed in (False, True):
-            (own,) = names.ran(results, _formed(backbone, name, healed))
+            (own,) = ran(results, _formed(backbone, name, healed))
             row.append(
                 page.percent(statistics.success(outcomes(own, "recorded"))) if own else page.NONE
             )
             for other in ("whole", "merged"):
-                both = names.ran(results, *(_formed(backbone, x, healed) for x in (name, other)))
+                both = ran(results, *(_formed(backbone, x, healed) for x in (name, other)))
                 row.append(_compared(both, "recorded", itself=name == other)[1])
         if own:
             size, count = f"{own[0]['bytes'] / 1e6:.1f} MB", len(own)
@@ -174,10 +175,10 @@ def _base_table(results: Results, backbone: str) -> str:
     rows = []
     for kind, methods in BASE_ROWS.items():
         if base := results.get(names.base(backbone, kind)):
-            rate = page.percent(statistics.success(statistics.outcomes([[base]])))
+            rate = page.percent(statistics.success(statistics.stacked([base["outcomes"]])))
             rows.append([kind, "the base itself, on the Panda", rate, *[page.NONE] * 3, "1"])
         for method, label in methods.items():
-            both = names.ran(results, *(_policies_on(backbone, kind, x) for x in (method, "lora")))
+            both = ran(results, *(_policies_on(backbone, kind, x) for x in (method, "lora")))
             row = [kind, label]
             for scene in SCENES:
                 row += _compared(both, scene, itself=method == "lora")
@@ -203,7 +204,7 @@ def _recipe_table(results: Results) -> str:
                 [names.recipe(backbone, x, seed) for seed in RECIPE_SEEDS]
                 for x in (name, "lora_sp")
             ]
-            both = names.ran(results, *policies)
+            both = ran(results, *policies)
             for scene in SCENES:
                 row += _compared(both, scene, itself=name == "lora_sp")
             row.append(str(len(both[0])))
@@ -228,7 +229,7 @@ def _pair(
     results: Results, backbone: str, *cases: tuple[str, int]
 ) -> list[list[Mapping[str, Any]]]:
     """Return the results of two methods for the seeds that have run with both."""
-    return names.ran(results, *([cell(backbone, *case, seed) for seed in SEEDS] for case in cases))
+    return ran(results, *([cell(backbone, *case, seed) for seed in SEEDS] for case in cases))
 
 
 @mpl.rc_context(STYLE)

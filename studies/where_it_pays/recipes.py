@@ -16,16 +16,16 @@ from lorasp_jax.config import AuxiliaryConfig, Config
 from lorasp_jax.dense import AdaptedLayer, AdapterParam
 from lorasp_jax.extras.study import Cell, Derived
 from lorasp_jax.extras.study.held_out import shared_demonstrations
+from lorasp_jax.extras.study.results import best_rate
 from lorasp_jax.extras.study.study import Results
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.peft import LoRA, LoRASP, Method
 from lorasp_jax.peft.auxiliary import Aux
 from lorasp_jax.peft.method import Params
-from lorasp_jax.training import activations, loop, rules, setup
+from lorasp_jax.training import activations, fixed_batches, loop, rules, setup
 from lorasp_jax.training.run import Run
 from studies.few.judge import judge as judge_scenes
 from studies.where_it_pays import names
-from studies.where_it_pays.judge import best_rate
 
 _BANK = LoRASP(rank=names.WIDE)
 RECIPES: Mapping[str, tuple[Method, dict[str, Any]]] = {
@@ -79,7 +79,7 @@ def cells(
 
 def judge_changed(run: Run, name: str, pool: int) -> dict[str, Any]:
     """Train the run's policy anew, with one of `CHANGES` of its new adapters."""
-    episodes = shared_demonstrations(run.folder.parents[2], pool, run.config, run.folder, _silent)
+    episodes = shared_demonstrations(run.folder.parents[2], pool, run.config)
     learner = dataclasses.replace(run, episodes=episodes)
     model = CHANGES[name](learner, setup.build(run.config, run.folder).model)
     learner.policy = replace(run.policy, model=model)
@@ -87,14 +87,10 @@ def judge_changed(run: Run, name: str, pool: int) -> dict[str, Any]:
     return judge_scenes(learner)
 
 
-def _silent(*_: Any) -> None:
-    """Report no progress."""
-
-
 def _eva(run: Run, model: Backbone) -> Backbone:
     """Begin with the leading directions of each layer's inputs x (EVA, arXiv 2410.07170)."""
     batches = activations.sampled(run, run.policy.processor, model.config.chunk)
-    moments = calibration.input_moments(model, batches, ".*", activations.loss)
+    moments = calibration.input_moments(model, batches, ".*", fixed_batches.forward)
     return _changed(model, lambda path, layer: _with_leading(layer, moments[path]))
 
 

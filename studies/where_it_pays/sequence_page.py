@@ -8,6 +8,7 @@ import numpy as np
 
 from lorasp_jax.extras.study import page, statistics
 from lorasp_jax.extras.study.page import BACKBONES
+from lorasp_jax.extras.study.results import ran
 from lorasp_jax.extras.study.statistics import Estimate
 from lorasp_jax.extras.study.study import Results
 from studies.where_it_pays import names
@@ -106,7 +107,7 @@ def table(results: Results, backbone: str, sequences: Sequences) -> str:
     """Return what policies that learn one task after another can do, learn and forget."""
     rows = []
     for method, label in METHODS.items():
-        (found,) = names.ran(results, _together(backbone, method, sequences))
+        (found,) = ran(results, _together(backbone, method, sequences))
         rate = statistics.success(_of_all(found, sequences)) if found else None
         row = [page.percent(rate) if rate else page.NONE, *[page.NONE] * 7, str(len(found))]
         rows.append([f"{label}, all tasks together", *row])
@@ -122,7 +123,7 @@ def _row(results: Results, backbone: str, kind: str, sequences: Sequences) -> tu
     """Return the numbers of a kind, and of how many seeds they are."""
     method, _, _, changed = KINDS[kind]
     own, orders = _policies(backbone, kind, sequences), sequences.orders
-    *found, joint = names.ran(results, *own, _together(backbone, method, sequences))
+    *found, joint = ran(results, *own, _together(backbone, method, sequences))
     if not joint:
         return [page.NONE] * 8, 0
     together = _of_all(joint, sequences)
@@ -137,7 +138,7 @@ def _row(results: Results, backbone: str, kind: str, sequences: Sequences) -> tu
     row += [page.percent(estimate(statistic, rates, orders)) for statistic in (learned, last)]
     row += [page.points(estimate(forgotten, rates, orders)), page.NONE]
     if changed:
-        both = names.ran(results, *own, *_policies(backbone, changed, sequences))
+        both = ran(results, *own, *_policies(backbone, changed, sequences))
         if both[0]:
             pairs = [_rates(*pair) for pair in zip(both, [*orders, *orders], strict=True)]
             row[-1] = page.points(estimate(forgotten, pairs, orders))
@@ -171,8 +172,7 @@ def _rates(seeds: Seeds, order: Sequence[str]) -> Rates:
 
 def _outcomes(seeds: Seeds, keys: Mapping[str, str]) -> np.ndarray:
     """Stack some outcomes, bool `[S, T, N]`, given their keys by task."""
-    texts = [{task: seed["outcomes"][key] for task, key in keys.items()} for seed in seeds]
-    return statistics.outcomes([[{"outcomes": text}] for text in texts])
+    return statistics.stacked([{t: seed["outcomes"][k] for t, k in keys.items()} for seed in seeds])
 
 
 def _mean_minus(joint: np.ndarray, *ends: np.ndarray) -> np.ndarray:

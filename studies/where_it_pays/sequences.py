@@ -65,14 +65,18 @@ def derived(
 def judge(run: Run, kind: str, order: int, pool: int) -> dict[str, Any]:
     """Return what `judged` does, in scenes as recorded."""
     tasks = [task for task in page.SEQUENCES.orders[order] if task in run.config.tasks]
-    study_folder = run.folder.parents[3]
-    every = shared_demonstrations(study_folder, pool, run.config, run.folder, lambda *_: None)
+    every = shared_demonstrations(run.folder.parents[3], pool, run.config)
 
     def demonstrate(stage: Run, shares: Mapping[str, float]) -> Run:
         counts = {t: math.ceil(share * every[t].num_episodes) for t, share in shares.items()}
         return dataclasses.replace(stage, episodes=some(every, counts))
 
-    return judged(run, kind, tasks, demonstrate, functools.partial(_outcomes, run))
+    def success(policy: Policy, shown: Sequence[str]) -> dict[str, str]:
+        learner = dataclasses.replace(run)
+        learner.policy = padded(policy, run.config.targets)
+        return scenes.outcomes(learner, "recorded", shown)
+
+    return judged(run, kind, tasks, demonstrate, success)
 
 
 def judged(
@@ -171,11 +175,3 @@ def _interpolated(model: Backbone, config: Config, number: int) -> Backbone:
     merged = lorasp_jax.merge(nnx.merge(graphdef, adapters, frozen))
     key = jax.random.fold_in(RandomStream.ADAPTERS.key(config.seed), number)
     return adaptation.adapt(merged, rules.rules(config), rngs=nnx.Rngs(key))
-
-
-def _outcomes(run: Run, policy: Policy, tasks: Sequence[str]) -> dict[str, str]:
-    """Return the outcomes of a policy by task."""
-    shown = dataclasses.replace(run, config=dataclasses.replace(run.config, tasks=tuple(tasks)))
-    shown.policy = padded(policy, run.config.targets)
-    found = scenes.judge(shown, ("recorded",))["outcomes"]
-    return {name.partition("/")[2]: text for name, text in found.items()}

@@ -20,6 +20,7 @@ from flax import nnx
 from lorasp_jax import models
 from lorasp_jax.config import AugmentConfig, Config, EvaluationConfig
 from lorasp_jax.extras.study import Cell, Derived, Study
+from lorasp_jax.extras.study.results import best_rate, rate_of
 from lorasp_jax.extras.study.study import Results
 from lorasp_jax.models import presets
 from lorasp_jax.peft import AdaLoRA, LoRA, LoRASP, Method, plan
@@ -28,7 +29,7 @@ from studies.few import study as few
 from studies.few.judge import judge as judge_scenes
 from studies.paper.transforms import cut
 from studies.where_it_pays import bases, forms, names, page, recipes, sequences
-from studies.where_it_pays.judge import best_rate, judge
+from studies.where_it_pays.judge import judge
 
 RATES = (1e-3, 3e-3)
 """Learning rates, of which pilots choose one per backbone, method and rank."""
@@ -96,8 +97,7 @@ def _ranked(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
     cases = [(method, rank) for rank in scale.ranks for method in names.METHODS]
     for method, rank in cases:
         for name in _pilots(backbone, method, rank):
-            rate = float(name.rpartition("/")[2])
-            config = _config(scale, backbone, MAKE[method](rank), names.PILOT_SEED, rate)
+            config = _config(scale, backbone, MAKE[method](rank), names.PILOT_SEED, rate_of(name))
             group = f"{backbone}/{method}_r{rank}"
             yield Cell(name, config, (), group, evaluate=pilot, pool=scale.pool)
     for seed in scale.seeds:

@@ -99,7 +99,7 @@ def test_episodes_round_trip(simulated):
     length = source.length[number]
     np.testing.assert_array_equal(episode.action[0], source.action[number, :length])
     np.testing.assert_array_equal(episode.image["side"][0], source.image["side"][number, :length])
-    assert episode.instructions[episode.instruction[0]] == source.instructions[1]
+    assert episode.phrases[0] == source.instructions[1]
     assert (episode.task, episode.robot) == ("pour", "piper")
     assert found.episode(4, ()).image == {}
 

@@ -102,10 +102,7 @@ def test_outline(simulated):
                 expected = getattr(wanted, name)[episode, :length]
                 np.testing.assert_array_equal(rows[:length], expected)
                 assert not rows[length:].any()
-            assert (
-                group.instructions[group.instruction[episode]]
-                == wanted.instructions[wanted.instruction[episode]]
-            )
+            assert group.phrases[episode] == wanted.phrases[episode]
         first = wanted.image["wrist"][0, 0]
         assert (group.image["wrist"] == first).all()
         assert group.image["wrist"].base is not None  # takes no memory

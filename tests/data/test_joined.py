@@ -58,7 +58,7 @@ def test_episodes_follow_each_other(joined, folder):
         name = "side" if number < 4 else "cam_high"
         np.testing.assert_array_equal(found.image["side"], expected.image[name])
         assert found.image["wrist"].any() == (number < 4)  # black where there is no camera
-        texts = [e.instructions[int(e.instruction[0])] for e in (found, expected)]
+        texts = [e.phrases[0] for e in (found, expected)]
         assert texts[0] == texts[1]
         assert joined.episode(number, ("wrist",)).image.keys() == {"wrist"}
     assert "extra of rlds" not in joined.left_out  # `Renamed` says it without a name

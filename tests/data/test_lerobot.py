@@ -35,7 +35,7 @@ def test_data_match_lerobot(version):
         for name in ("state", "action"):
             found = np.concatenate([getattr(e, name)[0] for e in episodes])
             np.testing.assert_array_equal(found, truth[f"all/{name}"])
-        steps = [(e.instructions[e.instruction[0]], n) for e in episodes for n in e.length]
+        steps = [(e.phrases[0], n) for e in episodes for n in e.length]
         tasks = np.concatenate([[task] * n for task, n in steps])
         np.testing.assert_array_equal(tasks, truth["all/task"])
         for row, (episode, frame) in enumerate(

@@ -45,7 +45,7 @@ def test_both_read_the_same(folder, kind, lengths, tolerance):
         ends = np.repeat(np.cumsum(lengths), lengths) - 1
         rows = np.minimum(np.arange(sum(lengths))[:, None] + np.arange(3), ends[:, None])
         np.testing.assert_array_equal(expected["chunks"], found[rows])  # found: the actions
-        tasks = [e.instructions[e.instruction[0]] for e in episodes for _ in range(e.num_steps)]
+        tasks = [e.phrases[0] for e in episodes for _ in range(e.num_steps)]
         assert tasks == expected["task"].tolist()
         for camera in ("side", "wrist"):
             found = np.concatenate([episode.image[camera][0] for episode in episodes])

@@ -13,8 +13,6 @@ from lorasp_jax.models.pi0 import Pi0Config, openpi_lora, published_names
 from tests.models.random_models import random_backbone
 
 CONFIG = Pi0Config.dummy()
-SCALE = 0.5
-"""alpha / rank; the MLP ignores it."""
 LAYERS = "PaliGemma/llm/layers"
 RANK = {"": 3, "_1": 2}
 BATCH, TOKENS = 2, 3
@@ -46,7 +44,7 @@ def leaves():
 
 @pytest.mark.parametrize(("tower", "suffix"), [("language", ""), ("action", "_1")])
 def test_the_layers_compute_openpis_einsums(model, leaves, tower, suffix):
-    adapted = openpi_lora.attach(model, leaves, scale=SCALE)
+    adapted = openpi_lora.attach(model, leaves)
     size, layer = getattr(CONFIG, tower), 1
     rng = np.random.default_rng(2)
 
@@ -65,10 +63,10 @@ def test_the_layers_compute_openpis_einsums(model, leaves, tower, suffix):
     x = rng.normal(size=(BATCH, TOKENS, size.width))
     a, b = pair(f"attn/q_einsum{suffix}/")
     inner = np.einsum("BTD,NDL->BTNL", x, a)
-    close(delta("q_proj", x), SCALE * np.einsum("BTNL,NLH->BTNH", inner, b))
+    close(delta("q_proj", x), np.einsum("BTNL,NLH->BTNH", inner, b))
     a, b = pair(f"attn/kv_einsum{suffix}/")
     inner = np.einsum("BSD,zKDL->zBSKL", x, a)
-    k, v = SCALE * np.einsum("zBSKL,zKLH->zBSKH", inner, b)
+    k, v = np.einsum("zBSKL,zKLH->zBSKH", inner, b)
     close(delta("k_proj", x), k)
     close(delta("v_proj", x), v)
     a, b = pair(f"mlp{suffix}/gating_einsum_")
@@ -78,9 +76,7 @@ def test_the_layers_compute_openpis_einsums(model, leaves, tower, suffix):
     x = rng.normal(size=(BATCH, TOKENS, size.heads, size.head_dim))
     a, b = pair(f"attn/attn_vec_einsum{suffix}/")
     inner = np.einsum("BTNH,NHL->BTL", x, a)
-    close(
-        delta("o_proj", x.reshape(BATCH, TOKENS, -1)), SCALE * np.einsum("BTL,NLD->BTD", inner, b)
-    )
+    close(delta("o_proj", x.reshape(BATCH, TOKENS, -1)), np.einsum("BTL,NLD->BTD", inner, b))
     x = rng.normal(size=(BATCH, TOKENS, size.mlp))
     a, b = pair(f"mlp{suffix}/linear_")
     close(delta("down_proj", x), x @ a @ b)

@@ -11,9 +11,9 @@ from flax import nnx
 from lorasp_jax import adapt
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io import native
+from lorasp_jax.adapters.paths import by_path
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models import presets
-from lorasp_jax.models.checkpoints.native import by_path
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.shared_base import SharedBase
 from lorasp_jax.models.smolvla import SmolVLAConfig
@@ -98,7 +98,7 @@ def test_factors_are_stored_in_the_dtype_that_they_are_multiplied_in():
     )
     adapted = nnx.merge(graphdef, with_noise(adapters, 0.1), frozen)
     shared = SharedBase(model).attach_model(adapted, model)
-    arrays = by_path(nnx.to_pure_dict(nnx.state(adapted, AdapterParam)))
+    arrays = by_path(nnx.state(adapted, AdapterParam))
     factors = sum(a.nbytes for n, a in arrays.items() if "/bank/" in n and "blocks" in n)
     whole = sum(array.nbytes for array in arrays.values())
     assert sum(array.nbytes for array in shared.own) == whole - factors // 2

@@ -23,12 +23,10 @@ def run(folder, monkeypatch):  # noqa: F811
 def test_report_is_updated(run):
     report, path = callback.Report(), run.folder / "report.html"
     report.on_start(run)
-    report._latest.result()
     assert "step 4 of 4" in path.read_text()
     with (run.folder / "metrics.jsonl").open("a") as file:
         file.write(json.dumps({"step": 5, "task": 0.125}) + "\n")
     report.on_log(run, 5, {})
-    report._latest.result()
     assert "step 5 of 4" in path.read_text()
     write_json(run.folder / "results.json", RESULTS)
     report.on_end(run)
@@ -43,21 +41,15 @@ def test_a_stopped_run_has_a_final_report(run):
     assert f"report up to this step: {path}" in run.console.file.getvalue().replace("\n", "")
     resumed = callback.Report()
     resumed.on_log(run, 6, {})
-    resumed._latest.result()
     assert "Running: step" in path.read_text()
 
 
-def test_errors_of_the_thread_are_raised_at_the_next_report(run, monkeypatch):
+def test_a_report_is_written_only_if_the_latest_is_old(run, monkeypatch):
     report, written = callback.Report(), []
     monkeypatch.setattr(callback, "write_report", written.append)
     monkeypatch.setattr(callback, "INTERVAL", 100.0)
     report.on_start(run)
     report.on_log(run, 2, {})
-    report._latest.result()
-    assert written == [run.folder]  # the next one is not due yet
-    monkeypatch.setattr(callback, "INTERVAL", 0.0)
-    (run.folder / "config.json").unlink()
-    monkeypatch.undo()
-    report._submit(run.folder)
-    with pytest.raises(ValueError, match="no run in"):
-        report._submit(run.folder)
+    assert written == [run.folder]
+    report.on_end(run)
+    assert written == [run.folder] * 2

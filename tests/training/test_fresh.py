@@ -8,7 +8,7 @@ import pytest
 
 from lorasp_jax.data.batches import fit_to_size, flatten, windows
 from lorasp_jax.peft import LoRA
-from lorasp_jax.training import demonstrations
+from lorasp_jax.training import batches, demonstrations
 from lorasp_jax.training.loop import train
 from tests.runs import (
     CONFIG,
@@ -41,28 +41,29 @@ def run(folder, config=FRESH):
     return run
 
 
-def test_generations_replace_each_other(tmp_path):
+def test_generations_replace_each_other(tmp_path, monkeypatch):
     """The first one is as without replacement; a resumed run reproduces all of them exactly."""
     collect = Collect()
+    monkeypatch.setattr(batches, "fresh_demonstrations", collect)
     same, whole = run(tmp_path / "same", SAME), run(tmp_path / "whole")
-    train(same, collect=collect)
+    train(same)
     assert collect.generations == []
-    train(whole, collect=collect)
+    train(whole)
     assert collect.generations == [*range(1, CONFIG.optim.steps // 2)]
     first, *others = zip(repeatable(same.folder), repeatable(whole.folder), strict=True)
     assert first[0] == first[1]
     assert all(without != fresh for without, fresh in others)
     halved = run(tmp_path / "halved")
     with pytest.raises(KeyboardInterrupt):
-        train(halved, [Terminate()], collect=collect)
+        train(halved, [Terminate()])
     collect.generations.clear()
     halved = run(tmp_path / "halved")
-    train(halved, [Terminate()], resume=True, collect=collect)
+    train(halved, [Terminate()], resume=True)
     assert collect.generations == [*range(1, CONFIG.optim.steps // 2)]
     assert repeatable(halved.folder) == repeatable(whole.folder)
     collect.generations.clear()
     # As after a stop during the final evaluation.
-    train(run(tmp_path / "whole"), resume=True, collect=collect)
+    train(run(tmp_path / "whole"), resume=True)
     assert collect.generations == []
 
 

@@ -251,17 +251,11 @@ def adapters_by_path(name: str, model: nnx.Module) -> AdaptedLayers:
 
 def _check_same_base(first: nnx.Module, name: str, second: nnx.Module, other: str) -> None:
     """Raise ValueError unless two models without adapters have the same parameters."""
-    params, other_params = _parameters(first), _parameters(second)
+    params, other_params = (paths.by_path(nnx.state(x, nnx.Param)) for x in (first, second))
     for path in params | other_params:
         a, b = params.get(path), other_params.get(path)
         if a is not b and (a is None or b is None or not _equal(a, b)):
             raise ValueError(f"{name} and {other} have different bases, first at {path!r}")
-
-
-def _parameters(model: nnx.Module) -> dict[str, Any]:
-    state = nnx.to_pure_dict(nnx.state(model, nnx.Param))
-    leaves = jax.tree_util.tree_leaves_with_path(state)
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
 def _equal(a: jax.Array, b: jax.Array) -> bool:

@@ -79,7 +79,7 @@ def save_adapters(
         TypeError: metadata is not JSON-serializable.
     """
     folder, adapters = validate.folder(folder), nnx.state(validate.with_values(model), AdapterParam)
-    tensors = {name: np.asarray(leaf) for name, leaf in _leaves_by_name(adapters).items()}
+    tensors = {name: np.asarray(leaf) for name, leaf in paths.by_path(adapters).items()}
     if not tensors:
         raise ValueError("the model has no adapters; of a combined model, extract one first")
     data = safetensors.numpy.save(tensors)
@@ -246,10 +246,10 @@ def _adapted(
     return adaptation.adapt(model, rules, rngs=nnx.Rngs(0), einsums=einsums)
 
 
-def _frozen_weights(model: nnx.Module) -> dict[str, jax.Array]:
+def _frozen_weights(model: nnx.Module) -> dict[str, Any]:
     """Base parameters that have values, by path, except those split by an adapter."""
     split = [path for path, method in adaptation.methods(model).items() if method.splits_kernel]
-    leaves = _leaves_by_name(nnx.state(model, nnx.All(nnx.Param, nnx.Not(AdapterParam))))
+    leaves = paths.by_path(nnx.state(model, nnx.All(nnx.Param, nnx.Not(AdapterParam))))
     return {
         name: leaf
         for name, leaf in leaves.items()
@@ -278,7 +278,7 @@ def _matched_leaves(
     folder: pathlib.Path,
 ) -> dict[str, Any]:
     """Leaves of the adapters by name; raise ValueError if names or shapes of tensors differ."""
-    leaves = _leaves_by_name(adapters)
+    leaves = paths.by_path(adapters)
     if different := sorted(leaves.keys() ^ tensors.keys()):
         raise ValueError(f"{folder} and the model have different tensors, first {different[0]!r}")
     expected = {name: leaf.shape for name, leaf in leaves.items()}
@@ -295,12 +295,6 @@ def _matched_leaves(
         if saved[name] != shape:
             raise ValueError(f"{name} is {saved[name]} in {folder}, but {shape} in the model")
     return leaves
-
-
-def _leaves_by_name(adapters: nnx.State) -> dict[str, jax.Array]:
-    """Leaves by path, in tree order."""
-    leaves = jax.tree_util.tree_flatten_with_path(nnx.to_pure_dict(adapters))[0]
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
 def read_tensors(path: pathlib.Path) -> tuple[bytes, dict[str, np.ndarray]]:

@@ -14,6 +14,7 @@ from lorasp_jax.config import Config, DataConfig
 from lorasp_jax.training.demonstrations import Demonstrations, Progress, demonstrations, map_threads
 from lorasp_jax.training.run_folder import to_json
 
+_SILENT: Progress = lambda *_: None  # noqa: E731
 EPISODES = 32
 """Held-out episodes per task."""
 SEED = 2**32 - 1
@@ -21,7 +22,11 @@ SEED = 2**32 - 1
 
 
 def shared_demonstrations(
-    study_folder: Path, pool: int, config: Config, _folder: Path, progress: Progress
+    study_folder: Path,
+    pool: int,
+    config: Config,
+    _folder: Path | None = None,
+    progress: Progress = _SILENT,
 ) -> Demonstrations:
     """Load the demonstrations that cells with the same robot, scene and data settings share.
 
@@ -60,7 +65,7 @@ def _collecting(config: Config, episodes: int, seed: int) -> Config:
     return dataclasses.replace(config, data=DataConfig(episodes=episodes, **kept), seed=seed)
 
 
-def _shared(root: Path, config: Config, progress: Progress = lambda *_: None) -> Demonstrations:
+def _shared(root: Path, config: Config, progress: Progress = _SILENT) -> Demonstrations:
     """Load each task's episodes from a folder named after the settings, or collect them there."""
     settings = {
         "robot": config.robot,

@@ -76,7 +76,7 @@ def compare(results: Results) -> Iterator[str]:
             yield f"{name}: repeat {number} ({_origin(again)}) minus first run ({_origin(first)})"
             yield f"    {', '.join(_differences(again, first))} points"
         if KEY in first and _is_even(first):
-            runs.append(statistics.outcomes([[each] for each in (first, *first[KEY])]))
+            runs.append(statistics.stacked([x["outcomes"] for x in (first, *first[KEY])]))
     if runs:
         deviation, degrees = statistics.between_runs(runs)
         found = f"{100 * deviation:.1f} points of mean success, {degrees} degrees of freedom"
@@ -122,14 +122,12 @@ def _is_alike(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
 
 def _differences(again: Mapping[str, Any], first: Mapping[str, Any]) -> Iterator[str]:
     """Yield the paired difference of success by task and, of tasks of one size, of the mean."""
-    parts: dict[str, Any] = {
-        task: {"outcomes": {task: first["outcomes"][task]}} for task in first["outcomes"]
-    }
+    parts = {task: [task] for task in first["outcomes"]}
     if len(parts) > 1 and _is_even(first):
-        parts["mean"] = first
-    for label, part in parts.items():
-        other = {"outcomes": {task: again["outcomes"][task] for task in part["outcomes"]}}
-        pair = (statistics.outcomes([[each]]) for each in (other, part))
+        parts["mean"] = [*parts]
+    for label, tasks in parts.items():
+        both = ({task: run["outcomes"][task] for task in tasks} for run in (again, first))
+        pair = (statistics.stacked([each]) for each in both)
         yield f"{label} {page.points(statistics.difference(*pair))}"
 
 

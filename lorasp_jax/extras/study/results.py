@@ -3,7 +3,7 @@
 import dataclasses
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +66,27 @@ def load(path: Path, study: str = "") -> dict[str, dict[str, Any]]:
         }
         check(results, {str: SCHEMA})
         return results
+
+
+def ran(results: Results, *policies: Sequence[str]) -> list[list[Mapping[str, Any]]]:
+    """Return the results of policies, given their names by seed, for seeds that all have run."""
+    whole = [names for names in zip(*policies, strict=True) if all(n in results for n in names)]
+    return [[results[names[i]] for names in whole] for i in range(len(policies))]
+
+
+def rate_of(pilot: str) -> float:
+    """Return the learning rate of a pilot, the last part of its name."""
+    return float(pilot.rpartition("/")[2])
+
+
+def best_pilot(results: Results, pilots: Sequence[str]) -> str:
+    """Return the pilot with the most success, of equals the first; all have as many episodes."""
+    return max(pilots, key=lambda name: "".join(results[name]["outcomes"].values()).count("1"))
+
+
+def best_rate(results: Results, pilots: Sequence[str]) -> float:
+    """Return the learning rate of the best pilot."""
+    return rate_of(best_pilot(results, pilots))
 
 
 def _dump(value: Any) -> str:

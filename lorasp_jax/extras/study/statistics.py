@@ -56,7 +56,12 @@ def outcomes(seeds: Sequence[Sequence[Mapping[str, Any]]]) -> np.ndarray:
     Raises:
         ValueError: seeds differ in their tasks or numbers of episodes.
     """
-    rows = [{task: o for cell in cells for task, o in cell["outcomes"].items()} for cells in seeds]
+    rows = ((pair for cell in cells for pair in cell["outcomes"].items()) for cells in seeds)
+    return stacked([dict(row) for row in rows])
+
+
+def stacked(rows: Sequence[Mapping[str, str]]) -> np.ndarray:
+    """Stack episodes, such as "011" by task, one row a seed; see `outcomes`."""
     sizes = [{task: len(episodes) for task, episodes in row.items()} for row in rows]
     if not sizes or len({*sizes[0].values()}) != 1 or any(size != sizes[0] for size in sizes):
         raise ValueError("all seeds need the same tasks, and all tasks as many episodes")

@@ -22,6 +22,7 @@ from flax import nnx
 
 from lorasp_jax.adapters.combine.adapter_set import AdapterSetParam
 from lorasp_jax.adapters.compress.quantization import is_quantized
+from lorasp_jax.adapters.paths import by_path
 from lorasp_jax.base import json_values
 from lorasp_jax.base.files import as_value_error, check_local, read_json
 from lorasp_jax.base.writing import write_bytes
@@ -181,13 +182,7 @@ def weights_hash(source: Folder | nnx.Module) -> str:
 def named_arrays(model: nnx.Module, adapters: bool = True) -> dict[str, Any]:
     """Return parameters by "/"-joined path, in tree order; only frozen ones unless `adapters`."""
     state = nnx.state(model, nnx.Param if adapters else nnx.All(nnx.Param, nnx.Not(AdapterParam)))
-    return by_path(nnx.to_pure_dict(state))
-
-
-def by_path(tree: Any) -> dict[str, Any]:
-    """Return the leaves of a pytree by "/"-joined path, in tree order."""
-    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+    return by_path(state)
 
 
 def _digest(description: Mapping[str, Any], arrays: Mapping[str, Any]) -> str:

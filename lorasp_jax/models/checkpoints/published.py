@@ -26,10 +26,11 @@ import orbax.checkpoint as ocp
 import safetensors.numpy
 from flax import nnx
 
+from lorasp_jax.adapters.paths import by_path
 from lorasp_jax.base.files import check_local, check_memory
 from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.models.checkpoints import layouts, orbax_folders
-from lorasp_jax.models.checkpoints.native import base_arrays, by_path, named_arrays, set_arrays
+from lorasp_jax.models.checkpoints.native import base_arrays, named_arrays, set_arrays
 from lorasp_jax.models.checkpoints.tensor_files import SINGLE, TensorFiles, weight_files
 from lorasp_jax.models.pi0 import openpi_lora
 

@@ -25,7 +25,6 @@ from lorasp_jax.peft import LoRA
 
 _LAYERS = "PaliGemma/llm/layers"
 _TOWERS = {"language": "", "action": "_1"}  # our tower -> openpi's suffix
-_ATTENTION = ("q_proj", "k_proj", "v_proj", "o_proj")
 Pair = tuple[np.ndarray, np.ndarray]
 """A [L, ..., I, r] and B [L, ..., r, O]."""
 
@@ -36,15 +35,13 @@ def pop_lora(leaves: MutableMapping[str, Any]) -> dict[str, Any]:
     return {name: leaves.pop(name) for name in names}
 
 
-def attach(model: Any, leaves: Mapping[str, np.ndarray], *, scale: float = 1.0) -> Any:
-    """Attach openpi's LoRA weights to a pi0 model as adapters.
+def attach(model: Any, leaves: Mapping[str, np.ndarray]) -> Any:
+    """Attach openpi's LoRA weights to a pi0 model as adapters, at openpi's scale 1.
 
     Args:
         model: a pi0 model; it is not modified, but the result shares its arrays.
         leaves: LoRA arrays of one expert or both, from `pop_lora`, by "/"-joined path below
             `params`.
-        scale: s of the attention layers: alpha / rank, or alpha / √rank with openpi's `rslora`.
-            Checkpoints do not store it; openpi's own variants use 1.
 
     Raises:
         ValueError: leaves are missing, unexpected or wrongly shaped.
@@ -61,8 +58,7 @@ def attach(model: Any, leaves: Mapping[str, np.ndarray], *, scale: float = 1.0) 
     for path, (a, b) in pairs.items():
         tower, _, name = path.split("/")
         layer = getattr(getattr(model, tower).blocks, name)
-        rank = a.shape[-1]
-        layer.method = LoRA(rank, alpha=rank * (scale if name in _ATTENTION else 1.0))
+        layer.method = LoRA(a.shape[-1], alpha=float(a.shape[-1]))
         values = {"lora_a": jnp.asarray(a, jnp.float32), "lora_b": jnp.asarray(b, jnp.float32)}
         layer.adapter = AdapterParam(values)
     return model

@@ -93,7 +93,8 @@ def _concatenated(
     q: jax.Array, own: KeysValues, cache: KeysValues | None, mask: jax.Array | None
 ) -> jax.Array:
     """`attention` with the cached keys and values in front of the queries' own."""
-    k, v = own if cache is None else map(_join, cache, own)
+    join = lambda *arrays: jnp.concatenate(arrays, axis=1)  # noqa: E731
+    k, v = own if cache is None else map(join, cache, own)
     batch, tokens, heads, size = q.shape
     if _use_cudnn(q, k, mask):
         return _cudnn_attention(q, k, v, mask)[:, :tokens].reshape(batch, tokens, heads * size)
@@ -110,10 +111,6 @@ def _concatenated(
         logits = jnp.where(mask[:, None, :, None, :], logits, MASKED)
     weights = jax.nn.softmax(logits, axis=-1).astype(v.dtype)
     return jnp.einsum("BKTGS,BSKH->BTKGH", weights, v).reshape(batch, tokens, heads * size)
-
-
-def _join(cached: jax.Array, own: jax.Array) -> jax.Array:
-    return jnp.concatenate([cached, own], axis=1)
 
 
 def _pad_keys(

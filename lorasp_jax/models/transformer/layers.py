@@ -95,18 +95,17 @@ Norm: TypeAlias = RMSNorm | AdaptiveRMSNorm
 
 
 class LayerNorm(nnx.Module):
-    """(x - mean) / sqrt(variance + eps) * scale + bias, computed in fp32, returned in x's dtype."""
+    """(x - mean) / sqrt(variance + 1e-6) * scale + bias, in fp32, returned in the dtype of x."""
 
-    def __init__(self, width: int, *, eps: float = 1e-6, param_dtype: Any = jnp.float32) -> None:
+    def __init__(self, width: int, *, param_dtype: Any = jnp.float32) -> None:
         self.scale: nnx.Param[jax.Array] = nnx.Param(jnp.ones((width,), param_dtype))
         self.bias: nnx.Param[jax.Array] = nnx.Param(jnp.zeros((width,), param_dtype))
-        self.eps = eps
 
     def __call__(self, x: jax.Array) -> jax.Array:
         """Normalize x `[..., D]`."""
         h = x.astype(jnp.float32)
         h = h - jnp.mean(h, axis=-1, keepdims=True)
-        h = h * jax.lax.rsqrt(jnp.mean(jnp.square(h), axis=-1, keepdims=True) + self.eps)
+        h = h * jax.lax.rsqrt(jnp.mean(jnp.square(h), axis=-1, keepdims=True) + 1e-6)
         scale, bias = self.scale.get_value(), self.bias.get_value()
         return (h * scale.astype(jnp.float32) + bias.astype(jnp.float32)).astype(x.dtype)
 

@@ -116,7 +116,7 @@ def test_several_episodes_are_recorded_in_one_start_and_in_the_next(
     assert real([*words, "--log", str(tmp_path / "log3")]) == 0
     source = open_source(tmp_path / "data")
     episodes = [source.episode(i) for i in range(len(source))]
-    said = [e.instructions[int(e.instruction[0])] for e in episodes]
+    said = [e.phrases[0] for e in episodes]
     assert said == ["press it", "tap it", "press it"]
     assert [int(e.success[0]) for e in episodes] == [0, 1, 1]
     assert source.metadata["attempted"] == 3

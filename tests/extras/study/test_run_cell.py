@@ -50,7 +50,7 @@ def collected(monkeypatch):
 
 def load(folder, **changes):
     config = dataclasses.replace(CONFIG, **changes)
-    return held_out.shared_demonstrations(folder, 0, config, folder, lambda *_: None)
+    return held_out.shared_demonstrations(folder, 0, config)
 
 
 def test_cells_share_demonstrations(tmp_path, collected):
@@ -155,7 +155,7 @@ def test_each_seed_takes_its_own_demonstrations_from_a_pool(tmp_path, monkeypatc
     def taken(count, seed, preset="none"):
         data = dataclasses.replace(CONFIG.data, episodes=count, augment=AugmentConfig(preset))
         config = dataclasses.replace(CONFIG, data=data, seed=seed, tasks=("press", "pour"))
-        found = held_out.shared_demonstrations(tmp_path, 3, config, tmp_path, lambda *_: None)
+        found = held_out.shared_demonstrations(tmp_path, 3, config)
         return {task: episodes.state[:, 0].tolist() for task, episodes in found.items()}
 
     pool, two = taken(3, 0), taken(2, 0)

@@ -265,7 +265,7 @@ def test_rate_is_that_of_the_best_pilot():
     assert {name.split("/")[2] for name in pilots} == {"lora_r64"}
     outcomes = {"reach": "0011"}, {"reach": "1111"}, {"reach": "0111"}
     found = {name: {"outcomes": o} for name, o in zip(pilots, outcomes, strict=True)}
-    assert study.best_rate(found, pilots) == 1e-3
+    assert files.best_rate(found, pilots) == 1e-3
 
 
 @pytest.fixture
