@@ -22,11 +22,15 @@ LABELS = {
 }
 GROWING = ("lora_r16", "lora_r64", "lora_sp")
 """Methods that learn sets of every size, LoRA-SP and the LoRA of its size last."""
+SHARED = GROWING[1:]
+"""Those of them that learn single tasks, too."""
 RANKS = {
     rank: (f"lora_r{rank}", "lora_sp" if rank == 64 else f"lora_sp_r{rank}")
     for rank in (4, 8, 16, 32, 64, 128)
 }
 """R -> LoRA and LoRA-SP."""
+UNTUNED = 16
+"""R whose policies take the rate of R = 64; all others have pilots."""
 SEEDS = (0, 1, 2)
 SIZES = (*(f"first{size}" for size in FIRST), "mt50")
 """Sets of tasks that contain each other."""
@@ -79,7 +83,7 @@ def _table(results: Results, backbone: str, stage: str) -> str:
     }
     head += ["mean", "minus LoRA-SP"]
     if any(len(ran) < len(SEEDS) for ran in seeds.values()):
-        return page.table(head, [_filled([label], head) for label in LABELS.values()])
+        return page.table(head, [[label] for label in LABELS.values()])
     return page.table(head, [_row(LABELS[m], seeds[m], seeds["lora_sp"], columns) for m in LABELS])
 
 
@@ -123,40 +127,40 @@ def _size_table(results: Results, backbone: str) -> str:
                 (value, draws), (first, first_draws) = leads[stage], leads[SIZES[0]]
                 ends = statistics.percentiles(draws - first_draws)
                 row.append(page.points(statistics.Estimate(value - first, *ends)))
-        rows.append(_filled(row, head))
+        rows.append(row)
     return page.table(head, rows)
 
 
 def _shared_table(results: Results, backbone: str) -> str:
     """Return success on the tasks of the smallest set by the number of tasks that a policy learns.
 
-    Then that minus the success of one policy per task.
+    Then that minus the success of one policy per task. Policies of `together` have as many steps a
+    task as those, the others fewer.
     """
-    head = [f"{BACKBONES[backbone]}: tasks", *(LABELS[method] for method in GROWING)]
-    head += [f"{LABELS[method]}, minus alone" for method in GROWING]
+    head = [f"{BACKBONES[backbone]}: tasks", *(LABELS[method] for method in SHARED)]
+    head += [f"{LABELS[method]}, minus alone" for method in SHARED]
     head += ["LoRA-SP's minus r = 64's"]
     shared, rows = SETS[SIZES[0]], []
     alone = tuple(f"single-{task}" for task in shared)
-    for number, stages in ((1, alone), *((len(SETS[stage]), (stage,)) for stage in SIZES)):
-        row, own = [str(number)], [(stages, method) for method in GROWING]
+    cases = {"1": alone, "10, as many steps a task": ("together",)}
+    cases |= {str(len(SETS[stage])): (stage,) for stage in SIZES}
+    for label, stages in cases.items():
+        row, own = [label], [(stages, method) for method in SHARED]
         if found := _outcomes(results, backbone, own, shared):
             row += [page.percent(statistics.success(each)) for each in found]
-        both = [*own, *((alone, method) for method in GROWING)]
-        if number > 1 and (found := _outcomes(results, backbone, both, shared)):
+        both = [*own, *((alone, method) for method in SHARED)]
+        if stages != alone and (found := _outcomes(results, backbone, both, shared)):
             pairs = [*zip(found[: len(own)], found[len(own) :], strict=True)]
             row += [page.points(statistics.difference(*pair)) for pair in pairs]
-            row.append(page.points(statistics.bootstrap(_gain, *pairs[-1], *pairs[-2])))
-        rows.append(_filled(row, head))
+            row.append(
+                page.points(statistics.bootstrap(statistics.interaction, *pairs[-1], *pairs[-2]))
+            )
+        rows.append(row)
     return page.table(head, rows)
 
 
-def _gain(*rates: np.ndarray) -> np.ndarray:
-    """Return success minus success alone of a method, minus that of another one."""
-    return statistics.minus(*rates[:2]) - statistics.minus(*rates[2:])
-
-
 def _rank_table(results: Results, backbone: str) -> str:
-    """Return success on the fifty tasks by R, and its span over all R."""
+    """Return success on the fifty tasks by R, and its span over all R with rates of their own."""
     head = [f"{BACKBONES[backbone]}: R", "LoRA", "LoRA-SP", "LoRA-SP minus LoRA"]
     head += ["LoRA's rate", "LoRA-SP's rate"]
     rows, every = [], []
@@ -167,27 +171,19 @@ def _rank_table(results: Results, backbone: str) -> str:
         row.append(page.points(statistics.difference(*own, *lora)) if lora and own else NONE)
         rates = [_rate(results, f"{backbone}/mt50/{method}/s{SEEDS[0]}") for method in pair]
         rows.append([str(rank), *row, *rates])
-        every.append([*lora, *own])
-    row = ["highest minus lowest"]
+        if rank != UNTUNED:
+            every.append([*lora, *own])
+    row = [f"highest minus lowest, without {UNTUNED}"]
     if all(len(both) == 2 for both in every):
         loras, owns = zip(*every, strict=True)
-        row += [page.percent(statistics.bootstrap(_span, *each)) for each in (loras, owns)]
-        row.append(page.points(statistics.bootstrap(_span_difference, *owns, *loras)))
-    return page.table(head, [*rows, _filled(row, head)])
+        spans = [statistics.bootstrap(statistics.span, *each) for each in (loras, owns)]
+        row += map(page.percent, spans)
+        row.append(page.points(statistics.bootstrap(statistics.span_minus, *owns, *loras)))
+    return page.table(head, [*rows, row])
 
 
 def _rate(results: Results, name: str) -> str:
     return f"{results[name]['config']['optim']['learning_rate']:g}" if name in results else NONE
-
-
-def _span(*rates: np.ndarray) -> np.ndarray:
-    means = np.stack([statistics.mean(each) for each in rates])
-    return means.max(0) - means.min(0)
-
-
-def _span_difference(*rates: np.ndarray) -> np.ndarray:
-    """Return the span of the first half of some methods minus that of the others."""
-    return _span(*rates[: len(rates) // 2]) - _span(*rates[len(rates) // 2 :])
 
 
 def _outcomes(
@@ -219,8 +215,3 @@ def _only(cell: Mapping[str, Any], tasks: Sequence[str]) -> Mapping[str, Any]:
 
 def _stacked(seeds: Seeds) -> np.ndarray:
     return statistics.stacked([seed["outcomes"] for seed in seeds])
-
-
-def _filled(row: Sequence[str], head: Sequence[str]) -> list[str]:
-    """Return a row with dashes where it lacks cells."""
-    return [*row, *[NONE] * (len(head) - len(row))]

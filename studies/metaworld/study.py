@@ -111,10 +111,11 @@ def _cells(backbone: str) -> Iterator[Cell | Derived]:
 def _compared(backbone: str) -> Iterator[str]:
     """Yield the policies of the tables, question by question."""
     other_ranks = [method for method in METHODS if method not in page.LABELS]
-    by_tasks = [stage for stage in STAGES if stage.startswith(("first", "single-"))]
+    sets, alone = ([s for s in STAGES if s.startswith(kind)] for kind in ("first", "single-"))
     methods: Iterable[tuple[str, Iterable[str]]] = (
         *((stage, page.LABELS) for stage in ("mt50", "ml5")),
-        *((stage, page.GROWING) for stage in by_tasks),
+        *((stage, page.GROWING) for stage in sets),
+        *((stage, page.SHARED) for stage in alone),
         ("mt50", other_ranks),
         ("together", page.TOGETHER.values()),
     )

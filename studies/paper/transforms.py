@@ -24,7 +24,7 @@ from lorasp_jax.training.demonstrations import Demonstrations
 from lorasp_jax.training.fixed_batches import forward, keyed_batches
 
 
-def cut(policy: Policy, mean_rank: float) -> Policy:
+def cut(policy: Policy, mean_rank: float, *, by_size: bool = False) -> Policy:
     """Cut a trained LoRA policy to a mean rank, by one threshold on singular values.
 
     The rival of choosing ranks while training: PARA (arXiv 2604.27796). The singular values of
@@ -39,6 +39,8 @@ def cut(policy: Policy, mean_rank: float) -> Policy:
     Args:
         policy: not modified. All its LoRA layers, whose updates start at zero, are cut.
         mean_rank: at least 0.
+        by_size: a layer counts I + O times, as its parameters do; sizes matter, and the largest
+            values are kept that together have no more parameters than `mean_rank` in all layers.
 
     Returns:
         A policy whose updates are stored as AdaLoRA's triplets, s A diag(e) B with orthonormal A
@@ -48,8 +50,9 @@ def cut(policy: Policy, mean_rank: float) -> Policy:
     root = nnx.List([nnx.clone(policy.model)])
     locations = [p for p in paths.locate(root, AdaptedLayer) if type(p.child.method) is LoRA]
     updates = [_decomposed(*p.child.method_and_params()) for p in locations]
+    costs = [u.left.shape[-2] + u.right.shape[-1] if by_size else 1 for u in updates]
     for location, update, kept in zip(
-        locations, updates, _largest(updates, mean_rank), strict=True
+        locations, updates, _largest(updates, costs, mean_rank), strict=True
     ):
         location.child.method, params = _triplets(update, kept, location.child.stack_shape())
         location.child.adapter = AdapterParam(params)
@@ -78,14 +81,15 @@ def _decomposed(method: LoRA, params: Mapping[str, jax.Array]) -> _Decomposition
     return _Decomposition(a_basis @ left, values, right @ b_basis.swapaxes(-1, -2))
 
 
-def _largest(updates: list[_Decomposition], mean_rank: float) -> list[np.ndarray]:
-    """Return which singular values to keep, bool `[L, n]` for each stack."""
+def _largest(updates: list[_Decomposition], costs: list[int], mean_rank: float) -> list[np.ndarray]:
+    """Return which singular values to keep, bool `[L, n]` for each stack; see `cut`."""
     values = np.concatenate([update.values.ravel() for update in updates])
     # A product of rank r has more than r singular values in floating point: those are zero.
     values[values <= np.finfo(np.float32).eps * values.max(initial=0.0)] = 0.0
-    count = round(mean_rank * sum(len(update.values) for update in updates))
-    kept = np.zeros(len(values), bool)
-    kept[np.argsort(-values, kind="stable")[:count]] = True
+    cost = np.concatenate([np.full(u.values.size, c) for u, c in zip(updates, costs, strict=True)])
+    budget = round(mean_rank * sum(len(u.values) * c for u, c in zip(updates, costs, strict=True)))
+    order, kept = np.argsort(-values, kind="stable"), np.zeros(len(values), bool)
+    kept[order[np.cumsum(cost[order]) <= budget]] = True
     kept &= values > 0
     ends = np.cumsum([update.values.size for update in updates])[:-1]
     parts = zip(np.split(kept, ends), updates, strict=True)

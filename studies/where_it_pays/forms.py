@@ -31,7 +31,7 @@ def cells(backbone: str, seed: int, pool: int, steps: int) -> Iterator[Derived]:
     """Yield the forms of a seed; healed ones have trained on for some steps."""
     for form, (method, _) in page.FORMS.items():
         for healed in (0, steps):
-            if not healed and form in page.HEALED:
+            if form in (page.HEALED if not healed else page.MADE):
                 continue
             evaluate = functools.partial(judge, form=form, steps=healed, pool=pool)
             source = names.cell(backbone, method, names.WIDE, seed)
@@ -59,7 +59,7 @@ def judge(run: Run, form: str, steps: int, pool: int) -> dict[str, Any]:
         shown.episodes = sequences.some(every, counts)
         heal = functools.partial(healing.train_on, run=shown, **options) if steps else None
         shown.policy = _in_form(run.policy, form, {task: held_out[task] for task in tasks}, heal)
-        outcomes |= judge_scenes(shown)["outcomes"]
+        outcomes |= judge_scenes(shown, ("recorded",))["outcomes"]
         size += measurement.weight_bytes(shown.policy)
     return {"outcomes": outcomes, "bytes": size}
 

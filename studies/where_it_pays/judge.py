@@ -2,7 +2,7 @@
 
 import dataclasses
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -12,19 +12,26 @@ from lorasp_jax.adapters import paths
 from lorasp_jax.dense import AdaptedLayer, AdapterParam
 from lorasp_jax.evaluation.callback import training_ranks
 from lorasp_jax.models import presets
-from lorasp_jax.peft import LoRA
+from lorasp_jax.peft import LoRA, LoRASP
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training.run import Run
-from studies.few import judge as scenes
+from studies.few.judge import judge as judge_scenes
+from studies.few.page import SCENES
 from studies.where_it_pays import names
 
 
-def judge(run: Run) -> dict[str, Any]:
-    """Return what `few.judge` does, and the active ranks by tower and layer."""
-    trained = {"trainable_parameters": run.parameters[0]}
+def judge(run: Run, scenes: Iterable[str] = SCENES) -> dict[str, Any]:
+    """Return what `few.judge` does, and the active ranks by tower and layer.
+
+    Raises:
+        ValueError: the ranks are lost, since another process has trained the policy.
+    """
+    ranks, trained = training_ranks(run), {"trainable_parameters": run.parameters[0]}
+    if isinstance(run.config.peft, LoRASP) and not ranks:
+        raise ValueError("its active ranks are lost with the process that trained it: delete it")
     shown = dataclasses.replace(run)
     shown.policy = padded(run.policy, run.config.targets)
-    return scenes.judge(shown) | trained | {"layer_active_rank": training_ranks(run)}
+    return judge_scenes(shown, scenes) | trained | {"layer_active_rank": ranks}
 
 
 def padded(policy: Policy, targets: Sequence[str]) -> Policy:

@@ -1,7 +1,7 @@
 """The tables and the figure of README.md, from the results of all policies alone."""
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from studies.few.page import SCENES, outcomes
 from studies.where_it_pays import names, sequence_page
 from studies.where_it_pays.names import METHODS, SEEDS, WIDE, cell
 
+CONTRASTED = ("lora_sp", "lora")
 COLORS = {"lora": "#4269d0", "lora_sp": "#ff725c"}
 RANKS = (4, 8, 16, 32, 64, 128)
 BUDGETS = (8, 16, 32)
@@ -47,7 +48,8 @@ ALLOCATED = {
     "one rank, EVA's initialization": ("eva", "lora"),
     "AdaLoRA": ("ada_lora", "lora"),
     "LoRA with r = 64, cut by one threshold on singular values": ("cut", "lora"),
-    "trained with the ranks, minus cut": ("planned", "cut"),
+    "the same, trained on for 400 steps": ("cut_healed", "lora"),
+    "ranks in proportion to active ranks, minus that": ("planned", "cut_healed"),
     "the layers with the lowest active rank dropped, half of the parameters": ("dropped", "lora"),
     "the same, minus random layers dropped": ("dropped", "dropped_random"),
 }
@@ -55,7 +57,6 @@ ALLOCATED = {
 
 FORMS = {
     "whole": ("lora_sp", "whole"),
-    "pruned": ("lora_sp", "pruned to the directions in use"),
     "half": ("lora_sp", "half of the bank"),
     "merged": ("lora_sp", "one LoRA, merged"),
     "merged_int8": ("lora_sp", "the same, base in int8"),
@@ -66,12 +67,13 @@ FORMS = {
 """Form of a policy with R = `WIDE` -> its method, and its label; see docs/deployment.md."""
 HEAL = 400
 """Steps by which forms train on."""
-HEALED = ("taught",)
-"""Forms that exist only after training on."""
+HEALED = ("taught", "merged_int8")
+"""Forms that are judged only after training on."""
+MADE = ("by_task",)
+"""Forms that are judged only as made."""
 _MINUS = ("", ", minus whole", ", minus merged")
 
 RECIPES = {
-    "lora": "LoRA, r = 64",
     "lora_sp": "LoRA-SP, R = 64",
     "eta_0.8": "η = .8",
     "eta_0.99": "η = .99",
@@ -91,11 +93,12 @@ RECIPES = {
     "expert": "LoRA on vision and language",
     "vlm": "LoRA on the action expert",
 }
-"""Changes of LoRA-SP that pilots try, and LoRA."""
+"""Changes of LoRA-SP that pilots try."""
 RECIPE_SEEDS = (1001, 1002, 1003)
 
 _ORDER = ("press", "open_pot", "pick_place", "pour")
-SEQUENCES = sequence_page.Sequences((_ORDER, _ORDER[::-1]), cell, "recorded/")
+_KINDS = [kind for kind in sequence_page.KINDS if kind != "single"]
+SEQUENCES = sequence_page.Sequences((_ORDER, _ORDER[::-1]), cell, "recorded/", _KINDS)
 
 
 def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
@@ -109,7 +112,7 @@ def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
         "bases": _base_table,
     }
     made = {f"{b} {name}": table(results, b) for name, table in tables.items() for b in BACKBONES}
-    return made | {"recipes": _recipe_table(results)}
+    return made | {"contrasts": _contrast_table(results), "recipes": _recipe_table(results)}
 
 
 def _rank_table(results: Results, backbone: str) -> str:
@@ -132,6 +135,41 @@ def _rank_table(results: Results, backbone: str) -> str:
     ]
     parameters = [f"{label}'s parameters" for label in METHODS.values()]
     return page.table([f"{BACKBONES[backbone]}: R", *heads, *parameters, "seeds"], rows)
+
+
+def _contrast_table(results: Results) -> str:
+    """Return what claims compare and no other table has, as recorded."""
+    each = [_contrasts(backbone) for backbone in BACKBONES]
+    rows = [[label] for label in each[0]]
+    for contrasts in each:
+        for row, (statistic, policies) in zip(rows, contrasts.values(), strict=True):
+            found = ran(results, *policies)
+            stacked = [outcomes(x, "recorded") for x in found if x]
+            row.append(
+                page.points(statistics.bootstrap(statistic, *stacked)) if stacked else page.NONE
+            )
+    return page.table(["points", *BACKBONES.values()], rows)
+
+
+def _contrasts(backbone: str) -> dict[str, tuple[Callable[..., Any], list[list[str]]]]:
+    """Return statistics by label, and the names by seed of the policies that they compare."""
+    own, lora = ([[cell(backbone, m, r, s) for s in SEEDS] for r in RANKS] for m in CONTRASTED)
+    on = [_policies_on(backbone, kind, m) for kind in ("second", "first") for m in CONTRASTED]
+    rank = dict(zip(RANKS, range(len(RANKS)), strict=True))
+    wide = slice(rank[16], None)
+    return {
+        "LoRA, highest minus lowest success, R = 16 to 128": (statistics.span, lora[wide]),
+        "LoRA-SP, the same": (statistics.span, own[wide]),
+        "the latter minus the former": (statistics.span_minus, [*own[wide], *lora[wide]]),
+        "LoRA-SP, R = 16, minus LoRA, r = 32, which has as many parameters": (
+            statistics.minus,
+            [own[rank[16]], lora[rank[32]]],
+        ),
+        "LoRA-SP minus LoRA, R = 64, on the second base, minus that on the first": (
+            statistics.interaction,
+            on,
+        ),
+    }
 
 
 def _layer_table(results: Results, backbone: str) -> str:

@@ -19,7 +19,7 @@ from lorasp_jax.extras.study.held_out import shared_demonstrations
 from lorasp_jax.extras.study.results import best_rate
 from lorasp_jax.extras.study.study import Results
 from lorasp_jax.models.backbone import Backbone
-from lorasp_jax.peft import LoRA, LoRASP, Method
+from lorasp_jax.peft import LoRASP, Method
 from lorasp_jax.peft.auxiliary import Aux
 from lorasp_jax.peft.method import Params
 from lorasp_jax.training import activations, fixed_batches, loop, rules, setup
@@ -29,7 +29,6 @@ from studies.where_it_pays import names
 
 _BANK = LoRASP(rank=names.WIDE)
 RECIPES: Mapping[str, tuple[Method, dict[str, Any]]] = {
-    "lora": (LoRA(rank=names.WIDE), {}),
     "lora_sp": (_BANK, {}),
     "eta_0.8": (replace(_BANK, energy_target=0.8), {}),
     "eta_0.99": (replace(_BANK, energy_target=0.99), {}),
@@ -63,11 +62,12 @@ def cells(
     for name, (method, changes) in RECIPES.items():
 
         def config(results: Results, method: Method = method, changes: Any = changes) -> Config:
-            rate = best_rate(results, pilots[method.name])
+            both = (best_rate(results, pilots[name]) for name in ("lora_sp", "lora"))
+            rate = min(both) if "adapt" in changes else next(both)
             return make(method, seed=seed, rate=rate, **changes)
 
         own, group = names.recipe(backbone, name, seed), f"{backbone}/{name}"
-        after = tuple(pilots[method.name])
+        after = (*pilots["lora_sp"], *(pilots["lora"] if "adapt" in changes else ()))
         yield Cell(own, config, after, group, evaluate=judge_scenes, pool=pool)
     source = names.recipe(backbone, "lora_sp", seed)
     for name in CHANGES:
@@ -81,6 +81,7 @@ def judge_changed(run: Run, name: str, pool: int) -> dict[str, Any]:
     """Train the run's policy anew, with one of `CHANGES` of its new adapters."""
     episodes = shared_demonstrations(run.folder.parents[2], pool, run.config)
     learner = dataclasses.replace(run, episodes=episodes)
+    learner.policy = run.policy  # which is no argument of a run
     model = CHANGES[name](learner, setup.build(run.config, run.folder).model)
     learner.policy = replace(run.policy, model=model)
     learner.policy = loop.trained(learner)

@@ -27,7 +27,7 @@ from studies.where_it_pays.judge import padded
 from studies.where_it_pays.sequence_page import KINDS, SINGLE, Sequences
 
 RATE = 1e-3
-"""Learning rate of all kinds, since what is forgotten depends on it."""
+"""Learning rate of all kinds but `SINGLE`, since what is forgotten depends on it."""
 REPLAYED = 0.02
 """Share of the demonstrations of earlier tasks that `replay` trains on, too."""
 KEPT = 0.5
@@ -39,7 +39,7 @@ Demonstrate = Callable[[Run, Mapping[str, float]], Run]
 
 def cells(backbone: str, seed: int, pool: int, ranks: Sequence[int]) -> Iterator[Derived]:
     """Yield the policies of a seed that learn one task after another; see `study.Scale`."""
-    kinds = [kind for kind, (_, rank, *_) in KINDS.items() if rank in ranks]
+    kinds = [kind for kind in page.SEQUENCES.kinds if KINDS[kind][1] in ranks]
     chosen = dataclasses.replace(page.SEQUENCES, kinds=kinds)
     yield from derived(chosen, backbone, seed, judge, pool=pool)
 
@@ -51,8 +51,9 @@ def derived(
 
     `evaluate` is called with a run, `kind`, `order` and the settings.
     """
-    shared = settings | {"rate": RATE, "replayed": REPLAYED, "kept": KEPT, "least": protect.LEAST}
+    shared = settings | {"replayed": REPLAYED, "kept": KEPT, "least": protect.LEAST}
     for kind in sequences.kinds:
+        shared |= {"rate": None if kind in SINGLE else RATE}
         method, rank, *_ = KINDS[kind]
         source = sequences.together(backbone, method, rank, seed)
         for order, tasks in enumerate(sequences.of_kind(kind)):
@@ -156,10 +157,11 @@ def some(every: Demonstrations, counts: Mapping[str, int]) -> Demonstrations:
 
 
 def _stage(run: Run, kind: str, count: int) -> Run:
-    """Return a run that is to learn one of `count` tasks."""
+    """Return a run that is to learn one of `count` tasks; `SINGLE` kinds keep the tuned rate."""
     optim = run.config.optim
     steps, warmup = optim.steps // count, optim.warmup_steps // count
-    optim = dataclasses.replace(optim, steps=steps, warmup_steps=warmup, learning_rate=RATE)
+    rate = optim.learning_rate if kind in SINGLE else RATE
+    optim = dataclasses.replace(optim, steps=steps, warmup_steps=warmup, learning_rate=rate)
     config = dataclasses.replace(run.config, optim=optim, checkpoint_every=steps, log_every=steps)
     if kind == "no_spectral":
         auxiliary = dataclasses.replace(config.auxiliary, spectral=0.0)

@@ -4,8 +4,8 @@
         --results studies/where_it_pays/results.json --jobs 8
 
 Policies learn four tasks as in studies/few, from 120 demonstrations of each. Every method and rank
-has the best of two or three learning rates, chosen with a seed that no table uses; LoRA with ranks
-by layer takes that of LoRA with their mean.
+has the best of three learning rates, chosen with a seed that no table uses; LoRA with ranks by
+layer takes that of LoRA with their mean, AdaLoRA that of one mean rank.
 """
 
 import functools
@@ -19,6 +19,7 @@ from flax import nnx
 
 from lorasp_jax import models
 from lorasp_jax.config import AugmentConfig, Config, EvaluationConfig
+from lorasp_jax.extras.deployment import healing
 from lorasp_jax.extras.study import Cell, Derived, Study
 from lorasp_jax.extras.study.results import best_rate, rate_of
 from lorasp_jax.extras.study.study import Results
@@ -27,14 +28,13 @@ from lorasp_jax.peft import AdaLoRA, LoRA, LoRASP, Method, plan
 from lorasp_jax.training import rules
 from studies.few import study as few
 from studies.few.judge import judge as judge_scenes
-from studies.paper.transforms import cut
-from studies.where_it_pays import bases, forms, names, page, recipes, sequences
+from studies.where_it_pays import bases, cutting, forms, names, page, recipes, sequences
 from studies.where_it_pays.judge import judge
 
-RATES = (1e-3, 3e-3)
-"""Learning rates, of which pilots choose one per backbone, method and rank."""
-HIGHER = 1e-2
-"""A third one of ranks up to 16, whose first pilots had much more success at the higher rate."""
+RATES = (1e-3, 3e-3, 1e-2)
+"""Learning rates up to R = 32, of which pilots choose one per backbone, method and rank."""
+WIDE_RATES = (3e-4, 1e-3, 3e-3)
+"""Those of larger R, which diverge earlier."""
 MAKE: Mapping[str, Callable[[int], Method]] = {
     "lora": lambda rank: LoRA(rank=rank),
     "lora_sp": lambda rank: LoRASP(rank=rank),
@@ -84,7 +84,7 @@ def get_study(scale: str) -> Study:
     chosen = {"accelerator": _ACCELERATOR, "smoke": _SMOKE}[scale]
     cells = [
         cell
-        for part in (_ranked, _started)
+        for part in (_ranked, _formed, _in_sequence, _layered, _changed, _on_bases)
         for backbone in page.BACKBONES
         for cell in part(chosen, backbone)
     ]
@@ -95,7 +95,7 @@ def _ranked(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
     """Yield the pilots of a backbone, then LoRA and LoRA-SP of every rank, seed by seed."""
     pilot = functools.partial(judge_scenes, scenes=("recorded",))
     cases = [(method, rank) for rank in scale.ranks for method in names.METHODS]
-    for method, rank in cases:
+    for method, rank in (*cases, ("ada_lora", _middle(scale))):
         for name in _pilots(backbone, method, rank):
             config = _config(scale, backbone, MAKE[method](rank), names.PILOT_SEED, rate_of(name))
             group = f"{backbone}/{method}_r{rank}"
@@ -105,17 +105,35 @@ def _ranked(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
             yield _cell(scale, backbone, method, rank, seed)
 
 
-def _started(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
-    """Yield what comes after the policies of every rank."""
-    make = functools.partial(_config, scale, backbone)
-    pilots = {method: _pilots(backbone, method, names.WIDE) for method in names.METHODS}
-    yield from bases.cells(backbone, scale.seeds, scale.pool, make, pilots, scale.config.scale)
-    for seed in page.RECIPE_SEEDS[: len(scale.seeds)]:
-        yield from recipes.cells(backbone, seed, scale.pool, make, pilots)
+def _formed(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
+    for seed in scale.seeds:
+        yield from forms.cells(backbone, seed, scale.pool, scale.heal)
+
+
+def _in_sequence(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
+    for seed in scale.seeds:
+        yield from sequences.cells(backbone, seed, scale.pool, scale.ranks)
+
+
+def _layered(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
     for seed in scale.seeds:
         yield from _allocated(scale, backbone, seed)
-        yield from forms.cells(backbone, seed, scale.pool, scale.heal)
-        yield from sequences.cells(backbone, seed, scale.pool, scale.ranks)
+
+
+def _changed(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
+    for seed in page.RECIPE_SEEDS[: len(scale.seeds)]:
+        yield from recipes.cells(backbone, seed, scale.pool, *_makers(scale, backbone))
+
+
+def _on_bases(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
+    makers = _makers(scale, backbone)
+    yield from bases.cells(backbone, scale.seeds, scale.pool, *makers, scale.config.scale)
+
+
+def _makers(scale: Scale, backbone: str) -> tuple[Callable[..., Config], dict[str, Any]]:
+    """Return what makes a config of method, seed, rate and more, and pilots by method."""
+    pilots = {method: _pilots(backbone, method, names.WIDE) for method in names.METHODS}
+    return functools.partial(_config, scale, backbone), pilots
 
 
 def _allocated(scale: Scale, backbone: str, seed: int) -> Iterator[Cell | Derived]:
@@ -128,32 +146,38 @@ def _allocated(scale: Scale, backbone: str, seed: int) -> Iterator[Cell | Derive
     twin = names.cell(twin, "lora_sp", names.WIDE, seed)
     for kind, source in (("other_backbone", twin), ("other_tasks", half.name)):
         yield _cell(scale, backbone, kind, scale.budgets[0], seed, source)
+    yield _cell(scale, backbone, "other_seed", scale.budgets[0], seed, other)
+    for kind in ("dropped", "dropped_random"):
+        yield _cell(scale, backbone, kind, scale.budgets[0], seed, own)
     for rank in scale.budgets:
-        for kind, source in (("planned", own), ("shuffled", own), ("other_seed", other)):
-            yield _cell(scale, backbone, kind, rank, seed, source)
-        for kind in ("dropped", "dropped_random"):
+        for kind in ("planned", "shuffled"):
             yield _cell(scale, backbone, kind, rank, seed, own)
         for method in ("ada_lora", "eva"):
             yield _cell(scale, backbone, method, rank, seed)
-        yield Derived(
-            names.cell(backbone, "cut", rank, seed),
-            names.cell(backbone, "lora", names.WIDE, seed),
-            lambda policy, _, __, rank=rank: cut(policy, rank),
-            settings={"rank": rank},
-            evaluate=judge_scenes,
-        )
+        for kind, steps in (("cut", 0), ("cut_healed", scale.heal)):
+            settings = {"rank": rank, "steps": steps, "pool": scale.pool}
+            yield Derived(
+                names.cell(backbone, kind, rank, seed),
+                names.cell(backbone, "lora", names.WIDE, seed),
+                settings=settings | {"rate": healing.RATE},
+                evaluate=functools.partial(cutting.judge, **settings),
+            )
 
 
 def _cell(scale: Scale, backbone: str, method: str, rank: int, seed: int, source: str = "") -> Cell:
     """Return a policy; the active ranks of `source` decide the ranks of its layers, if given."""
-    tuned = {page.HALF: "lora_sp"}.get(method, method if method in names.METHODS else "lora")
-    pilots = _pilots(backbone, tuned, rank)
+    tuned = {page.HALF: "lora_sp"}.get(method, method if method in MAKE else "lora")
+    pilots = _pilots(backbone, "lora" if tuned == "eva" else tuned, rank)
+    if method == "ada_lora":
+        pilots = _pilots(backbone, method, _middle(scale))
 
     def config(results: Results) -> Config:
         made = MAKE.get(method, MAKE["lora"])(rank)
         found = _config(scale, backbone, made, seed, best_rate(results, pilots))
         if method == page.HALF:
             return replace(found, tasks=found.tasks[: len(found.tasks) // 2])
+        if method == "eva":  # which needs at most as many directions as a layer has inputs
+            return replace(found, plan=_in_all(backbone, scale, rank))
         if not source:
             return found
         active = results[source]["layer_active_rank"]
@@ -162,7 +186,13 @@ def _cell(scale: Scale, backbone: str, method: str, rank: int, seed: int, source
     after = (*pilots, source) if source else pilots
     group = f"{backbone}/{method}_r{rank}" if not source else ""  # a plan is a program of its own
     name = names.cell(backbone, method, rank, seed)
-    return Cell(name, config, after, group, evaluate=judge, pool=scale.pool)
+    evaluate = judge if method in names.METHODS else functools.partial(judge, scenes=("recorded",))
+    return Cell(name, config, after, group, evaluate=evaluate, pool=scale.pool)
+
+
+def _middle(scale: Scale) -> int:
+    """Return the mean rank that decides AdaLoRA's rate."""
+    return scale.budgets[len(scale.budgets) // 2]
 
 
 def make_plan(
@@ -227,7 +257,19 @@ def _without_half(
     for path in paths:
         if left - sizes[path] >= sum(sizes.values()) / 2:
             kept[path], left = 0, left - sizes[path]
-    return {path: (min(each, *shapes[path][1:]),) * shapes[path][0] for path, each in kept.items()}
+    return {path: _at_most(each, shapes[path]) for path, each in kept.items()}
+
+
+def _in_all(backbone: str, scale: Scale, rank: int) -> plan.RankPlan:
+    """Return a plan of one rank in all layers that are not smaller."""
+    shapes = _shapes(backbone, scale.config.model.size, scale.config.targets)
+    ranks = {path: _at_most(rank, shape) for path, shape in shapes.items()}
+    return plan.RankPlan(backbone, ranks, rule="uniform")
+
+
+def _at_most(rank: int, shape: tuple[int, int, int]) -> tuple[int, ...]:
+    layers, *sizes = shape
+    return (min(rank, *sizes),) * layers
 
 
 @functools.cache
@@ -239,7 +281,7 @@ def _shapes(backbone: str, size: str, targets: tuple[str, ...]) -> plan.Shapes:
 
 
 def _pilots(backbone: str, method: str, rank: int) -> tuple[str, ...]:
-    rates = (*RATES, HIGHER) if rank <= 16 else RATES
+    rates = RATES if rank <= 32 else WIDE_RATES
     return tuple(f"{backbone}/pilot/{method}_r{rank}/{rate}" for rate in rates)
 
 

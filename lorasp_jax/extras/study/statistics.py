@@ -108,6 +108,23 @@ def minus(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return mean(a) - mean(b)
 
 
+def interaction(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Mean of a minus that of b, minus the same of c and d."""
+    return minus(a, b) - minus(c, d)
+
+
+def span(*methods: np.ndarray) -> np.ndarray:
+    """Highest minus lowest mean rate of several methods."""
+    means = np.stack([mean(each) for each in methods])
+    return means.max(0) - means.min(0)
+
+
+def span_minus(*methods: np.ndarray) -> np.ndarray:
+    """`span` of the first half of several methods minus that of the other half."""
+    half = len(methods) // 2
+    return span(*methods[:half]) - span(*methods[half:])
+
+
 def success(method: np.ndarray) -> Estimate:
     """Estimate a method's success rate, averaged over tasks."""
     return bootstrap(mean, method)

@@ -21,8 +21,10 @@ from lorasp_jax.models.smolvla import SmolVLAConfig
 from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP, plan
 from lorasp_jax.peft.settings import to_settings
 from lorasp_jax.training import activations, rules
+from studies.paper.transforms import cut
 from studies.where_it_pays import (
     bases,
+    cutting,
     forms,
     judge,
     page,
@@ -120,7 +122,8 @@ def test_policies_differ_in_what_their_names_say(results):
             assert config.model.size == bases.BASES[method][0]
             assert isinstance(config.peft, FullFineTuning) == (rank == ["full"])
             continue
-        assert bool(config.plan) == (method not in (*study.MAKE, page.HALF))
+        ranked = method in (*study.MAKE, page.HALF) and method != "eva"
+        assert bool(config.plan) != ranked
         assert len(config.tasks) == (2 if method == page.HALF else 4)
         named = config.peft.target_rank if method == "ada_lora" else config.peft.rank
         assert [f"r{named}"] == rank
@@ -180,7 +183,9 @@ def test_page(results, tmp_path, monkeypatch):
     assert shown["pi0 forms"]["whole"][:3] == ["50.0", "–", "+0.0"]
     layers = shown["smolvla layers"]
     assert layers["the former minus the latter"] == ["+25.0"] * 3
-    assert layers["ranks of another seed, minus own"] == ["−25.0"] * 3
+    assert layers["ranks of another seed, minus own"] == ["−25.0", "–", "–"]
+    spans = [["+0.0"] * 2] * 3
+    assert [*shown["contrasts"].values()] == [*spans, ["+0.0"] * 2, ["+50.0"] * 2]
     assert layers["ranks of the other backbone, by kind of layer, minus own"][0] == "−25.0"
     assert shown["recipes"]["ReLU scores"] == [*["75.0", "+25.0"] * 2, "3"] * 2
     lines = [line.split(" | ") for line in blocks["pi0 bases"].splitlines() if "| second" in line]
@@ -202,11 +207,36 @@ def test_the_recipes_differ_in_one_thing():
     plain = to_settings(recipes.RECIPES["lora_sp"][0])
     losses = dataclasses.asdict(AuxiliaryConfig())
     for name, (method, changes) in recipes.RECIPES.items():
-        if name != "lora":
-            settings, changed = to_settings(method), changes.get("auxiliary", AuxiliaryConfig())
-            count = sum(settings[x] != plain[x] for x in plain) + ("adapt" in changes)
-            count += sum(value != losses[x] for x, value in dataclasses.asdict(changed).items())
-            assert count == (name != "lora_sp")
+        settings, changed = to_settings(method), changes.get("auxiliary", AuxiliaryConfig())
+        count = sum(settings[x] != plain[x] for x in plain) + ("adapt" in changes)
+        count += sum(value != losses[x] for x, value in dataclasses.asdict(changed).items())
+        assert count == (name != "lora_sp")
+
+
+def test_a_recipe_with_lora_in_a_part_takes_the_lower_rate(results):
+    for rate, share in (("0.001", 0.9), ("0.003", 0.1)):
+        name = f"pi0/pilot/lora_r64/{rate}"
+        outcomes = dict.fromkeys(results[name]["outcomes"], episodes(share))
+        results = {**results, name: {**results[name], "outcomes": outcomes}}
+    for recipe, rate in {"lora_sp": 3e-3, "vlm": 1e-3, "expert": 1e-3}.items():
+        config = STUDY[f"pi0/recipe_{recipe}/s1001"].config(results)
+        assert config.optim.learning_rate == rate
+
+
+@pytest.mark.parametrize("name", recipes.CHANGES)
+def test_a_changed_policy_begins_anew(name, tmp_path, monkeypatch):
+    config, base = dataclasses.replace(CONFIG, peft=LoRASP(rank=64)), Pi0Config.dummy()
+    (folder := tmp_path / "pi0" / "recipe").mkdir(parents=True)
+    run = make_run(folder / "s1001", config, random_backbone(base))
+    start, began = run.policy.model, []
+    monkeypatch.setattr(recipes.setup, "build", lambda *_: SimpleNamespace(model=start))
+    monkeypatch.setattr(recipes, "shared_demonstrations", lambda *_: run.episodes)
+    monkeypatch.setattr(recipes.loop, "trained", lambda x: began.append(x.policy) or run.policy)
+    monkeypatch.setattr(recipes, "judge_scenes", lambda x: x.policy)
+    assert recipes.judge_changed(run, name, 0) is run.policy
+    (policy,) = began
+    assert policy.processor is run.policy.processor
+    assert {*adapted(policy.model)} == {*adapted(start)}
 
 
 def test_tasks_without_demonstrations_keep_the_numbers_of_instructions():
@@ -246,6 +276,8 @@ def test_a_sequence_learns_task_after_task(kind, tmp_path, monkeypatch):
     stages, of = zip(*learned, strict=True)
     assert [*of] == [["press"], ["pick_place"]]
     assert [x.config.optim.steps for x in stages] == [CONFIG.optim.steps // 2] * 2
+    rate = CONFIG.optim.learning_rate if kind == "single" else sequences.RATE
+    assert [x.config.optim.learning_rate for x in stages] == [rate] * 2
     assert [x.config.auxiliary.spectral == 0 for x in stages] == [kind == "no_spectral"] * 2
     began = [stage.policy.model is start for stage in stages]
     assert began == [True, kind == "single"]
@@ -275,6 +307,30 @@ def with_adapters(config):
         adaptation.adapt(model, rules.rules(config), rngs=nnx.Rngs(0))
     )
     return nnx.merge(graphdef, with_noise(adapters, 0.1), frozen)
+
+
+def test_a_cut_policy_is_lora_with_fewer_parameters(tmp_path):
+    config = dataclasses.replace(CONFIG, peft=LoRA(rank=4))
+    run = make_run(tmp_path, config, random_backbone(Pi0Config.dummy()))
+    own = dataclasses.replace(run.policy, model=with_adapters(config))
+    shapes = rules.shapes(random_backbone(Pi0Config.dummy()), presets.patterns(config.targets))
+    sizes = [n * (d_in + d_out) for n, d_in, d_out in shapes.values()]
+    for rank, atol in ((2, None), (4, 1e-5)):
+        smaller = cut(own, rank, by_size=True)
+        found, count = cutting.as_lora(smaller)
+        assert rank * sum(sizes) - max(sizes) < count <= rank * sum(sizes)
+        assert {type(x) for x in adaptation.methods(found.model).values()} == {LoRA}
+        merged = [adaptation.merge(x.model) for x in (smaller, found, own)]
+        for path in ("action", "language"):
+            kernels = [getattr(x, path).blocks.q_proj.kernel.get_value() for x in merged]
+            np.testing.assert_allclose(*kernels[:2], atol=1e-5)
+            assert (np.abs(kernels[1] - kernels[2]).max() > 1e-3) == (atol is None)
+
+
+def test_active_ranks_that_are_lost_are_missed(tmp_path):
+    run = make_run(tmp_path, CONFIG, random_backbone(Pi0Config.dummy()))
+    with pytest.raises(ValueError, match="active ranks are lost"):
+        judge.judge(run)
 
 
 def test_half_of_an_update_is_merged(lora):
