@@ -79,7 +79,7 @@ def _table(results: Results, backbone: str, stage: str) -> str:
     }
     head += ["mean", "minus LoRA-SP"]
     if any(len(ran) < len(SEEDS) for ran in seeds.values()):
-        return page.table(head, [_filled([label], head) for label in LABELS.values()])
+        return page.table(head, [[label] for label in LABELS.values()])
     return page.table(head, [_row(LABELS[m], seeds[m], seeds["lora_sp"], columns) for m in LABELS])
 
 
@@ -123,7 +123,7 @@ def _size_table(results: Results, backbone: str) -> str:
                 (value, draws), (first, first_draws) = leads[stage], leads[SIZES[0]]
                 ends = statistics.percentiles(draws - first_draws)
                 row.append(page.points(statistics.Estimate(value - first, *ends)))
-        rows.append(_filled(row, head))
+        rows.append(row)
     return page.table(head, rows)
 
 
@@ -146,7 +146,7 @@ def _shared_table(results: Results, backbone: str) -> str:
             pairs = [*zip(found[: len(own)], found[len(own) :], strict=True)]
             row += [page.points(statistics.difference(*pair)) for pair in pairs]
             row.append(page.points(statistics.bootstrap(_gain, *pairs[-1], *pairs[-2])))
-        rows.append(_filled(row, head))
+        rows.append(row)
     return page.table(head, rows)
 
 
@@ -173,7 +173,7 @@ def _rank_table(results: Results, backbone: str) -> str:
         loras, owns = zip(*every, strict=True)
         row += [page.percent(statistics.bootstrap(_span, *each)) for each in (loras, owns)]
         row.append(page.points(statistics.bootstrap(_span_difference, *owns, *loras)))
-    return page.table(head, [*rows, _filled(row, head)])
+    return page.table(head, [*rows, row])
 
 
 def _rate(results: Results, name: str) -> str:
@@ -219,8 +219,3 @@ def _only(cell: Mapping[str, Any], tasks: Sequence[str]) -> Mapping[str, Any]:
 
 def _stacked(seeds: Seeds) -> np.ndarray:
     return statistics.stacked([seed["outcomes"] for seed in seeds])
-
-
-def _filled(row: Sequence[str], head: Sequence[str]) -> list[str]:
-    """Return a row with dashes where it lacks cells."""
-    return [*row, *[NONE] * (len(head) - len(row))]

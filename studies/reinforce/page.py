@@ -107,7 +107,7 @@ def _success_table(results: Results, seeds: dict[tuple[str, int], list[int]]) ->
             row += [page.percent(statistics.success(x)) for x in stacked]
             row += [f"{_last(*at, own, 'environment_steps') / 1e6:.1f} M"]
             row += [f"{_last(*at, own, 'minutes'):.0f}"]
-        rows.append(row + [page.NONE] * (9 - len(row)))
+        rows.append(row)
     for backbone in BACKBONES:
         own = _seeds(results, backbone, CEILING, "imitation")
         row = [BACKBONES[backbone], f"{CEILING}, imitation alone", str(len(own))]
@@ -117,7 +117,7 @@ def _success_table(results: Results, seeds: dict[tuple[str, int], list[int]]) ->
             row += [page.NONE, page.percent(estimates[0]), page.NONE, page.percent(estimates[1])]
             seconds = [results[cell(backbone, CEILING, "imitation", s)]["seconds"] for s in own]
             row += [page.NONE, f"{np.mean([x['total'] for x in seconds]) / 60:.0f}"]
-        rows.append(row + [page.NONE] * (9 - len(row)))
+        rows.append(row)
     heads = ("", "demonstrations", "seeds", "before", "after")
     hard = " and ".join(HARD)
     return page.table(
@@ -143,9 +143,9 @@ def _task_table(results: Results, seeds: dict[tuple[str, int], list[int]]) -> st
 def _gains(
     results: Results, where: tuple[str, int], policy: str, seeds: Sequence[int]
 ) -> list[str]:
-    """Return the gains of a policy over its start, by task."""
+    """Return the gains of a policy over its start, by task; none without seeds."""
     if not seeds:
-        return [page.NONE] * len(TASKS)
+        return []
     pairs = [
         [_outcomes(results, where, policy, seeds, [task], when) for when in ("outcomes", "before")]
         for task in TASKS
@@ -182,7 +182,7 @@ def _active_table(results: Results) -> str:
     for backbone in BACKBONES:
         own = _seeds(results, backbone, COUNTS[0], "lora_sp")
         runs = [results[cell(backbone, COUNTS[0], "lora_sp", s)]["progress"] for s in own]
-        row = [BACKBONES[backbone], str(len(own)), *[page.NONE] * (0 if own else len(MODULES))]
+        row = [BACKBONES[backbone], str(len(own))]
         for name in MODULES if own else ():
             first, last = (
                 np.mean([run[i][f"active_rank/{name}"] for run in runs]) for i in (0, -1)
@@ -211,7 +211,7 @@ def _scene_table(results: Results) -> str:
                     _outcomes(results, where, name, own, when="shifted", prefix=f"{when}/"),
                 ]
                 row += [page.percent(statistics.success(x)) for x in stacked]
-            rows.append(row + [page.NONE] * (5 - len(row)))
+            rows.append(row)
     return page.table([f"N = {COUNTS[0]}", "", "seeds", "as recorded", "shifted"], rows)
 
 

@@ -28,8 +28,12 @@ def fill(path: Path, blocks: Mapping[str, str]) -> None:
 
 
 def table(headers: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a Markdown table, in which intervals and other numbers do not break."""
-    lines = [headers, ["---"] * len(headers), *rows]
+    """Return a Markdown table, in which intervals and other numbers do not break.
+
+    Rows get dashes where they lack cells.
+    """
+    filled = ([*row, *[NONE] * (len(headers) - len(row))] for row in rows)
+    lines = [headers, ["---"] * len(headers), *filled]
     text = "".join(f"| {' | '.join(line)} |\n" for line in lines)
     return _UNBREAKABLE.sub("\u00a0", text)
 
