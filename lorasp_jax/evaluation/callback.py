@@ -20,7 +20,7 @@ from lorasp_jax.base.bars import bars
 from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.evaluation import metrics, video
 from lorasp_jax.evaluation.programs import compiled_rollout
-from lorasp_jax.evaluation.results import Result, evaluate
+from lorasp_jax.evaluation.results import Result, evaluate, map_rollouts
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training import early, records
 from lorasp_jax.training.demonstrations import map_threads
@@ -129,9 +129,7 @@ class Evaluation(Callback):
                 self._evaluate_task, run, policy, when, episodes, progress
             )
             tasks = run.config.tasks
-            # Warp is not thread-safe.
-            map_tasks = map if physics.default_backend() == "warp" else map_threads
-            results = dict(zip(tasks, map_tasks(evaluate_task, tasks), strict=True))
+            results = dict(zip(tasks, map_rollouts(evaluate_task, tasks), strict=True))
         for task, result in results.items():
             low, high = (100 * bound for bound in result.ci95)
             run.console.print(

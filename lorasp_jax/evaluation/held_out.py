@@ -209,8 +209,7 @@ def _read(
         dataset = np.full_like(steps.end, dataset_of(source)[number])
         steps = dataclasses.replace(steps, dataset=dataset)
     starts = np.array(_evenly(range(0, len(steps.end), every), limit), np.int32)
-    phrase = episode.instructions[int(episode.instruction[0])]
-    where = [(episode.task, phrase, number, int(start)) for start in starts]
+    where = [(episode.task, episode.phrases[0], number, int(start)) for start in starts]
     raw = gather(steps, starts, policy.model.config.chunk)
     return raw, np.asarray(steps.action[starts - 1]), where
 

@@ -1,19 +1,22 @@
 """Success of a policy on a task, measured in closed loop."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import numpy as np
 
 from envs.env import Env
+from envs.physics import physics
 from envs.scene.randomization import Draw
 from envs.state import Poses
 from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.evaluation import metrics
 from lorasp_jax.evaluation.programs import RECORDED_WORLDS, Rollout, make_rollout
 from lorasp_jax.policies.policy import Policy
+from lorasp_jax.training.demonstrations import map_threads
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,12 @@ class Result:
     active_rank_histogram: dict[str, np.ndarray]
     poses: Poses = dataclasses.field(repr=False)
     draw: Draw | None = dataclasses.field(default=None, repr=False)
+
+
+def map_rollouts(function: Callable, *arguments: Iterable[Any]) -> list[Any]:
+    """Map a function that runs rollouts, in threads; not in Warp, which is not thread-safe."""
+    run = map if physics.default_backend() == "warp" else map_threads
+    return [*run(function, *arguments)]
 
 
 def evaluate(

@@ -10,12 +10,10 @@ import jax.numpy as jnp
 
 import envs
 from envs import Env, Randomization
-from envs.physics import physics
 from envs.state import State
 from lorasp_jax.evaluation import metrics
 from lorasp_jax.evaluation.programs import Rollout, make_rollout
-from lorasp_jax.evaluation.results import evaluate
-from lorasp_jax.training.demonstrations import map_threads
+from lorasp_jax.evaluation.results import evaluate, map_rollouts
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Run
 from studies.few.page import SCENES
@@ -57,9 +55,7 @@ def judge(run: Run, scenes: Iterable[str] = SCENES, *, cropped: bool = False) ->
         return "".join("01"[succeeded] for succeeded in result.outcomes)
 
     cases = [(scene, task) for scene in scenes for task in run.config.tasks]
-    # Warp is not thread-safe.
-    run_all = map if physics.default_backend() == "warp" else map_threads
-    found = [*run_all(one, cases)]
+    found = map_rollouts(one, cases)
     if bias := metrics.position_bias([x == "1" for x in text] for text in found):
         raise ValueError(bias)
     trainable, total = run.parameters

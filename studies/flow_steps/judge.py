@@ -9,17 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs import Env
-from envs.physics import physics
 from lorasp_jax.distill_flow import command
 from lorasp_jax.distill_flow.config import Distillation, DistillFlowConfig
 from lorasp_jax.evaluation import held_out
 from lorasp_jax.evaluation.programs import compiled_rollout
+from lorasp_jax.evaluation.results import map_rollouts
 from lorasp_jax.extras.latency.curve import measure_point
 from lorasp_jax.extras.latency.execution import Execution, delayed_rollout
 from lorasp_jax.extras.study.held_out import AllTasks
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training import loop
-from lorasp_jax.training.demonstrations import Demonstrations, map_threads
+from lorasp_jax.training.demonstrations import Demonstrations
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Run
 from studies.flow_steps.page import STEPS
@@ -45,9 +45,7 @@ def judge(run: Run, delay: int) -> dict[str, Any]:
         return measure_point(policy, env, play, key, settings.episodes, delay)
 
     cases = [(steps, task) for task in run.config.tasks for steps in _steps(run)]
-    # Warp is not thread-safe.
-    run_all = map if physics.default_backend() == "warp" else map_threads
-    found = dict(zip([f"{n}/{task}" for n, task in cases], run_all(one, cases), strict=True))
+    found = dict(zip([f"{n}/{task}" for n, task in cases], map_rollouts(one, cases), strict=True))
     return {name: {k: v[name] for k, v in found.items()} for name in ("outcomes", "jerk")}
 
 

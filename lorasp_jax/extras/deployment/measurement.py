@@ -101,8 +101,7 @@ def call_milliseconds(
     policy, first = policy.with_sampler(), next(iter(episodes.values()))
     images = {name: jnp.asarray(image[0, :1]) for name, image in first.image.items()}
     observation = {"image": images, "state": jnp.asarray(first.state[0, :1])}
-    phrase = first.instructions[int(first.instruction[0])]
-    row = jnp.array(policy.processor.prompts.rows([phrase]))
+    row = jnp.array(policy.processor.prompts.rows(first.phrases[:1]))
     sample = functools.partial(_sample, num_steps=num_steps)
     arguments = policy, jax.random.key(0), observation, row
     jax.block_until_ready(sample(*arguments))  # compiles
