@@ -6,11 +6,21 @@ WIDE = 64
 """R of the policies whose ranks by layer plans have, and that other cells start from."""
 SEEDS = (0, 1, 2)
 PILOT_SEED = 1000
+RATES = (1e-3, 3e-3, 1e-2)
+"""Learning rates up to R = 32, of which pilots choose one per backbone, method and rank."""
+WIDE_RATES = (3e-4, 1e-3, 3e-3)
+"""Those of larger R, which diverge earlier."""
 
 
 def cell(backbone: str, method: str, rank: int, seed: int) -> str:
     """Return the name of a policy."""
     return f"{backbone}/{method}/r{rank}/s{seed}"
+
+
+def pilots(backbone: str, method: str, rank: int) -> tuple[str, ...]:
+    """Return the names of the policies whose success decides a learning rate."""
+    rates = RATES if rank <= 32 else WIDE_RATES
+    return tuple(f"{backbone}/pilot/{method}_r{rank}/{rate}" for rate in rates)
 
 
 def form(backbone: str, name: str, healed: bool, seed: int) -> str:

@@ -12,7 +12,7 @@ from lorasp_jax.evaluation.figure_style import STYLE
 from lorasp_jax.extras.study import Study, page, statistics
 from lorasp_jax.extras.study import figure as figures
 from lorasp_jax.extras.study.page import BACKBONES
-from lorasp_jax.extras.study.results import ran
+from lorasp_jax.extras.study.results import ran, rate_of
 from lorasp_jax.extras.study.study import Results
 from studies.few.page import SCENES, outcomes
 from studies.where_it_pays import names, sequence_page
@@ -112,7 +112,8 @@ def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
         "bases": _base_table,
     }
     made = {f"{b} {name}": table(results, b) for name, table in tables.items() for b in BACKBONES}
-    return made | {"contrasts": _contrast_table(results), "recipes": _recipe_table(results)}
+    more = {"pilots": _pilot_table, "contrasts": _contrast_table, "recipes": _recipe_table}
+    return made | {name: table(results) for name, table in more.items()}
 
 
 def _rank_table(results: Results, backbone: str) -> str:
@@ -135,6 +136,21 @@ def _rank_table(results: Results, backbone: str) -> str:
     ]
     parameters = [f"{label}'s parameters" for label in METHODS.values()]
     return page.table([f"{BACKBONES[backbone]}: R", *heads, *parameters, "seeds"], rows)
+
+
+def _pilot_table(results: Results) -> str:
+    """Return the success of pilots by rate, as recorded."""
+    cases = [(b, method) for b in BACKBONES for method in METHODS]
+    rows = []
+    for rank in RANKS:
+        row = [str(rank)]
+        for case in cases:
+            tried = {rate_of(x): results[x] for x in names.pilots(*case, rank) if x in results}
+            rates = {r: outcomes([x], "recorded").mean() for r, x in tried.items()}
+            row.append(", ".join(f"{100 * x:.1f} ({r:g})" for r, x in rates.items()) or page.NONE)
+        rows.append(row)
+    heads = [f"{BACKBONES[b]}, {METHODS[method]}" for b, method in cases]
+    return page.table(["R", *heads], rows)
 
 
 def _contrast_table(results: Results) -> str:

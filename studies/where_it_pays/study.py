@@ -31,10 +31,6 @@ from studies.few.judge import judge as judge_scenes
 from studies.where_it_pays import bases, cutting, forms, names, page, recipes, sequences
 from studies.where_it_pays.judge import judge
 
-RATES = (1e-3, 3e-3, 1e-2)
-"""Learning rates up to R = 32, of which pilots choose one per backbone, method and rank."""
-WIDE_RATES = (3e-4, 1e-3, 3e-3)
-"""Those of larger R, which diverge earlier."""
 MAKE: Mapping[str, Callable[[int], Method]] = {
     "lora": lambda rank: LoRA(rank=rank),
     "lora_sp": lambda rank: LoRASP(rank=rank),
@@ -96,7 +92,7 @@ def _ranked(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
     pilot = functools.partial(judge_scenes, scenes=("recorded",))
     cases = [(method, rank) for rank in scale.ranks for method in names.METHODS]
     for method, rank in (*cases, ("ada_lora", _middle(scale))):
-        for name in _pilots(backbone, method, rank):
+        for name in names.pilots(backbone, method, rank):
             config = _config(scale, backbone, MAKE[method](rank), names.PILOT_SEED, rate_of(name))
             group = f"{backbone}/{method}_r{rank}"
             yield Cell(name, config, (), group, evaluate=pilot, pool=scale.pool)
@@ -132,7 +128,7 @@ def _on_bases(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
 
 def _makers(scale: Scale, backbone: str) -> tuple[Callable[..., Config], dict[str, Any]]:
     """Return what makes a config of method, seed, rate and more, and pilots by method."""
-    pilots = {method: _pilots(backbone, method, names.WIDE) for method in names.METHODS}
+    pilots = {method: names.pilots(backbone, method, names.WIDE) for method in names.METHODS}
     return functools.partial(_config, scale, backbone), pilots
 
 
@@ -167,9 +163,9 @@ def _allocated(scale: Scale, backbone: str, seed: int) -> Iterator[Cell | Derive
 def _cell(scale: Scale, backbone: str, method: str, rank: int, seed: int, source: str = "") -> Cell:
     """Return a policy; the active ranks of `source` decide the ranks of its layers, if given."""
     tuned = {page.HALF: "lora_sp"}.get(method, method if method in MAKE else "lora")
-    pilots = _pilots(backbone, "lora" if tuned == "eva" else tuned, rank)
+    pilots = names.pilots(backbone, "lora" if tuned == "eva" else tuned, rank)
     if method == "ada_lora":
-        pilots = _pilots(backbone, method, _middle(scale))
+        pilots = names.pilots(backbone, method, _middle(scale))
 
     def config(results: Results) -> Config:
         made = MAKE.get(method, MAKE["lora"])(rank)
@@ -278,11 +274,6 @@ def _shapes(backbone: str, size: str, targets: tuple[str, ...]) -> plan.Shapes:
     config = getattr(models.backbone.find(backbone), size)()
     model = nnx.eval_shape(lambda: config.create(nnx.Rngs(0)))
     return rules.shapes(model, presets.patterns(targets))
-
-
-def _pilots(backbone: str, method: str, rank: int) -> tuple[str, ...]:
-    rates = RATES if rank <= 32 else WIDE_RATES
-    return tuple(f"{backbone}/pilot/{method}_r{rank}/{rate}" for rate in rates)
 
 
 def _config(

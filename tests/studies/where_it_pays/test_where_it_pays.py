@@ -187,6 +187,9 @@ def test_page(results, tmp_path, monkeypatch):
     spans = [["+0.0"] * 2] * 3
     assert [*shown["contrasts"].values()] == [*spans, ["+0.0"] * 2, ["+50.0"] * 2]
     assert layers["ranks of the other backbone, by kind of layer, minus own"][0] == "−25.0"
+    rates = {"4": "50.0 (0.001), 70.0 (0.003), 50.0 (0.01)"}
+    rates["128"] = "50.0 (0.0003), 50.0 (0.001), 70.0 (0.003)"
+    assert {rank: shown["pilots"][rank] for rank in rates} == {r: [x] * 4 for r, x in rates.items()}
     assert shown["recipes"]["ReLU scores"] == [*["75.0", "+25.0"] * 2, "3"] * 2
     lines = [line.split(" | ") for line in blocks["pi0 bases"].splitlines() if "| second" in line]
     rates = [[cell.split("\u00a0")[0] for cell in line[2:4]] for line in lines[1:]]
