@@ -151,7 +151,8 @@ def prepare(config, folder, collect=collect, **options):
     return run, console.file.getvalue()
 
 
-def test_a_run_protects_what_another_uses(settings, finished, tmp_path):
+def test_a_run_protects_what_another_uses(settings, finished, tmp_path, monkeypatch):
+    monkeypatch.setattr(protect, "ROOM", 1.0)  # all banks count as full
     run, said = prepare(settings, tmp_path / "b")
     start = load_policy(finished)
     before = leaves(nnx.state(start.model, adaptation.AdapterParam))
@@ -163,6 +164,7 @@ def test_a_run_protects_what_another_uses(settings, finished, tmp_path):
     assert {*protected} == {*adaptation.methods(run.policy.model)}
     assert 0 < np.concatenate([x.ravel() for x in protected.values()]).mean() < 1
     assert "free directions" in said
+    assert "warning: only" in said
 
     def only_own(config, *rest):
         assert config.tasks == ("pour",), "it counts again"
