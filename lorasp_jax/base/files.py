@@ -142,13 +142,16 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def as_value_error(path: Path, *also: type[Exception], remedy: str = "") -> Iterator[None]:
+def as_value_error(
+    path: Path, *also: type[Exception], remedy: str = "", problem: str = "is damaged"
+) -> Iterator[None]:
     """Convert read errors to a ValueError that names the path; a RefusedError passes unchanged.
 
     Args:
         path: the file or folder read in the block.
         also: further exceptions that a library raises for damaged files.
         remedy: what to do, as the end of the message.
+        problem: what the file is if it cannot be read; people also write files themselves.
     """
     try:
         yield
@@ -158,7 +161,7 @@ def as_value_error(path: Path, *also: type[Exception], remedy: str = "") -> Iter
         if isinstance(error, FileNotFoundError) and error.filename:
             raise ValueError(f"{os.fsdecode(error.filename)} is missing{remedy}") from error
         cause = first_line(error)
-        problem = f"lacks {error}" if isinstance(error, KeyError) else f"is damaged ({cause})"
+        problem = f"lacks {error}" if isinstance(error, KeyError) else f"{problem} ({cause})"
         raise ValueError(f"{path} {problem}{remedy}") from error
 
 

@@ -30,19 +30,21 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--rank", type=types.not_negative, metavar="MEAN", help=text)
     add("--least", type=types.positive, default=1, metavar="N", help="smallest rank (default: 1)")
     text = "give the N layers with the lowest active rank no adapter (default: 0)"
-    add("--drop", type=types.positive, default=0, metavar="N", help=text)
+    add("--drop", type=int, default=0, metavar="N", help=text)
     return parser
 
 
 def _run(options: argparse.Namespace) -> None:
-    from lorasp_jax.training.allocation import from_run
+    from lorasp_jax.training.allocation import from_run, shapes
+    from lorasp_jax.training.export import RecordedPolicy
 
     if options.out.exists():
         raise ValueError(f"{options.out} exists already: choose another --out")
     plan = from_run(options.run, rank=options.rank, least=options.least, drop=options.drop)
     plan.save(options.out)
     ranks = [rank for each in plan.ranks.values() for rank in each]
+    count = plan.count(shapes(RecordedPolicy.read(options.run), plan.ranks))
     print(
         f"written: {options.out}, ranks from {min(ranks)} to {max(ranks)} in {len(ranks)} layers, "
-        f"at most {plan.budget:,} parameters"
+        f"{count:,} of at most {plan.budget:,} parameters"
     )

@@ -6,7 +6,8 @@ A plan is a JSON file, as `lorasp-jax allocate` writes it or a person does:
      "ranks": {"language/blocks/q_proj": [4, 7, 0], "state_proj": [12]}}
 
 `ranks` has a list for every layer that a run adapts, with one entry per layer of a stack. 0 is no
-adapter. A plan is not one of learning rates: the scale of the method is the same in all layers.
+adapter. A `budget`, if there is one, is the most parameters that the plan may have. A plan is not
+one of learning rates: the scale of the method is the same in all layers.
 """
 
 import dataclasses
@@ -52,7 +53,7 @@ class RankPlan:
     rule: str = ""
     """How it was made."""
     budget: int = 0
-    """How many parameters it may have; 0: not limited."""
+    """How many parameters it may have, as `count` counts them; 0: not limited."""
 
     def __post_init__(self) -> None:
         if not any(map(any, self.ranks.values())):
@@ -75,16 +76,21 @@ class RankPlan:
         return cls(**values)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the plan to a file, with one line per layer."""
+        """Write the plan to a file, with one line per layer, and create the file's folder."""
         fields = {x.name: getattr(self, x.name) for x in dataclasses.fields(self)}
         entry = lambda name, value: f"{json.dumps(name)}: {json.dumps(value)}"  # noqa: E731
         layers = ",\n    ".join(entry(*each) for each in fields.pop("ranks").items())
         head = {"format": FORMAT, "version": VERSION, **fields}
         lines = [*(entry(*each) for each in head.items()), f'"ranks": {{\n    {layers}\n  }}']
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
         write_text(Path(path), "{\n  " + ",\n  ".join(lines) + "\n}\n")
 
+    def count(self, shapes: Shapes) -> int:
+        """Return the number of parameters of A and B, Σ r (I + O), of a plan for these layers."""
+        return sum(sum(ranks) * sum(shapes[path][1:]) for path, ranks in self.ranks.items())
+
     def check(self, shapes: Shapes) -> None:
-        """Raise ValueError unless the plan is one for exactly these layers."""
+        """Raise ValueError unless the plan is one for exactly these layers, within its budget."""
         names = ", ".join([*shapes][:5])
         if unknown := self.ranks.keys() - shapes.keys():
             raise ValueError(
@@ -106,6 +112,11 @@ class RankPlan:
                     f"the plan has rank {max(ranks)} for {path}, but its kernels are {d_in} x "
                     f"{d_out}: at most {min(d_in, d_out)}"
                 )
+        if self.budget and (count := self.count(shapes)) > self.budget:
+            raise ValueError(
+                f"the plan has {count:,} parameters, more than its budget of {self.budget:,}: "
+                "lower its ranks, or leave out the budget"
+            )
 
     def rules(self, method: Method) -> dict[str, tuple[str, Method | None]]:
         """Return rules for `adapt` by path, which give each layer the method with its rank.
@@ -136,10 +147,10 @@ def read(path: str | os.PathLike[str]) -> RankPlan:
     """Read a plan's file.
 
     Raises:
-        ValueError: it is missing, no plan, or of another version.
+        ValueError: it is missing, invalid, or of another version.
     """
     path = Path(path)
-    with as_value_error(path):
+    with as_value_error(path, problem="is invalid"):
         fields = read_json(path)
         check(fields, {"format": str, "version": int})
         if (fields.pop("format"), fields.pop("version")) != (FORMAT, VERSION):
@@ -163,21 +174,25 @@ def allocate(
     the largest layer, unless all layers of any importance are at their upper bound.
 
     Args:
-        importance: of each layer of a stack, by path.
+        importance: of each layer of a stack, by path; at least 0.
         shapes: of the same layers.
         budget: number of parameters.
         most: largest rank.
         least: smallest rank.
-        drop: how many of the least important layers get rank 0 instead.
+        drop: how many of the least important layers get rank 0 instead; not all.
 
     Raises:
-        ValueError: a layer has no importance, the budget is too small, or all layers are to be
-            dropped.
+        ValueError: a layer has no importance, or one that is negative or not finite, the budget is
+            too small, or `drop` is negative or drops all layers.
     """
     for path, (layers, _, _) in shapes.items():
         if len(importance.get(path, ())) != layers:
             raise ValueError(f"importance must have {layers} numbers for {path}")
+        if wrong := [x for x in importance[path] if not 0 <= x < np.inf]:
+            raise ValueError(f"importance must be finite and at least 0, got {wrong[0]} for {path}")
     values = np.concatenate([np.asarray(importance[path], float) for path in shapes])
+    if not 0 <= drop < len(values):
+        raise ValueError(f"drop must be at least 0 and below {len(values)} layers, got {drop}")
     counts = [layers for layers, _, _ in shapes.values()]
     spread = lambda each: np.repeat(np.array(each), counts)  # noqa: E731
     cost = spread([d_in + d_out for _, d_in, d_out in shapes.values()])
@@ -185,7 +200,7 @@ def allocate(
     low = np.minimum(least, high)
     dropped = np.argsort(values, kind="stable")[:drop]
     low[dropped] = high[dropped] = 0
-    if drop >= len(values) or low @ cost > budget:
+    if low @ cost > budget:
         raise ValueError(
             f"a budget of {budget:,.0f} parameters is too small for ranks of at least {least}: "
             f"{len(values)} layers, {drop} of them dropped, need {low @ cost:,}"

@@ -1,12 +1,13 @@
 """Make a plan of ranks from the active ranks of a finished run."""
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 from flax import nnx
 
 from lorasp_jax.adapters.io import native
-from lorasp_jax.peft.plan import RankPlan, allocate
+from lorasp_jax.peft.plan import RankPlan, Shapes, allocate
 from lorasp_jax.training import export, records, rules
 from lorasp_jax.training.run_folder import read_json
 
@@ -41,20 +42,26 @@ def from_run(run: Path, *, rank: float | None = None, least: int = 1, drop: int 
             f"{run} was trained with {', '.join(sorted(names))}: a plan is made from the active "
             f"ranks of a run of {' or '.join(METHODS)}"
         )
-    results = read_json(run / RESULTS, records.RESULTS)
+    if not (results := read_json(run / RESULTS, records.RESULTS)):
+        raise ValueError(f"{run} is not a finished run: it needs {RESULTS}")
     try:
         found = results["layer_active_rank"]
         ranks = {path: found[rules.tower(path)][rules.short_name(path)] for path in methods}
     except KeyError as error:
         raise ValueError(f"{run / RESULTS} has no active ranks of {error}") from error
-    model = nnx.eval_shape(lambda: recorded.config.create(nnx.Rngs(0)))
-    shapes = rules.shapes(model, [f"^{re.escape(path)}$" for path in methods])
+    sizes = shapes(recorded, methods)
     most = max(settings["rank"] for settings in methods.values())
     mean = results["active_rank"]["mean"] if rank is None else rank
     if mean > most:
         raise ValueError(f"the mean rank must be at most the run's {most}, got {mean:g}")
-    budget = int(mean * sum(layers * (d_in + d_out) for layers, d_in, d_out in shapes.values()))
-    planned = allocate(ranks, shapes, budget, most=most, least=least, drop=drop)
+    budget = int(mean * sum(layers * (d_in + d_out) for layers, d_in, d_out in sizes.values()))
+    planned = allocate(ranks, sizes, budget, most=most, least=least, drop=drop)
     rule = f"active rank, least {least}, drop {drop}"
     source = f"{run.resolve().name} {saved['sha256']}"
     return RankPlan(recorded.fields["backbone"], planned, source, rule, budget)
+
+
+def shapes(run: export.RecordedPolicy, layers: Iterable[str]) -> Shapes:
+    """Return the shapes of the layers with these paths in a run's model."""
+    model = nnx.eval_shape(lambda: run.config.create(nnx.Rngs(0)))
+    return rules.shapes(model, [f"^{re.escape(path)}$" for path in layers])

@@ -76,6 +76,7 @@ def write_variant(
     tasks: Sequence[str] = (),
     quantized: Kind | None = None,
     calibration: Mapping[str, Any] = MappingProxyType({}),
+    healed: int = 0,
 ) -> None:
     """Write a policy made from a run's, with frozen weights in bf16, for `load_policy`.
 
@@ -87,6 +88,7 @@ def write_variant(
         tasks: what the policy is for; (): the run's tasks.
         quantized: how to quantize the base whenever the policy is loaded.
         calibration: what calibrated the policy, which is recorded; {}: nothing.
+        healed: steps by which its adapters trained on, which are recorded, too; 0: none.
 
     Raises:
         ValueError: the policy has learned its initial noise, which is that of its weights.
@@ -105,6 +107,7 @@ def write_variant(
     metadata |= {"policy": fields, QUANTIZED: quantized, STEPS: denoise_steps(source)}
     metadata |= {"tasks": list(tasks)} if tasks else {}
     metadata |= {"calibration": dict(calibration)} if calibration else {}
+    metadata |= {"healed": healed} if healed else {}
     if adaptation.methods(policy.model):
         base = native.read_description(source)["base"]
         native.save_adapters(folder, policy.model, base=base, metadata=metadata)

@@ -38,9 +38,9 @@ def recorded_config(run: Path, *, simulated: bool = True) -> Config:
     """
     from lorasp_jax.training import export  # heavy, and finished studies need no run
 
-    recorded = read_json(run / CONFIG_FILE, records.CONFIG)
     finished = read_json(run / "results.json", records.RESULTS)
-    if not recorded or not finished:
+    recorded = finished and read_json(run / CONFIG_FILE, records.CONFIG)  # a base has one, too
+    if not recorded:
         raise ValueError(f"{run} is not a finished run: it needs {CONFIG_FILE} and results.json")
     if simulated and not finished["tasks"]:
         raise ValueError(f"the tasks of {run} cannot be simulated")

@@ -83,6 +83,10 @@ def parse(arguments: Sequence[str], program: str = "python train.py") -> Command
     given |= {"plan"} if known.plan else set()
     if "tasks" in given and config.data.source:
         raise ValueError("--tasks names simulated tasks, but --data.source decides them: drop it")
+    if known.plan and "peft.rank" in given:
+        raise ValueError(
+            "--peft.rank and --plan, which has the ranks, cannot be combined: drop one"
+        )
     return Command(config, known.resume, known.dry_run, known.wandb, known.fit, given)
 
 

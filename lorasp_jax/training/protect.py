@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from flax import nnx
+from rich.console import Console
 from rich.table import Table
 
 from lorasp_jax.adapters import adaptation, paths
@@ -35,9 +36,11 @@ from lorasp_jax.training.run_folder import CONFIG_FILE, read_json, write_json
 FILE = "protected.json"
 """Protected directions in a run's folder: "1" or "0" for each, by path and layer of the stack."""
 LEAST = 0.05
+ROOM = 0.05
+"""Share of free directions below which a run is warned that it has few to learn with."""
 _SAME = (
     *("model.backbone", "model.size", "model.relative_actions", "model.chunk", "model.max_tokens"),
-    *("model.tokenizer", "robot", "image_size", "control_dt", "peft", "targets", "adapt"),
+    *("model.tokenizer", "robot", "image_size", "control_dt", "targets", "adapt", "peft.name"),
 )
 """Settings that both runs share."""
 
@@ -48,16 +51,21 @@ Protected = Mapping[str, np.ndarray]
 def check(config: Config) -> None:
     """Raise ValueError if a run cannot protect the directions of the one that it names.
 
-    That one is not finished, has adapters other than LoRA-SP's or different settings, or trained on
-    several datasets; or the run averages its adapters or has several datasets itself.
+    That one is gone, not finished, has adapters other than LoRA-SP's or different settings, or
+    trained on several datasets; or the run averages its adapters or has several datasets itself.
     """
     folder = Path(config.protect)
+    if not folder.is_dir():
+        raise ValueError(
+            f"there is no folder {folder}, whose run is to be protected: if it has moved, leave a "
+            "link in its place"
+        )
     recorded = recorded_config(folder, simulated=False)
     start.with_kept(config, folder, recorded, (), ())
     others = [x.name for x in rules.methods(recorded) if not isinstance(x, BankMethod)]
     if others:
         raise ValueError(f"{folder} has {others[0]} adapters: only LoRA-SP's can be protected")
-    for name in _SAME:
+    for name in (*_SAME, *(f"peft.{field}" for field in vars(config.peft))):
         own, theirs = map(operator.attrgetter(name), (config, recorded))
         # The robot of a dataset is known later.
         if own != theirs and not (name == "robot" and config.data.source):
@@ -123,8 +131,18 @@ def directions(run: Run, model: Backbone, collect: Callable[..., Demonstrations]
                 share = 1 - rows.mean(1)
                 free.add_row(path, f"{share.mean():.0%}", f"{share.min():.0%}")
             run.console.print(free)
+            _warn_if_full(run.console, found)
             write_json(run.folder / FILE, lines)
     return read(run.folder, model)
+
+
+def _warn_if_full(console: Console, protected: Protected) -> None:
+    """Say so if less than `ROOM` of all directions are free."""
+    free = 1 - np.mean(np.concatenate([each.ravel() for each in protected.values()]))
+    if free < ROOM:
+        text = f"warning: only {free:.1%} of all directions are free to learn with: give the first "
+        text += "run a larger --peft.rank"
+        console.print(text, style="yellow", highlight=False, soft_wrap=True)
 
 
 def in_use(run: Run, model: Backbone, inputs: Processor, earlier: Protected) -> Protected:

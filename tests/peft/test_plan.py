@@ -57,10 +57,29 @@ def test_equal_layers_use_the_budget():
     assert 2.5 * UNIFORM - parameters(ranks) < LARGEST
 
 
-@pytest.mark.parametrize(("budget", "drop"), [(UNIFORM - 1, 0), (10 * UNIFORM, 9)])
-def test_impossible_budgets(budget, drop):
+def test_impossible_budgets():
     with pytest.raises(ValueError, match="is too small for ranks of at least 1: 9 layers"):
-        plan.allocate(IMPORTANCE, SHAPES, budget, most=8, drop=drop)
+        plan.allocate(IMPORTANCE, SHAPES, UNIFORM - 1, most=8)
+
+
+@pytest.mark.parametrize("drop", [-1, 9, 15])
+def test_impossible_drops(drop):
+    with pytest.raises(ValueError, match=f"at least 0 and below 9 layers, got {drop}"):
+        plan.allocate(IMPORTANCE, SHAPES, 10 * UNIFORM, most=8, drop=drop)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -0.5])
+def test_impossible_importance(value):
+    with pytest.raises(ValueError, match=f"finite and at least 0, got {value} for head"):
+        plan.allocate(IMPORTANCE | {"head": (value,)}, SHAPES, 3 * UNIFORM, most=8)
+
+
+def test_a_plan_keeps_its_budget():
+    count = PLAN.count(SHAPES)
+    assert count == parameters(PLAN.ranks)
+    RankPlan("pi0", PLAN.ranks, budget=count).check(SHAPES)
+    with pytest.raises(ValueError, match=f"has {count:,} parameters, more than its budget of"):
+        RankPlan("pi0", PLAN.ranks, budget=count - 1).check(SHAPES)
 
 
 def test_a_shuffled_plan_has_as_many_parameters():
@@ -92,7 +111,7 @@ GOOD = {"format": plan.FORMAT, "version": 1, "backbone": "pi0", "ranks": {"head"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "is damaged"),
+        ("{", r"plan.json is invalid \("),
         ("[]", "it must be an object"),
         (json.dumps(GOOD | {"version": 2}), "must be a lorasp_jax plan of version 1"),
         (json.dumps({"ranks": {}}), "lacks 'format'"),

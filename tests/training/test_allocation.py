@@ -23,8 +23,9 @@ from lorasp_jax.report.html import write_report
 from lorasp_jax.training import allocation, export, loop, rules
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.finished_run import recorded_config
-from lorasp_jax.training.overrides import Command, override
+from lorasp_jax.training.overrides import Command, override, parse
 from lorasp_jax.training.run_folder import open_run, read_json, to_json, write_json
+from tests import ROOT
 from tests.models.random_models import random_backbone
 from tests.peft.test_plan import parameters
 from tests.runs import CONFIG, RESULTS, Terminate, finish_with_weights, leaves, make_run
@@ -103,6 +104,16 @@ def test_configs_that_cannot_have_a_plan(changes, message):
         configured(**changes)
 
 
+def test_the_command_line_takes_ranks_from_one_place(tmp_path):
+    random_plan("pi0").save(tmp_path / "plan.json")
+    options = ["--config", str(ROOT / "configs/multitask.py"), "--scale", "smoke"]
+    options += ["--method", "lora", "--plan", str(tmp_path / "plan.json")]
+    assert parse(options).config.plan == random_plan("pi0")
+    for text in (["--peft.rank", "16"], ["--peft.rank=16"]):
+        with pytest.raises(ValueError, match=r"--peft\.rank and --plan, .* cannot be combined"):
+            parse([*options, *text])
+
+
 def test_plans_for_other_targets():
     config = configured(targets=("q_proj",))
     model = nnx.eval_shape(lambda: DUMMIES["pi0"].create(nnx.Rngs(0)))
@@ -163,13 +174,21 @@ def test_a_plan_follows_active_ranks(finished):
 
 
 def test_the_command(finished, tmp_path, capsys):
-    out = tmp_path / "plan.json"
+    out = tmp_path / "new" / "plan.json"
     arguments = [str(finished / "sp"), "--out", str(out)]
     assert allocate.main([*arguments, "--rank", "2", "--drop", "1"]) == 0
     assert plan.read(out) == allocation.from_run(finished / "sp", rank=2, drop=1)
-    assert f"written: {out}, ranks from 0 to " in capsys.readouterr().out
+    said, made = capsys.readouterr().out, plan.read(out)
+    assert f"written: {out}, ranks from 0 to " in said
+    count = parameters(made.ranks, base_shapes("pi0"))
+    assert f", {count:,} of at most {made.budget:,} parameters" in said
     assert allocate.main(arguments) == 2
     assert "exists already: choose another --out" in capsys.readouterr().err
+    out.unlink()
+    assert allocate.main([*arguments, "--drop", "0"]) == 0
+    out.unlink()
+    assert allocate.main([*arguments, "--drop", "-1"]) == 2
+    assert "drop must be at least 0" in capsys.readouterr().err
 
 
 def test_runs_without_a_plan(finished, tmp_path):
@@ -182,6 +201,9 @@ def test_runs_without_a_plan(finished, tmp_path):
         allocation.from_run(tmp_path / "old")
     with pytest.raises(ValueError, match="was trained with lora: a plan is made from the active"):
         allocation.from_run(finish_with_weights(tmp_path / "lora"))
+    (tmp_path / "old" / "results.json").unlink()  # as in a saved form
+    with pytest.raises(ValueError, match=r"old is not a finished run: it needs results\.json"):
+        allocation.from_run(tmp_path / "old")
     with pytest.raises(ValueError, match="there is no folder"):
         allocation.from_run(tmp_path / "nothing")
 

@@ -16,7 +16,7 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.cli.train import _resolved
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
-from lorasp_jax.peft import LoRA, LoRASP
+from lorasp_jax.peft import LoRA, LoRASP, LoRASPRelease
 from lorasp_jax.training import early, export, loop, program, protect, setup
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.export import load_policy
@@ -151,7 +151,8 @@ def prepare(config, folder, collect=collect, **options):
     return run, console.file.getvalue()
 
 
-def test_a_run_protects_what_another_uses(settings, finished, tmp_path):
+def test_a_run_protects_what_another_uses(settings, finished, tmp_path, monkeypatch):
+    monkeypatch.setattr(protect, "ROOM", 1.0)  # all banks count as full
     run, said = prepare(settings, tmp_path / "b")
     start = load_policy(finished)
     before = leaves(nnx.state(start.model, adaptation.AdapterParam))
@@ -163,6 +164,7 @@ def test_a_run_protects_what_another_uses(settings, finished, tmp_path):
     assert {*protected} == {*adaptation.methods(run.policy.model)}
     assert 0 < np.concatenate([x.ravel() for x in protected.values()]).mean() < 1
     assert "free directions" in said
+    assert "warning: only" in said
 
     def only_own(config, *rest):
         assert config.tasks == ("pour",), "it counts again"
@@ -218,10 +220,12 @@ def test_the_program_is_compiled_early(settings, tmp_path, monkeypatch):
     ("changes", "message"),
     [
         ({"robot": "panda"}, r"robot must be that of .*/a, whose .*: piper, got panda"),
-        ({"peft": LoRASP(rank=4, hidden_width=8)}, r"peft must be that of .*rank=8.*rank=4"),
+        ({"peft": LoRASP(rank=4, hidden_width=8)}, r"peft\.rank must be that of .*: 8, got 4"),
+        ({"peft": LoRASPRelease(rank=8)}, r"peft\.name must .*: lora_sp, got lora_sp_release"),
         ({"targets": ("q_proj",)}, "targets must be that of"),
         ({"optim": dataclasses.replace(CONFIG.optim, ema=0.9)}, "--optim.ema cannot be combined"),
-        ({"protect": "missing"}, "missing is not a finished run"),
+        ({"protect": "missing"}, "there is no folder missing, .* leave a link in its place"),
+        ({"protect": str(ROOT / "assets/pi0_nano")}, "pi0_nano is not a finished run"),
     ],
 )
 def test_bad_settings_are_refused_in_a_sentence(settings, changes, message):
@@ -233,6 +237,15 @@ def test_only_lora_sp_has_directions(settings, tmp_path):
     lora = finish_with_weights(tmp_path / "lora")
     with pytest.raises(ValueError, match="lora has lora adapters: only LoRA-SP's can be protected"):
         protect.check(dataclasses.replace(settings, protect=str(lora), peft=LoRA(rank=4)))
+
+
+@pytest.mark.parametrize("free", [0, 3, 5])
+def test_few_free_directions_are_told(tmp_path, free):
+    rows = np.arange(100).reshape(2, 50) >= free
+    console = Console(file=io.StringIO(), width=40)
+    protect._warn_if_full(console, {"a": rows[:1], "b": rows[1:]})
+    expected = f"warning: only {free}.0% of all directions are free" if free < 5 else ""
+    assert console.file.getvalue().partition(" to learn")[0] == expected
 
 
 def test_other_kinds_of_runs_refuse_it(finished):

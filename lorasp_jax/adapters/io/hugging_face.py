@@ -92,8 +92,9 @@ def load_peft(
         folder: local folder with adapter_config.json and adapter_model.safetensors, or a Hub
             repository hf://owner/name, from which only these two files are downloaded.
         model: not modified; its adapters on other layers are kept.
-        names: function (path, index) -> module name; index is the position in a scanned stack, or
-            (). By default, "a/0/b" becomes "a.0.b".
+        names: function (path, index) -> PEFT's module name. The path is "/"-joined; the index is a
+            tuple with the position along each axis of a scanned stack, () for a layer in none. By
+            default, "a/0/b" becomes "a.0.b", and stacks are refused.
         einsums: as for `adapt`.
 
     Raises:
@@ -209,7 +210,8 @@ def save_peft(
         folder: created if absent; an adapter in it is replaced.
         model: adapted with LoRA, AdaLoRA or both, or with DoRA only. Fully fine-tuned parameters
             become PEFT's `bias` and `modules_to_save`.
-        names: as for `load_peft`.
+        names: as for `load_peft`; called with ("blocks/q_proj", (0,)), ("blocks/q_proj", (1,)), ...
+            for a stack, and with ("head", ()) for a layer in none.
         base: value of base_model_name_or_path.
 
     Raises:

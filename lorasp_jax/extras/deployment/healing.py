@@ -47,9 +47,8 @@ def check(run: Path, task: str = "") -> Config:
         "ada_lora has spent its rank budget": any(
             isinstance(method, AdaLoRA) for method in rules.methods(config)
         ),
-        "some of its demonstrations are gone": not (
-            config.data.source or are_cached(with_replayed(config), run)
-        ),
+        f"some of its demonstrations are gone from {run / 'cache'}: put them back, or leave out "
+        "--heal": not (config.data.source or are_cached(with_replayed(config), run)),
     }
     if reason := next((text for text, applies in reasons.items() if applies), ""):
         raise ValueError(f"{run} cannot be healed: {reason}")

@@ -176,8 +176,9 @@ def save(run: Path, name: str, out: Path, heal: int = 0, task: str = "") -> dict
     tasks cannot be simulated, the run's recordings calibrate, and `task` may be an instruction.
 
     Raises:
-        ValueError: the variant is unknown, the folder exists, the run cannot be healed, or its data
-            are gone; see also `dataset.limit` and `healing.check_datasets`.
+        ValueError: the variant is unknown, the folder exists, the run cannot be healed, its data
+            are gone, or they are not all that a calibrated form must keep, since the run protects
+            another's; see also `dataset.limit` and `healing.check_datasets`.
     """
     form, base = check(name, run).split("-")
     check_local(out)
@@ -185,8 +186,14 @@ def save(run: Path, name: str, out: Path, heal: int = 0, task: str = "") -> dict
         raise ValueError(f"{out} exists already: choose another --out")
     if heal:
         healing.check(run, task)
+    config = recorded_config(run, simulated=False)
+    if config.protect and form != "whole" and not task:
+        raise ValueError(
+            f"{run} also knows what {config.protect} learned, but its own data alone would "
+            f"calibrate a {form} form: save a whole one, or one for a --task of its own"
+        )
     cache.enable()
-    policy, config = export.load_policy(run), recorded_config(run, simulated=False)
+    policy = export.load_policy(run)
     tasks, data, phrases = (task,) if task else (), {}, ()
     if not (simulated := _is_simulated(run)):
         healing.check_datasets(run)
@@ -203,7 +210,7 @@ def save(run: Path, name: str, out: Path, heal: int = 0, task: str = "") -> dict
     deployed = in_form(policy, form, data, train)
     if task:
         deployed = _with_instructions(deployed, phrases)
-    more: Any = {"quantized": BASES[base], "calibration": calibration}
+    more: Any = {"quantized": BASES[base], "calibration": calibration, "healed": heal}
     export.write_variant(out, deployed, run, tasks=tasks, **more)
     return calibration
 

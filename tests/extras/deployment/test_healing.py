@@ -98,6 +98,7 @@ def test_a_healed_variant_is_saved_and_served(run, tmp_path, capsys, monkeypatch
     arguments = [str(run), "--save", name, "--out", str(out), "--heal", "2"]
     assert command.main(arguments) == 0
     assert capsys.readouterr().out.startswith(f"written: {out}, calibrated on ")
+    assert export.describe(out)["healed"] == 2
     served = loading.load_run(str(out)).policy
     assert bool(adaptation.methods(served.model)) == (form != "merged")
     expected = actions(variants.on_base(made[0], base))
@@ -132,6 +133,7 @@ def test_missing_demonstrations_are_not_collected(run, tmp_path, capsys, monkeyp
     files, out = {path: path.stat().st_mtime_ns for path in changed.rglob("*")}, tmp_path / "policy"
     error = refuse(capsys, changed, "--save", "half-bf16", "--out", out, "--heal", 1)
     assert "run cannot be healed: some of its demonstrations are gone" in error
+    assert f"gone from {changed / 'cache'}: put them back, or leave out --heal" in error
     with pytest.raises(ValueError, match="some of its demonstrations are gone"):
         healing.heal(export.load_policy(run), changed, 1)
     assert {path: path.stat().st_mtime_ns for path in changed.rglob("*")} == files

@@ -183,6 +183,18 @@ def test_what_a_run_replays_must_be_there_too(run, dummy_base, tmp_path):
     assert healing.check(changed, "pour").data.replay == 0.1  # a part of the same dataset
 
 
+def test_forms_keep_what_a_run_protects(run, tmp_path, capsys):
+    """Its own data would calibrate a form that says it knows both."""
+    changed, config = shutil.copytree(run, tmp_path / "run"), read_json(run / "config.json")
+    write_json(changed / "config.json", config | {"protect": "runs/first"})
+    error = refuse(capsys, changed, "--save", "half-bf16", "--out", tmp_path / "half")
+    assert f"{changed} also knows what runs/first learned, but its own data alone would" in error
+    assert not (tmp_path / "half").exists()
+    save(changed, tmp_path / "pour", "half-bf16", "pour")
+    assert export.load_policy(tmp_path / "pour").processor.prompts.instructions == TASKS["pour"]
+    assert command.main([str(changed), "--save", "whole-bf16", "--out", str(tmp_path / "a")]) == 0
+
+
 def test_variants_are_measured_on_one_task(run, capsys):
     words = [str(run), "--variants", "lora-nf4", "--episodes", "4"]
     assert command.main([*words, "--task", "pour"]) == 0
@@ -269,7 +281,7 @@ def test_the_form_as_trained_needs_no_data(recorded, tmp_path, capsys):
     write_json(changed / "config.json", gone)
     assert command.main([str(changed), "--save", "whole-int8", "--out", str(tmp_path / "a")]) == 0
     assert capsys.readouterr().out == f"written: {tmp_path / 'a'}\n"
-    assert "calibration" not in export.describe(tmp_path / "a")
+    assert not {"calibration", "healed"} & export.describe(tmp_path / "a").keys()
     error = refuse(capsys, changed, "--save", "half-bf16", "--out", tmp_path / "b")
     assert f"the recordings of {changed} cannot be read: gone does not exist" in error
     error = refuse(capsys, changed, "--save", "half-bf16", "--out", tmp_path / "b", "--task", "x")
