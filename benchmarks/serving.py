@@ -35,8 +35,13 @@ class Waiting(ServedPolicies):
 
     def __init__(self, image_size: int, cameras: int, seconds: float) -> None:
         names = tuple(f"camera{i}" for i in range(cameras))
-        self.sizes, self.metadata = (1, 2, 4, 8), {}
-        self.spec, self._seconds = PolicySpec(names, image_size, 7, 50), seconds
+        self.sizes, self._seconds = (1, 2, 4, 8), seconds
+        self.spec = PolicySpec(names, image_size, 7, 50)
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """No robot."""
+        return {}
 
     @property
     def instructions(self) -> dict[str, tuple[str, ...]]:
