@@ -36,6 +36,7 @@ from lorasp_jax.training.run_folder import CONFIG_FILE, read_json, write_json
 FILE = "protected.json"
 """Protected directions in a run's folder: "1" or "0" for each, by path and layer of the stack."""
 LEAST = 0.05
+"""Share of tokens for which a direction in use is active, at least."""
 ROOM = 0.05
 """Share of free directions below which a run is warned that it has few to learn with."""
 _SAME = (
