@@ -61,7 +61,7 @@ class Backbone(nnx.Module):
     """The language model, with stacked `blocks`."""
     action: Any
     """The action expert, with stacked `blocks`."""
-    noise_actor: nnx.Param | None = None
+    noise_actor: nnx.Param[Any] | None = None
     """The `NoiseActor` that chooses the initial noise of the flow; None: it is standard normal."""
     flow_layers: ClassVar[str] = "^(state_proj|action|time_mlp)"
     """Pattern of the paths of all layers that `run_suffix` uses."""

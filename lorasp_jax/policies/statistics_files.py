@@ -37,7 +37,7 @@ from lorasp_jax.policies.statistics import NAMES, Statistics, validate
 OURS, OPENPI, DATASET = "statistics.json", "norm_stats.json", "stats.json"
 EPISODES = "episodes_stats.jsonl"
 PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
-PIPELINE = {"steps": [{"registry_name?": str, "config?": {}, "state_file?": str}]}
+PIPELINE: dict[str, Any] = {"steps": [{"registry_name?": str, "config?": {}, "state_file?": str}]}
 """Schema of these, see `json_values.check`."""
 TENSOR = re.compile(
     r"(?:(?:un)?normalize_\w+\.)?(?:(?:(?P<dataset>.+)[._])?buffer[._])?"

@@ -75,7 +75,8 @@ def test_a_lerobot_dataset(version, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     source = str(ROOT / "tests" / "golden" / f"lerobot_{version}" / "dataset")
     options = ["--model.max-tokens", "16", "--data.source", source]
-    assert train.main([*COMMAND, *options, "--optim.steps", "20"]) == 0
+    command = [x for x in COMMAND if x not in ("--tasks", "press")]
+    assert train.main([*command, *options, "--optim.steps", "20"]) == 0
     first, *_, last = read_metrics(Path("runs/multitask"))
     assert last["task"] < first["task"]
     for name in ("report.html", "adapter.safetensors", "cache/steps/cache.json"):

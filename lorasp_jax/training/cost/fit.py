@@ -28,7 +28,7 @@ from lorasp_jax.training.cost.dry_run import plan_step, planned_bytes
 from lorasp_jax.training.cost.preflight import GIB, REMATS
 from lorasp_jax.training.run_folder import CONFIG_FILE, read_json
 
-UNITS = {"GB": 1e9, "GiB": GIB}
+UNITS: dict[str, float] = {"GB": 1e9, "GiB": GIB}
 CONTEXT = 0.75 * GIB
 """Memory that CUDA, cuBLAS and cuDNN take outside of JAX's allocator; 0.62 GiB on an H200."""
 FILLED = 0.93
@@ -44,7 +44,7 @@ take 86, 107 and 147 ms in 1, 2 and 4 parts; in bf16, 0.4 for pi0.5 and 1.5 for 
 BASE_COST = {"": 1.0, "float8": 1.2, "int8": 1.25, "nf4": 1.5}
 """Time of a step by how the base is stored, which is 0.91 in float8 (pi0) and 1.08 in nf4 (pi0.5),
 plus what rounding it counts: 0.3 in 8 bits, 0.4 in 4."""
-DEFAULTS = {
+DEFAULTS: dict[str, Any] = {
     "optim.accumulate": 1,
     "model.remat": "auto",
     "model.param_dtype": "float32",
