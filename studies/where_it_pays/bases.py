@@ -81,5 +81,6 @@ def _policy(
         return replace(found, model=replace(found.model, checkpoint=where, size=size))
 
     own = names.on_base(backbone, kind, method, name)
-    options: dict[str, Any] = {"evaluate": judge, "source": source, "pool": pool}
+    evaluate = judge if pilots else functools.partial(judge, scenes=("recorded",))
+    options: dict[str, Any] = {"evaluate": evaluate, "source": source, "pool": pool}
     return Cell(own, config, pilots, f"{backbone}/{kind}/{method}", **options)

@@ -216,6 +216,12 @@ def test_the_recipes_differ_in_one_thing():
         assert count == (name != "lora_sp")
 
 
+def test_pilots_decide_by_success_as_recorded():
+    pilots = [cell for cell in STUDY.cells if "/pilot/" in cell.name]
+    assert {cell.name.split("/")[1] for cell in pilots} == {"pilot", "medium"}
+    assert all(cell.evaluate.keywords == {"scenes": ("recorded",)} for cell in pilots)
+
+
 def test_a_recipe_with_lora_in_a_part_takes_the_lower_rate(results):
     for rate, share in (("0.001", 0.9), ("0.003", 0.1)):
         name = f"pi0/pilot/lora_r64/{rate}"
