@@ -75,8 +75,7 @@ def write_variant(
     *,
     tasks: Sequence[str] = (),
     quantized: Kind | None = None,
-    calibration: Mapping[str, Any] = MappingProxyType({}),
-    healed: int = 0,
+    record: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
     """Write a policy made from a run's, with frozen weights in bf16, for `load_policy`.
 
@@ -87,8 +86,7 @@ def write_variant(
         source: folder of the run.
         tasks: what the policy is for; (): the run's tasks.
         quantized: how to quantize the base whenever the policy is loaded.
-        calibration: what calibrated the policy, which is recorded; {}: nothing.
-        healed: steps by which its adapters trained on, which are recorded, too; 0: none.
+        record: how the policy was made, which its metadata then say.
 
     Raises:
         ValueError: the policy has learned its initial noise, which is that of its weights.
@@ -106,8 +104,7 @@ def write_variant(
     }
     metadata |= {"policy": fields, QUANTIZED: quantized, STEPS: denoise_steps(source)}
     metadata |= {"tasks": list(tasks)} if tasks else {}
-    metadata |= {"calibration": dict(calibration)} if calibration else {}
-    metadata |= {"healed": healed} if healed else {}
+    metadata |= record
     if adaptation.methods(policy.model):
         base = native.read_description(source)["base"]
         native.save_adapters(folder, policy.model, base=base, metadata=metadata)

@@ -37,11 +37,12 @@ def judge(run: Run, kind: str, order: int, episodes: int) -> dict[str, Any]:
     source = page.together(run.config.model.backbone, method, rank, run.config.seed)
     cache = Cache(run.folder.parents[3] / source / CACHE)
     cache.verify_images()
+    phrases = cache.phrases
 
     def demonstrate(stage: Run, shares: Mapping[str, float]) -> Run:
         left_out = {*range(len(cache))}
         for task, share in shares.items():
-            own = np.flatnonzero(cache.phrases == INSTRUCTIONS[task])
+            own = np.flatnonzero(phrases == INSTRUCTIONS[task])
             left_out -= {*own[: math.ceil(share * len(own))].tolist()}
         return dataclasses.replace(stage, dataset=dataset.without(cache.steps, left_out))
 

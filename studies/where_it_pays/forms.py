@@ -31,7 +31,7 @@ def cells(backbone: str, seed: int, pool: int, steps: int) -> Iterator[Derived]:
     """Yield the forms of a seed; healed ones have trained on for some steps."""
     for form, (method, _) in page.FORMS.items():
         for healed in (0, steps):
-            if form in (page.HEALED if not healed else page.MADE):
+            if form in (page.MADE if healed else page.HEALED):
                 continue
             evaluate = functools.partial(judge, form=form, steps=healed, pool=pool)
             source = names.cell(backbone, method, names.WIDE, seed)

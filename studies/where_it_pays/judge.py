@@ -29,9 +29,15 @@ def judge(run: Run, scenes: Iterable[str] = SCENES) -> dict[str, Any]:
     ranks, trained = training_ranks(run), {"trainable_parameters": run.parameters[0]}
     if isinstance(run.config.peft, LoRASP) and not ranks:
         raise ValueError("its active ranks are lost with the process that trained it: delete it")
-    shown = dataclasses.replace(run)
-    shown.policy = padded(run.policy, run.config.targets)
+    shown = with_policy(run, run.policy)
     return judge_scenes(shown, scenes) | trained | {"layer_active_rank": ranks}
+
+
+def with_policy(run: Run, policy: Policy) -> Run:
+    """Return a copy of a run that has a policy, `padded`."""
+    shown = dataclasses.replace(run)
+    shown.policy = padded(policy, run.config.targets)
+    return shown
 
 
 def padded(policy: Policy, targets: Sequence[str]) -> Policy:

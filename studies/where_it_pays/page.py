@@ -18,7 +18,6 @@ from studies.few.page import SCENES, outcomes
 from studies.where_it_pays import names, sequence_page
 from studies.where_it_pays.names import METHODS, SEEDS, WIDE, cell
 
-CONTRASTED = ("lora_sp", "lora")
 COLORS = {"lora": "#4269d0", "lora_sp": "#ff725c"}
 RANKS = (4, 8, 16, 32, 64, 128)
 BUDGETS = (8, 16, 32)
@@ -169,17 +168,17 @@ def _contrast_table(results: Results) -> str:
 
 def _contrasts(backbone: str) -> dict[str, tuple[Callable[..., Any], list[list[str]]]]:
     """Return statistics by label, and the names by seed of the policies that they compare."""
-    own, lora = ([[cell(backbone, m, r, s) for s in SEEDS] for r in RANKS] for m in CONTRASTED)
-    on = [_policies_on(backbone, kind, m) for kind in ("second", "first") for m in CONTRASTED]
-    rank = dict(zip(RANKS, range(len(RANKS)), strict=True))
-    wide = slice(rank[16], None)
+    both = "lora_sp", "lora"
+    own, lora = ({r: [cell(backbone, m, r, s) for s in SEEDS] for r in RANKS} for m in both)
+    on = [_policies_on(backbone, kind, m) for kind in ("second", "first") for m in both]
+    wide, lora_wide = ([by_rank[r] for r in RANKS if r >= 16] for by_rank in (own, lora))
     return {
-        "LoRA, highest minus lowest success, R = 16 to 128": (statistics.span, lora[wide]),
-        "LoRA-SP, the same": (statistics.span, own[wide]),
-        "the latter minus the former": (statistics.span_minus, [*own[wide], *lora[wide]]),
+        "LoRA, highest minus lowest success, R = 16 to 128": (statistics.span, lora_wide),
+        "LoRA-SP, the same": (statistics.span, wide),
+        "the latter minus the former": (statistics.span_minus, [*wide, *lora_wide]),
         "LoRA-SP, R = 16, minus LoRA, r = 32, which has as many parameters": (
             statistics.minus,
-            [own[rank[16]], lora[rank[32]]],
+            [own[16], lora[32]],
         ),
         "LoRA-SP minus LoRA, R = 64, on the second base, minus that on the first": (
             statistics.interaction,

@@ -60,14 +60,16 @@ def cells(
         pilots: names of the policies that decide the rate, by method.
     """
     for name, (method, changes) in RECIPES.items():
+        tried = [pilots[x] for x in (("lora_sp", "lora") if "adapt" in changes else ("lora_sp",))]
 
-        def config(results: Results, method: Method = method, changes: Any = changes) -> Config:
-            both = (best_rate(results, pilots[name]) for name in ("lora_sp", "lora"))
-            rate = min(both) if "adapt" in changes else next(both)
+        def config(
+            results: Results, method: Method = method, changes: Any = changes, tried: Any = tried
+        ) -> Config:
+            rate = min(best_rate(results, each) for each in tried)
             return make(method, seed=seed, rate=rate, **changes)
 
         own, group = names.recipe(backbone, name, seed), f"{backbone}/{name}"
-        after = (*pilots["lora_sp"], *(pilots["lora"] if "adapt" in changes else ()))
+        after = tuple(pilot for each in tried for pilot in each)
         yield Cell(own, config, after, group, evaluate=judge_scenes, pool=pool)
     source = names.recipe(backbone, "lora_sp", seed)
     for name in CHANGES:

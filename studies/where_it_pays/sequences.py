@@ -23,7 +23,7 @@ from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Run
 from studies.few import judge as scenes
 from studies.where_it_pays import names, page
-from studies.where_it_pays.judge import padded
+from studies.where_it_pays.judge import with_policy
 from studies.where_it_pays.sequence_page import KINDS, SINGLE, Sequences
 
 RATE = 1e-3
@@ -53,13 +53,13 @@ def derived(
     """
     shared = settings | {"replayed": REPLAYED, "kept": KEPT, "least": protect.LEAST}
     for kind in sequences.kinds:
-        shared |= {"rate": None if kind in SINGLE else RATE}
         method, rank, *_ = KINDS[kind]
         source = sequences.together(backbone, method, rank, seed)
         for order, tasks in enumerate(sequences.of_kind(kind)):
             own = functools.partial(evaluate, kind=kind, order=order, **settings)
             name = names.sequence(backbone, kind, order, seed)
-            recorded = {"kind": kind, "tasks": list(tasks), **shared}
+            rate = None if kind in SINGLE else RATE
+            recorded = {"kind": kind, "tasks": list(tasks), "rate": rate, **shared}
             yield Derived(name, source, settings=recorded, evaluate=own)
 
 
@@ -73,9 +73,7 @@ def judge(run: Run, kind: str, order: int, pool: int) -> dict[str, Any]:
         return dataclasses.replace(stage, episodes=some(every, counts))
 
     def success(policy: Policy, shown: Sequence[str]) -> dict[str, str]:
-        learner = dataclasses.replace(run)
-        learner.policy = padded(policy, run.config.targets)
-        return scenes.outcomes(learner, "recorded", shown)
+        return scenes.outcomes(with_policy(run, policy), "recorded", shown)
 
     return judged(run, kind, tasks, demonstrate, success)
 

@@ -39,6 +39,8 @@ MAKE: Mapping[str, Callable[[int], Method]] = {
     "eva": lambda rank: LoRA(rank=rank, initialization="eva"),
 }
 """Method by its (mean) rank."""
+TUNED_AS = {"lora_sp": "lora_sp", page.HALF: "lora_sp", "ada_lora": "ada_lora"}
+"""Method -> the one whose pilots decide its rate, if that is not LoRA."""
 
 
 @dataclass(frozen=True)
@@ -162,10 +164,8 @@ def _allocated(scale: Scale, backbone: str, seed: int) -> Iterator[Cell | Derive
 
 def _cell(scale: Scale, backbone: str, method: str, rank: int, seed: int, source: str = "") -> Cell:
     """Return a policy; the active ranks of `source` decide the ranks of its layers, if given."""
-    tuned = {page.HALF: "lora_sp"}.get(method, method if method in MAKE else "lora")
-    pilots = names.pilots(backbone, "lora" if tuned == "eva" else tuned, rank)
-    if method == "ada_lora":
-        pilots = names.pilots(backbone, method, _middle(scale))
+    at = _middle(scale) if method == "ada_lora" else rank
+    pilots = names.pilots(backbone, TUNED_AS.get(method, "lora"), at)
 
     def config(results: Results) -> Config:
         made = MAKE.get(method, MAKE["lora"])(rank)

@@ -210,8 +210,8 @@ def save(run: Path, name: str, out: Path, heal: int = 0, task: str = "") -> dict
     deployed = in_form(policy, form, data, train)
     if task:
         deployed = _with_instructions(deployed, phrases)
-    more: Any = {"quantized": BASES[base], "calibration": calibration, "healed": heal}
-    export.write_variant(out, deployed, run, tasks=tasks, **more)
+    made = {key: x for key, x in (("calibration", calibration), ("healed", heal)) if x}
+    export.write_variant(out, deployed, run, tasks=tasks, quantized=BASES[base], record=made)
     return calibration
 
 

@@ -93,8 +93,9 @@ def _concatenated(
     q: jax.Array, own: KeysValues, cache: KeysValues | None, mask: jax.Array | None
 ) -> jax.Array:
     """`attention` with the cached keys and values in front of the queries' own."""
-    join = lambda *arrays: jnp.concatenate(arrays, axis=1)  # noqa: E731
-    k, v = own if cache is None else map(join, cache, own)
+    k, v = own
+    if cache is not None:
+        k, v = (jnp.concatenate(pair, axis=1) for pair in zip(cache, own, strict=True))
     batch, tokens, heads, size = q.shape
     if _use_cudnn(q, k, mask):
         return _cudnn_attention(q, k, v, mask)[:, :tokens].reshape(batch, tokens, heads * size)
