@@ -7,9 +7,10 @@ and a killed one loses at most the steps since its last checkpoint.
 
 import contextlib
 import functools
+import itertools
 import time
 import traceback
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,27 +68,59 @@ def work(
 ) -> None:
     """Run the named cells, in the study's order, until none of them can run.
 
-    After a cell come the others of its group, whose programs are compiled. While another worker
-    runs a cell, this one waits: the cell may enable others, or be left behind.
+    Each worker begins with a group of its own, whose programs no other compiles, and goes on with
+    the others of its group; it helps with theirs when no group is left. While another worker runs
+    a cell, this one waits: the cell may enable others, or be left behind.
     """
     group_of = {cell.name: group for group, cells in study.groups.items() for cell in cells}
     last = ""
-    while True:
-        statuses = progress.read(study, folder)
-        runnable = [
-            cell.name
-            for cell in study.cells
-            if cell.name in names and statuses[cell.name].state is CellState.RUNNABLE
-        ]
-        if not runnable:
-            return
-        runnable.sort(key=lambda name: group_of[name] != group_of.get(last))
-        run = functools.partial(_run_claimed, study, folder, run_cell, say, set())
-        # The best cell that is free; then look again, because it may have enabled better ones.
-        ran = next((name for name in runnable if run(name)), "")
-        if not ran:
-            time.sleep(POLL)
-        last = ran or last
+    with contextlib.closing(_Group(folder)) as own:
+        while True:
+            statuses = progress.read(study, folder)
+            runnable = [
+                cell.name
+                for cell in study.cells
+                if cell.name in names and statuses[cell.name].state is CellState.RUNNABLE
+            ]
+            if not runnable:
+                return
+            run = functools.partial(_run_claimed, study, folder, run_cell, say, set())
+            shared = sorted(runnable, key=lambda name: group_of[name] != group_of.get(last))
+            tried = itertools.chain(own.cells(runnable, group_of), shared)
+            # The best cell that is free; then look again: it may have enabled better ones.
+            ran = next((name for name in tried if run(name)), "")
+            if not ran:
+                time.sleep(POLL)
+            last = ran or last
+
+
+class _Group:
+    """The group that a worker claims for itself, "" at first."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._name, self._claim = folder, "", contextlib.ExitStack()
+
+    def cells(self, runnable: Iterable[str], group_of: Mapping[str, str]) -> Iterator[str]:
+        """Yield the runnable cells of this group, then claim others in turn and yield theirs."""
+        found: dict[str, list[str]] = {}
+        for name in runnable:
+            found.setdefault(group_of[name], []).append(name)
+        for group in sorted(found, key=lambda group: group != self._name):
+            if group == self._name or self._claimed(group):
+                yield from found[group]
+
+    def _claimed(self, group: str) -> bool:
+        """Claim a group instead of this one; return False if another worker has it."""
+        claim = contextlib.ExitStack()
+        if not claim.enter_context(_claimed(self._folder, f".groups/{group}")):
+            return False
+        self.close()
+        self._name, self._claim = group, claim
+        return True
+
+    def close(self) -> None:
+        """Leave the group to others."""
+        self._claim.close()
 
 
 def _run_claimed(

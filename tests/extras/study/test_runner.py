@@ -79,7 +79,7 @@ def test_several_workers_run_every_cell_once(folder):
     assert set(states(folder).values()) == {CellState.FINISHED}
 
 
-def test_workers_share_a_group_that_others_wait_for(folder):
+def test_workers_share_a_group_when_no_other_is_left(folder):
     both = threading.Barrier(2, timeout=60)
 
     def meet(job):
@@ -89,8 +89,24 @@ def test_workers_share_a_group_that_others_wait_for(folder):
         return result
 
     work_together(2, folder, NAMES, meet)
-    assert {*ran(folder)[:2]} == {"sp/s0", "sp/s1"}
+    assert {*ran(folder)[:3]} == {"sp/s0", "sp/s1", "lr"}
     assert set(states(folder).values()) == {CellState.FINISHED}
+
+
+def test_each_worker_begins_with_a_group_of_its_own(folder):
+    names = [f"{group}/{i}" for group in "abc" for i in range(3)]
+    cells = [dataclasses.replace(study()["lr"], name=name, group=name[0]) for name in names]
+    barrier, first = threading.Barrier(3, timeout=60), {}
+
+    def meet(job):
+        if threading.get_ident() not in first:
+            first[threading.get_ident()] = job.cell.name
+            barrier.wait()
+        return run(job)
+
+    work_together(3, folder, names, meet, dataclasses.replace(study(), cells=tuple(cells)))
+    assert sorted(ran(folder)) == names
+    assert sorted(first.values()) == ["a/0", "b/0", "c/0"]
 
 
 def test_a_worker_goes_on_with_the_group_that_it_has_compiled(folder):
