@@ -12,7 +12,7 @@ from flax.typing import Dtype
 
 from lorasp_jax.dense import validate
 from lorasp_jax.kernels.frozen_matmul import frozen_matmul
-from lorasp_jax.kernels.low_rank_matmul import Bottleneck, LowRankLayer, low_rank_matmul
+from lorasp_jax.kernels.low_rank_matmul import Bottleneck, LowRankLayer, Mask, low_rank_matmul
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import Aux, Method
 from lorasp_jax.peft.fields import short
@@ -37,7 +37,7 @@ def dense(
     method: Method | None = None,
     dropout_key: jax.Array | None = None,
     *,
-    token_mask: jax.Array | None = None,
+    token_mask: Mask = None,
 ) -> tuple[jax.Array, Aux]:
     """x @ kernel + bias, with an optional adapter.
 
@@ -64,9 +64,7 @@ def dense(
     return apply_layer(layer, x, token_mask)
 
 
-def apply_layer(
-    layer: DenseLayer, x: jax.Array, token_mask: jax.Array | None
-) -> tuple[jax.Array, Aux]:
+def apply_layer(layer: DenseLayer, x: jax.Array, token_mask: Mask) -> tuple[jax.Array, Aux]:
     """Compute `dense` without checks."""
     matrix, method = _matrix(layer), layer.method
     if method is None or layer.params is None:
@@ -81,7 +79,7 @@ def apply_layer(
 
 
 def dense_shared_input(
-    x: jax.Array, layers: Sequence[DenseLayer], *, token_mask: jax.Array | None = None
+    x: jax.Array, layers: Sequence[DenseLayer], *, token_mask: Mask = None
 ) -> list[tuple[jax.Array, Aux]]:
     """`dense` for several layers with a shared input, without its checks.
 
@@ -90,7 +88,6 @@ def dense_shared_input(
     Args:
         x: [...tokens, I], in the dtype to compute in.
         layers: arguments of `dense` for each layer.
-        token_mask: bool [...tokens].
 
     Returns:
         y and aux of each layer.
@@ -135,11 +132,7 @@ def _with_bias(
 
 
 def cast_input(
-    dtype: Dtype | None,
-    x: Any,
-    kernel: Any,
-    token_mask: Any = None,
-    width: int | None = None,
+    dtype: Dtype | None, x: Any, kernel: Any, token_mask: Any = None, width: int | None = None
 ) -> jax.Array:
     """Check a layer's input and mask, and cast x to the compute dtype.
 
@@ -147,7 +140,7 @@ def cast_input(
         dtype: compute dtype; None promotes the dtypes of x and kernel.
         x: [...tokens, I].
         kernel: the layer's kernel.
-        token_mask: bool [...tokens], or None.
+        token_mask: bool [...tokens] or None.
         width: I; None to not check it.
 
     Raises:

@@ -15,7 +15,7 @@ from lorasp_jax.dense.functional import DenseLayer, apply_layer, cast_input
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import Aux, Method
 from lorasp_jax.peft.fields import short
-from lorasp_jax.peft.method import Params, check_params
+from lorasp_jax.peft.method import Mask, Params, check_params
 
 AUX_NAME = "stored_aux"
 KERNEL_INIT = jax.nn.initializers.lecun_normal()  # same as nnx.Linear and nn.Dense
@@ -179,7 +179,7 @@ class Dense(AdaptedLayer):
         self,
         x: jax.Array,
         *,
-        token_mask: jax.Array | None = None,
+        token_mask: Mask = None,
         return_aux: bool = False,
         out_sharding: None = None,
     ) -> Any:

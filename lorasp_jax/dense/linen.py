@@ -11,7 +11,7 @@ from lorasp_jax.dense import validate
 from lorasp_jax.dense.functional import DenseLayer, apply_layer, cast_input
 from lorasp_jax.dense.layers import AUX_NAME, KERNEL_INIT
 from lorasp_jax.peft import Method
-from lorasp_jax.peft.method import Params, check_params, dropout_rate
+from lorasp_jax.peft.method import Mask, Params, check_params, dropout_rate
 
 
 class LinenDense(nn.Module):
@@ -38,9 +38,7 @@ class LinenDense(nn.Module):
     kernel_init: Initializer = KERNEL_INIT
 
     @nn.compact
-    def __call__(
-        self, x: jax.Array, *, token_mask: jax.Array | None = None, return_aux: bool = False
-    ) -> Any:
+    def __call__(self, x: jax.Array, *, token_mask: Mask = None, return_aux: bool = False) -> Any:
         """y [...tokens, O], or (y, aux) if `return_aux`; see `dense`."""
         validate.method(self.method)
         validate.floating_dtype("param_dtype", self.param_dtype)

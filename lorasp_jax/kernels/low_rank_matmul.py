@@ -22,7 +22,7 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -32,22 +32,19 @@ from lorasp_jax.kernels.platform import platform
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.kernels.rematerialization import save_for_backward
 
+Mask: TypeAlias = jax.Array | None
+"""Bool [...tokens]: False excludes a token from losses and statistics; None excludes none."""
+
 
 class Bottleneck:
     """f of layers with a shared input. Hashable; objects that compare equal compute the same f."""
 
-    def bottleneck(
-        self, params: Any, rows: jax.Array, token_mask: jax.Array | None
-    ) -> tuple[jax.Array, Any]:
+    def bottleneck(self, params: Any, rows: jax.Array, token_mask: Mask) -> tuple[jax.Array, Any]:
         """Return z [..., R] and a pytree of auxiliary outputs, from projected rows [..., Q]."""
         raise NotImplementedError
 
     def bottlenecks(
-        self,
-        params: Sequence[Any],
-        projected: jax.Array,
-        widths: Sequence[int],
-        token_mask: jax.Array | None,
+        self, params: Sequence[Any], projected: jax.Array, widths: Sequence[int], token_mask: Mask
     ) -> list[tuple[jax.Array, Any]]:
         """Return z and the auxiliary outputs of each layer.
 
@@ -55,7 +52,6 @@ class Bottleneck:
             params: parameters of each layer.
             projected: projected rows of all layers, concatenated, possibly with trailing padding.
             widths: Q of each layer.
-            token_mask: bool [...tokens] or None.
         """
         each = jnp.split(projected, _ends(widths), axis=-1)[:-1]
         calls = zip(params, each, strict=True)
@@ -66,7 +62,7 @@ class Bottleneck:
         return params
 
     def stacked_bottlenecks(
-        self, params: Any, projected: jax.Array, columns: range, token_mask: jax.Array | None
+        self, params: Any, projected: jax.Array, columns: range, token_mask: Mask
     ) -> tuple[jax.Array, Any]:
         """`bottlenecks` of n layers whose parameters are stacked, here with `jax.vmap`.
 
@@ -74,7 +70,6 @@ class Bottleneck:
             params: from `pack`, stacked [n, ...].
             projected: [...tokens, C], contains the projected rows of all layers.
             columns: start column of each layer in `projected`. The step is Q.
-            token_mask: bool [...tokens] or None.
 
         Returns:
             z of all layers, concatenated to [...tokens, n R], and auxiliary outputs [n, ...].
@@ -110,7 +105,7 @@ def low_rank_matmul(
     rows_dtype: Any,
     layers: Sequence[LowRankLayer],
     x: jax.Array,
-    token_mask: jax.Array | None,
+    token_mask: Mask,
 ) -> list[tuple[jax.Array, Any]]:
     """Return (x W + z U, aux) of each layer, where z, aux = f(params, x P, token_mask).
 
@@ -119,7 +114,7 @@ def low_rank_matmul(
         rows_dtype: dtype of x P, which is accumulated in fp32.
         layers: the arrays of each layer.
         x: [..., I]; the outputs have its dtype.
-        token_mask: bool [...tokens] or None, passed to f.
+        token_mask: passed to f.
     """
     projected = jnp.matmul(x, _concat_downs(layers, x.dtype), preferred_element_type=rows_dtype)
     params = [layer.params for layer in layers]
@@ -146,7 +141,7 @@ def _forward(
     rows_dtype: Any,
     layers: Sequence[LowRankLayer],
     x: jax.Array,
-    token_mask: jax.Array | None,
+    token_mask: Mask,
 ) -> tuple:
     def inner(params: list[Any], projected: jax.Array) -> list[tuple[jax.Array, Any]]:
         z_aux = f.bottlenecks(params, projected, _widths(layers), token_mask)

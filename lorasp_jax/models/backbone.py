@@ -11,6 +11,7 @@ from flax import nnx
 
 from lorasp_jax.adapters.layers.prepared import Layer
 from lorasp_jax.dense import Dense
+from lorasp_jax.kernels.low_rank_matmul import Mask
 from lorasp_jax.models import flow_matching
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.observation import Observation
@@ -77,7 +78,7 @@ class Backbone(nnx.Module):
         self.action_out_proj: Layer = Dense(width, dim, **options)
 
     def embed_actions(
-        self, x_t: jax.Array, flow_time: jax.Array, action_valid: jax.Array | None
+        self, x_t: jax.Array, flow_time: jax.Array, action_valid: Mask
     ) -> tuple[jax.Array, LayerAux]:
         """Embed noisy actions and flow time as action tokens.
 
@@ -112,7 +113,7 @@ class Backbone(nnx.Module):
         obs: Observation,
         x_t: jax.Array,
         flow_time: jax.Array,
-        action_valid: jax.Array | None = None,
+        action_valid: Mask = None,
     ) -> tuple[jax.Array, LayerAux]:
         """Predict the velocity `[B, C, A]` f32.
 
@@ -200,7 +201,7 @@ class Backbone(nnx.Module):
         *,
         num_steps: int,
         slots: jax.Array | None = None,
-        action_valid: jax.Array | None = None,
+        action_valid: Mask = None,
     ) -> tuple[jax.Array, LayerAux]:
         """Sample chunks as `sample_actions` does up to rounding, but differentiably.
 

@@ -23,7 +23,7 @@ import optax
 
 from lorasp_jax.peft.auxiliary import Aux
 from lorasp_jax.peft.fields import positive_int
-from lorasp_jax.peft.method import Method, Params
+from lorasp_jax.peft.method import Mask, Method, Params
 
 _INIT_STD = 0.02  # PEFT's value for A and B
 _NAMES = {"lora_a", "lora_e", "lora_b"}
@@ -108,7 +108,7 @@ class AdaLoRA(Method):
         return params["lora_a"]
 
     def bottleneck(
-        self, params: Params, rows: jax.Array, token_mask: jax.Array | None
+        self, params: Params, rows: jax.Array, token_mask: Mask
     ) -> tuple[jax.Array, Aux]:
         """Eq. (3): z = s x A diag(e). The active rank is the number of nonzero entries of e."""
         del token_mask

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from lorasp_jax.peft.auxiliary import Aux
 from lorasp_jax.peft.lora import LoRA
-from lorasp_jax.peft.method import Kernel, Params
+from lorasp_jax.peft.method import Kernel, Mask, Params
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,12 +52,7 @@ class DoRA(LoRA):
         return params | {"magnitude": column_norms(kernel)}, residual
 
     def apply(
-        self,
-        params: Params,
-        x: jax.Array,
-        kernel: jax.Array,
-        *,
-        token_mask: jax.Array | None = None,
+        self, params: Params, x: jax.Array, kernel: jax.Array, *, token_mask: Mask = None
     ) -> tuple[jax.Array, Aux]:
         """Eq. (5): (x W + scale x A B) · m / ‖V‖, [...tokens, O]. The kernel receives no gradient.
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from lorasp_jax.peft.auxiliary import Aux
-from lorasp_jax.peft.method import Kernel, Method, Params
+from lorasp_jax.peft.method import Kernel, Mask, Method, Params
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,12 +30,7 @@ class FullFineTuning(Method):
         return {"kernel": kernel}, kernel
 
     def apply(
-        self,
-        params: Params,
-        x: jax.Array,
-        kernel: jax.Array,
-        *,
-        token_mask: jax.Array | None = None,
+        self, params: Params, x: jax.Array, kernel: jax.Array, *, token_mask: Mask = None
     ) -> tuple[jax.Array, Aux]:
         """x @ params["kernel"], [...tokens, O]."""
         del kernel

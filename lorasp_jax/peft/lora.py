@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from lorasp_jax.peft.auxiliary import Aux
 from lorasp_jax.peft.fields import check_kernel, short
-from lorasp_jax.peft.method import Kernel, Method, Params, kaiming_uniform
+from lorasp_jax.peft.method import Kernel, Mask, Method, Params, kaiming_uniform
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,7 +138,7 @@ class LoRA(Method):
         return params["lora_a"]
 
     def bottleneck(
-        self, params: Params, rows: jax.Array, token_mask: jax.Array | None
+        self, params: Params, rows: jax.Array, token_mask: Mask
     ) -> tuple[jax.Array, Aux]:
         """Eq. (3) of Hu et al.: z = scale x A. Every token uses the layer's full rank."""
         del token_mask

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from lorasp_jax.peft.auxiliary import Aux, masked_mean
 from lorasp_jax.peft.lora_sp.router import cast_and_clip
-from lorasp_jax.peft.method import Method, Params, kaiming_uniform
+from lorasp_jax.peft.method import Mask, Method, Params, kaiming_uniform
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +75,7 @@ class LoRAMoE(Method):
         return jnp.concatenate([params["lora_a"], params["router"]], axis=1)
 
     def bottleneck(
-        self, params: Params, rows: jax.Array, token_mask: jax.Array | None
+        self, params: Params, rows: jax.Array, token_mask: Mask
     ) -> tuple[jax.Array, Aux]:
         """Eq. (2) of the LoRA-SP paper: z = scale · w(x) ⊙ (x A); each w_i scales R columns."""
         del params
@@ -128,7 +128,7 @@ def _one_hot_argmax(probabilities: jax.Array) -> jax.Array:
     return jax.nn.one_hot(probabilities.argmax(-1), probabilities.shape[-1])
 
 
-def balance_loss(probabilities: jax.Array, valid: jax.Array | None) -> jax.Array:
+def balance_loss(probabilities: jax.Array, valid: Mask) -> jax.Array:
     """Load-balancing loss, E Σ_i f_i P_i: 1 if all experts are used equally, at most E.
 
     Fedus et al. (arXiv 2101.03961, eq. 4): f_i is the fraction of valid tokens whose most likely
@@ -137,7 +137,6 @@ def balance_loss(probabilities: jax.Array, valid: jax.Array | None) -> jax.Array
 
     Args:
         probabilities: the router's softmax, f32 [...tokens, E].
-        valid: bool [...tokens], False for padding; None if all are valid.
 
     Returns:
         f32 scalar, 0 if no token is valid.
@@ -148,14 +147,13 @@ def balance_loss(probabilities: jax.Array, valid: jax.Array | None) -> jax.Array
     return len(fractions) * jnp.sum(fractions * mean_probabilities)
 
 
-def z_loss(logits: jax.Array, valid: jax.Array | None) -> jax.Array:
+def z_loss(logits: jax.Array, valid: Mask) -> jax.Array:
     """Mean of logsumexp(logits)² over the valid tokens; it keeps the logits small.
 
     As in Zoph et al. (arXiv 2202.08906, eq. 5), with no offset: zero logits give (ln E)².
 
     Args:
         logits: f32 [...tokens, E].
-        valid: bool [...tokens], False for padding; None if all are valid.
 
     Returns:
         f32 scalar, 0 if no token is valid.

@@ -28,7 +28,7 @@ from lorasp_jax.kernels.energy_gate import kept_energy
 from lorasp_jax.peft.auxiliary import Aux, masked_mean
 from lorasp_jax.peft.lora_sp.bank import BankMethod, apply_masked_scores, init_bank
 from lorasp_jax.peft.lora_sp.router import cast_and_clip
-from lorasp_jax.peft.method import Params, kaiming_uniform
+from lorasp_jax.peft.method import Mask, Params, kaiming_uniform
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +56,7 @@ class LoRASPRelease(BankMethod):
         return {"bank": init_bank(v, d_out), "router": {"w1": w1}}
 
     def bottleneck(
-        self, params: Params, rows: jax.Array, token_mask: jax.Array | None
+        self, params: Params, rows: jax.Array, token_mask: Mask
     ) -> tuple[jax.Array, Aux]:
         """Compute z = scale Σ(x) V x and aux from the rows x [V, W1]."""
         del params

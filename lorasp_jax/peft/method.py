@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optax
 
 from lorasp_jax.kernels.frozen_matmul import frozen_matmul
-from lorasp_jax.kernels.low_rank_matmul import Bottleneck, LowRankLayer, low_rank_matmul
+from lorasp_jax.kernels.low_rank_matmul import Bottleneck, LowRankLayer, Mask, low_rank_matmul
 from lorasp_jax.peft import fields
 from lorasp_jax.peft.auxiliary import Aux
 
@@ -137,14 +137,13 @@ class Method(Bottleneck):
         return params
 
     def bottleneck(
-        self, params: Params, rows: jax.Array, token_mask: jax.Array | None
+        self, params: Params, rows: jax.Array, token_mask: Mask
     ) -> tuple[jax.Array, Aux]:
         """Map each token's row of x P to z.
 
         Args:
             params: from `bottleneck_params`.
             rows: x P, [...tokens, Q] in the dtype of x, or in fp32 if `down_in_fp32`.
-            token_mask: see `delta`.
 
         Returns:
             z [...tokens, R], to be multiplied by U, and aux with token_mask unset.
@@ -161,14 +160,13 @@ class Method(Bottleneck):
         raise NotImplementedError
 
     def delta(
-        self, params: Params, x: jax.Array, *, token_mask: jax.Array | None = None
+        self, params: Params, x: jax.Array, *, token_mask: Mask = None
     ) -> tuple[jax.Array, Aux]:
         """Compute what the adapter adds to x @ kernel, [...tokens, O], and aux.
 
         Args:
             params: from `init`.
             x: [...tokens, I].
-            token_mask: bool [...tokens]; False marks padding, excluded from losses and statistics.
 
         Raises:
             ValueError: the method is not additive, x is not floating point, or the parameters
@@ -184,7 +182,7 @@ class Method(Bottleneck):
         return z @ up, dataclasses.replace(aux, token_mask=token_mask)
 
     def bottleneck_from_input(
-        self, params: Params, x: jax.Array, token_mask: jax.Array | None
+        self, params: Params, x: jax.Array, token_mask: Mask
     ) -> tuple[jax.Array, Aux]:
         """Compute z [...tokens, R], in the dtype of x, and aux from x itself."""
         down = self.down(params).astype(x.dtype)
@@ -194,17 +192,11 @@ class Method(Bottleneck):
         return z.astype(x.dtype), aux
 
     def apply(
-        self,
-        params: Params,
-        x: jax.Array,
-        kernel: jax.Array,
-        *,
-        token_mask: jax.Array | None = None,
+        self, params: Params, x: jax.Array, kernel: jax.Array, *, token_mask: Mask = None
     ) -> tuple[jax.Array, Aux]:
         """Apply the adapted linear layer without its bias: x @ kernel + delta, [...tokens, O].
 
-        `kernel` receives no gradient. See `delta` for the other arguments. Nothing is checked here;
-        `lorasp_jax.dense.dense` does that.
+        `kernel` receives no gradient. Nothing is checked here; `lorasp_jax.dense.dense` does that.
         """
         f, layer = self.implementation(params), self.low_rank_layer(params, kernel)
         ((y, aux),) = low_rank_matmul(f, self.rows_dtype(x.dtype), [layer], x, token_mask)
@@ -217,7 +209,7 @@ class Method(Bottleneck):
         kernel: jax.Array,
         key: jax.Array,
         *,
-        token_mask: jax.Array | None = None,
+        token_mask: Mask = None,
     ) -> tuple[jax.Array, Aux]:
         """`apply` with dropout: the adapter sees dropout(x), the kernel sees x.
 

@@ -20,7 +20,7 @@ from flax import nnx
 
 from lorasp_jax.kernels.frozen_matmul import frozen_matmul
 from lorasp_jax.peft import Aux, LoRA, Method
-from lorasp_jax.peft.method import Params
+from lorasp_jax.peft.method import Mask, Params
 
 
 class AdapterChoice(nnx.Variable[Any]):
@@ -92,7 +92,7 @@ class AdapterSet(Method):
         )
 
     def bottleneck(
-        self, params: Params, rows: jax.Array, token_mask: jax.Array | None
+        self, params: Params, rows: jax.Array, token_mask: Mask
     ) -> tuple[jax.Array, Aux]:
         """Multiply each adapter's z by its weight; no losses, since sets are not trained."""
         weights, bank = self._weights(params["choice"], rows), params["bank"]
@@ -121,12 +121,7 @@ class AdapterSet(Method):
         )
 
     def apply(
-        self,
-        params: Params,
-        x: jax.Array,
-        kernel: jax.Array,
-        *,
-        token_mask: jax.Array | None = None,
+        self, params: Params, x: jax.Array, kernel: jax.Array, *, token_mask: Mask = None
     ) -> tuple[jax.Array, Aux]:
         """Compute x @ kernel + Σ_i w_i Δ_i(x), `[...tokens, O]`; arguments as for `Method.apply`.
 

@@ -22,7 +22,7 @@ from lorasp_jax.adapters import paths
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdapterAux, AdapterParam, validate
 from lorasp_jax.kernels.frozen_matmul import frozen_matmul
-from lorasp_jax.peft.method import Aux, Method, Params
+from lorasp_jax.peft.method import Aux, Mask, Method, Params
 
 Forward = Callable[[Any, Any], Any]
 """(model, batch) -> output pytree, which must include any aux that the model returns. All other
@@ -71,12 +71,7 @@ class Observed(Method):
     report: Report
 
     def apply(
-        self,
-        params: Params,
-        x: jax.Array,
-        kernel: jax.Array,
-        *,
-        token_mask: jax.Array | None = None,
+        self, params: Params, x: jax.Array, kernel: jax.Array, *, token_mask: Mask = None
     ) -> tuple[jax.Array, Aux]:
         """Return the wrapped layer's output, with the report in aux."""
         if self.inner is None:

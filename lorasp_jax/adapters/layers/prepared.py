@@ -28,7 +28,12 @@ import jax.numpy as jnp
 from flax import nnx
 
 from lorasp_jax.dense import Dense
-from lorasp_jax.kernels.low_rank_matmul import Bottleneck, base_plus_low_rank, pad_columns
+from lorasp_jax.kernels.low_rank_matmul import (
+    Bottleneck,
+    Mask,
+    base_plus_low_rank,
+    pad_columns,
+)
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import Aux
 
@@ -116,14 +121,14 @@ class Prepared(nnx.Module):
         self.fused = None if arrays is None else FusedArrays(arrays)
 
     def __call__(
-        self, x: jax.Array, *, token_mask: jax.Array | None, return_aux: Literal[True]
+        self, x: jax.Array, *, token_mask: Mask, return_aux: Literal[True]
     ) -> tuple[jax.Array, Aux]:
         """Compute y `[..., O]` and aux, for a `Prepared` with exactly one layer."""
         del return_aux
         (result,) = self.results(x, token_mask)
         return result
 
-    def results(self, x: jax.Array, token_mask: jax.Array | None) -> list[tuple[jax.Array, Aux]]:
+    def results(self, x: jax.Array, token_mask: Mask) -> list[tuple[jax.Array, Aux]]:
         """Compute y and aux of each layer for x `[..., I]`; an empty instance returns []."""
         if self.fused is None:
             return []
@@ -197,7 +202,7 @@ def fuse_stack(blocks: Block) -> Block:
 
 
 def _call_fused(
-    fused: FusedLayers, x: jax.Array, token_mask: jax.Array | None
+    fused: FusedLayers, x: jax.Array, token_mask: Mask
 ) -> tuple[Sequence[jax.Array], Aux]:
     """Output y of each layer, and aux with leading axis n."""
     ends = list(itertools.accumulate(fused.bottleneck.out_sizes))
@@ -217,7 +222,7 @@ def _call_kernels(fused: FusedKernels, x: jax.Array) -> Sequence[jax.Array]:
 
 
 def _call_shared(
-    shared: SharedProjection, x: jax.Array, token_mask: jax.Array | None
+    shared: SharedProjection, x: jax.Array, token_mask: Mask
 ) -> tuple[Sequence[jax.Array], Aux]:
     """Output y of each layer, and aux with leading axis n."""
     # Without the barrier XLA fuses x W and x P into one matmul and copies W.
@@ -236,10 +241,7 @@ def _call_shared(
 
 
 def _bottleneck(
-    arrays: FusedLayers | SharedProjection,
-    projected: jax.Array,
-    start: int,
-    token_mask: jax.Array | None,
+    arrays: FusedLayers | SharedProjection, projected: jax.Array, start: int, token_mask: Mask
 ) -> tuple[jax.Array, Aux]:
     """Concatenated z of all layers, in the dtype of `projected`, and aux.
 

@@ -20,6 +20,7 @@ from flax import nnx
 
 from lorasp_jax.adapters.layers.prepared import Layer
 from lorasp_jax.dense import Dense
+from lorasp_jax.kernels.low_rank_matmul import Mask
 from lorasp_jax.models.backbone import Backbone, suffix_mask_and_positions
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig, VisionConfig
 from lorasp_jax.models.inputs import OPENPI, OPENPI_PI05, OURS_PI05
@@ -161,11 +162,7 @@ class Pi0(Backbone):
         return tokens, jnp.concatenate([image_valid, obs.token_mask], axis=1), aux
 
     def embed_suffix(
-        self,
-        obs: Observation,
-        x_t: jax.Array,
-        flow_time: jax.Array,
-        action_valid: jax.Array | None = None,
+        self, obs: Observation, x_t: jax.Array, flow_time: jax.Array, action_valid: Mask = None
     ) -> tuple[jax.Array, LayerAux]:
         """Embed state and noisy actions as tokens `[B, 1 + C, D]` f32; see `embed_actions`."""
         valid, state = jnp.ones((x_t.shape[0], 1), bool), obs.state[:, None].astype(jnp.float32)
@@ -188,7 +185,7 @@ class Pi0(Backbone):
         obs: Observation,
         x_t: jax.Array,
         flow_time: jax.Array,
-        action_valid: jax.Array | None = None,
+        action_valid: Mask = None,
     ) -> tuple[jax.Array, LayerAux]:
         """Predict the velocity `[B, C, A]` f32; see `Backbone.run_suffix`."""
         batch, chunk = x_t.shape[:2]
@@ -230,11 +227,7 @@ class Pi05(Pi0):
         self.action_out_proj: Layer = Dense(width, dim, **options)
 
     def embed_suffix(
-        self,
-        obs: Observation,
-        x_t: jax.Array,
-        flow_time: jax.Array,
-        action_valid: jax.Array | None = None,
+        self, obs: Observation, x_t: jax.Array, flow_time: jax.Array, action_valid: Mask = None
     ) -> tuple[jax.Array, LayerAux]:
         """Embed noisy actions as tokens `[B, C, D]` f32.
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from lorasp_jax.kernels.low_rank_matmul import Mask
 from lorasp_jax.models.backbone import Backbone, suffix_mask_and_positions
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig, VisionConfig
 from lorasp_jax.models.inputs import LEROBOT_SMOLVLA
@@ -164,11 +165,7 @@ class SmolVLA(Backbone):
         return tokens, valid, {**aux, "action": {"state_proj": state_aux}}
 
     def embed_suffix(
-        self,
-        obs: Observation,
-        x_t: jax.Array,
-        flow_time: jax.Array,
-        action_valid: jax.Array | None = None,
+        self, obs: Observation, x_t: jax.Array, flow_time: jax.Array, action_valid: Mask = None
     ) -> tuple[jax.Array, LayerAux]:
         """See `embed_actions`; `obs` is unused, because the state is in the prefix."""
         del obs
@@ -190,7 +187,7 @@ class SmolVLA(Backbone):
         obs: Observation,
         x_t: jax.Array,
         flow_time: jax.Array,
-        action_valid: jax.Array | None = None,
+        action_valid: Mask = None,
     ) -> tuple[jax.Array, LayerAux]:
         """Predict the velocity `[B, C, A]` f32; see `Backbone.run_suffix`."""
         if action_valid is None:

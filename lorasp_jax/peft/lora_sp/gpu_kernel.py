@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from lorasp_jax.kernels.energy_gate import kept_energy, kept_flags
-from lorasp_jax.kernels.low_rank_matmul import Bottleneck
+from lorasp_jax.kernels.low_rank_matmul import Bottleneck, Mask
 from lorasp_jax.kernels.packing import PackedTree
 from lorasp_jax.kernels.rowwise_kernel import rowwise_kernel
 from lorasp_jax.peft.auxiliary import Aux
@@ -43,18 +43,12 @@ class FusedBottleneck(Bottleneck):
         """Pack the router into one flat array."""
         return PackedTree.of(params["router"])
 
-    def bottleneck(
-        self, params: Any, rows: jax.Array, token_mask: jax.Array | None
-    ) -> tuple[jax.Array, Aux]:
+    def bottleneck(self, params: Any, rows: jax.Array, token_mask: Mask) -> tuple[jax.Array, Aux]:
         """Compute z and aux of a single layer."""
         return self.bottlenecks([params], rows, [rows.shape[-1]], token_mask)[0]
 
     def bottlenecks(
-        self,
-        params: Sequence[Any],
-        projected: jax.Array,
-        widths: Sequence[int],
-        token_mask: jax.Array | None,
+        self, params: Sequence[Any], projected: jax.Array, widths: Sequence[int], token_mask: Mask
     ) -> list[tuple[jax.Array, Aux]]:
         """Compute z and aux of each layer in one launch. All widths must be equal."""
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(self.pack, params))
@@ -64,7 +58,7 @@ class FusedBottleneck(Bottleneck):
         return list(zip(jnp.split(z, len(params), axis=-1), layer_aux, strict=True))
 
     def stacked_bottlenecks(
-        self, params: Any, projected: jax.Array, columns: range, token_mask: jax.Array | None
+        self, params: Any, projected: jax.Array, columns: range, token_mask: Mask
     ) -> tuple[jax.Array, Aux]:
         """Compute z and aux of all layers; columns beyond theirs may hold anything."""
         tokens, n = projected.shape[:-1], len(columns)

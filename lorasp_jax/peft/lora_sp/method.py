@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 
 from lorasp_jax.kernels.energy_gate import default_implementation, energy_gate, kept_energy
-from lorasp_jax.kernels.low_rank_matmul import Bottleneck
+from lorasp_jax.kernels.low_rank_matmul import Bottleneck, Mask
 from lorasp_jax.peft.auxiliary import Aux
 from lorasp_jax.peft.lora_sp.bank import BankMethod, apply_masked_scores, init_bank
 from lorasp_jax.peft.lora_sp.gpu_kernel import FusedBottleneck, supported_size
@@ -80,7 +80,7 @@ class LoRASP(BankMethod):
         return {"bank": init_bank(v, d_out), "router": {"w1": w1, **output_layer}}
 
     def bottleneck(
-        self, params: Params, rows: jax.Array, token_mask: jax.Array | None
+        self, params: Params, rows: jax.Array, token_mask: Mask
     ) -> tuple[jax.Array, Aux]:
         """Compute z = scale Σ(x) V x of eq. (9), and aux, from the rows x [V, W1]."""
         tokens = rows.shape[:-1]
