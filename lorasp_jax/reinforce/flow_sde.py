@@ -4,7 +4,8 @@ Step k leads from x_k, at time t = 1 - k/K, to
 
     x_{k+1} ~ N(x_k - δ (v + σ²/(2t) ε), δ σ²),   δ = 1/K,   σ² = a² t / max(1 - t, δ),
 
-where v is the velocity and ε = x_k + (1 - t) v the noise that the policy estimates. With every step
+where v is the velocity, ε = x_k + (1 - t) v the noise that the policy estimates, and a (`level`)
+the standard deviation of the first step's noise [normalized action units]. With every step
 stochastic and K large, the chunks have the distribution that those of the ODE have. Here each world
 draws one step per call, and the others are the ODE's: the probability of a call is that of this
 step, and needs one velocity. Only the actions that the robot executes get noise.
@@ -17,21 +18,12 @@ import jax
 import jax.numpy as jnp
 
 from lorasp_jax.models import flow_matching
-from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.flow_matching import Velocity
-from lorasp_jax.models.transformer.layers import ModelAux, merge_action_aux
-from lorasp_jax.policies.processor import Processor, RawObservation
 from lorasp_jax.reinforce.noise import Spread
 
 
 def spread_of(step: jax.Array, num_steps: int, level: float | jax.Array) -> Spread:
-    """Return the distribution of the noise of steps k `[N]`; its std is `[N, 1]`.
-
-    Args:
-        step: k.
-        num_steps: K.
-        level: a, the standard deviation of the first step's noise [normalized action units].
-    """
+    """Return the distribution of the noise of steps k `[N]` of K; its std is `[N, 1]`."""
     t, rest = _times(step, num_steps)
     return Spread((level * jnp.sqrt(t / (num_steps * rest)))[:, None], 0.0)
 
@@ -39,15 +31,8 @@ def spread_of(step: jax.Array, num_steps: int, level: float | jax.Array) -> Spre
 def drift(
     x: jax.Array, v: jax.Array, step: jax.Array, num_steps: int, level: float | jax.Array
 ) -> jax.Array:
-    """Return the velocity `[N, C, A]` whose Euler step ends at the mean of x_{k+1}.
-
-    Args:
-        x: `[N, C, A]` x_k.
-        v: `[N, C, A]` the flow's velocity.
-        step: `[N]` k.
-        num_steps: K.
-        level: a.
-    """
+    """Return the velocity whose Euler step ends at the mean of x_{k+1}, from x_k and the flow's
+    velocity `[N, C, A]` at steps k `[N]` of K."""
     t, rest = (each[:, None, None] for each in _times(step, num_steps))
     return v + jnp.square(level) / (2 * rest) * (x + (1 - t) * v)
 
@@ -95,31 +80,3 @@ def sample(
     chunk, states = flow_matching.sample(stochastic, noise, num_steps=num_steps, slots=slots)
     states, rows = jnp.concatenate([states, chunk[None]]), jnp.arange(len(step))
     return chunk, (states[step, rows], states[step + 1, rows], step)
-
-
-def means(
-    model: Backbone,
-    processor: Processor,
-    observation: RawObservation,
-    prompts: jax.Array,
-    x: jax.Array,
-    step: jax.Array,
-    num_steps: int,
-    level: float | jax.Array,
-) -> tuple[jax.Array, ModelAux]:
-    """Return the means of x_{k+1} `[N, C, A]` where there is noise, and the adapters' aux.
-
-    Args:
-        model: the adapted model, not its sampler.
-        processor: the robot's.
-        observation: from `env.observe`, N rows.
-        prompts: `[N]` int32, rows of the processor's prompt table.
-        x: `[N, C, A]` x_k.
-        step: `[N]` k.
-        num_steps: K.
-        level: a.
-    """
-    obs = processor.encode(observation, prompts)
-    prefix, aux = model.run_prefix(obs)
-    v, action_aux = model.run_suffix(prefix, obs, x, 1 - step / num_steps)
-    return x - drift(x, v, step, num_steps, level) / num_steps, merge_action_aux(aux, action_aux)

@@ -16,9 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lorasp_jax.models.backbone import Backbone
-from lorasp_jax.models.transformer.layers import ModelAux, merge_action_aux
-from lorasp_jax.policies.processor import Processor, RawObservation
+from lorasp_jax.policies.processor import Processor
 from lorasp_jax.reinforce.config import Learning
 
 
@@ -63,14 +61,8 @@ def explore(key: jax.Array, mean: jax.Array, spread: Spread, slots: np.ndarray) 
 
 
 def log_prob(mean: jax.Array, actions: jax.Array, spread: Spread, slots: np.ndarray) -> jax.Array:
-    """Return the log-density `[..., C]` of actions in the executed slots, given the earlier ones.
-
-    Args:
-        mean: `[..., C, A]`.
-        actions: `[..., C, A]`.
-        spread: of the noise.
-        slots: `[A]` bool.
-    """
+    """Return the log-density `[..., C]` of actions `[..., C, A]` in the executed slots `[A]`, of
+    each given the earlier ones."""
     scales = spread.scales(mean.shape[-2])[..., 0]
     normalizer = slots.sum() * (jnp.log(scales) + 0.5 * np.log(2 * np.pi))
     return -_energy(actions - mean, spread, slots) - normalizer
@@ -87,31 +79,3 @@ def _energy(change: jax.Array, spread: Spread, slots: np.ndarray) -> jax.Array:
     earlier = jnp.pad(change[..., :-1, :], [(0, 0)] * (change.ndim - 2) + [(1, 0), (0, 0)])
     z = (change - spread.correlation * earlier) / spread.scales(change.shape[-2])
     return 0.5 * jnp.sum(jnp.square(z), axis=-1)
-
-
-def means(
-    model: Backbone,
-    processor: Processor,
-    observation: RawObservation,
-    prompts: jax.Array,
-    noise: jax.Array,
-    num_steps: int,
-) -> tuple[jax.Array, ModelAux]:
-    """Return the sampler's normalized chunk, differentiable, and the adapters' aux.
-
-    Args:
-        model: the adapted model, not its sampler.
-        processor: the robot's.
-        observation: from `env.observe`, B rows.
-        prompts: `[B]` int32, rows of the processor's prompt table.
-        noise: `[B, C, A]` initial noise of the flow.
-        num_steps: Euler steps.
-
-    Returns:
-        `[B, C, A]` f32, equal to `sample_actions` up to rounding.
-    """
-    obs = processor.encode(observation, prompts)
-    prefix, aux = model.run_prefix(obs)
-    slots = jnp.asarray(processor.flow_slots)
-    chunk, action_aux = model.run_flow(prefix, obs, noise, num_steps=num_steps, slots=slots)
-    return chunk, merge_action_aux(aux, action_aux)

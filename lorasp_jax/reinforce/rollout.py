@@ -14,8 +14,10 @@ from envs.scene.ranges import Randomization
 from envs.state import State
 from lorasp_jax.base import fast_cpu
 from lorasp_jax.evaluation.programs import Worlds
+from lorasp_jax.models.backbone import Backbone
+from lorasp_jax.models.transformer.layers import ModelAux, merge_action_aux
 from lorasp_jax.policies.policy import Policy
-from lorasp_jax.policies.processor import RawObservation
+from lorasp_jax.policies.processor import Processor, RawObservation
 from lorasp_jax.reinforce import flow_sde, noise
 from lorasp_jax.reinforce.noise import Spread
 from lorasp_jax.training.distributed import mesh as meshes
@@ -191,6 +193,33 @@ def explore(
         whole = jnp.concatenate([actions, mean[:, execute_steps:]], axis=1)
         chunks = Chunks(observation, prompts, initial, whole)
     return processor.decode(actions, observation["state"]), chunks
+
+
+def means(
+    model: Backbone, processor: Processor, chunks: Chunks, num_steps: int, level: float
+) -> tuple[jax.Array, ModelAux]:
+    """Return the means of the actions `[N, C, A]` of chunks, differentiable, and the adapters' aux.
+
+    They are what `sample_actions` returns, up to rounding, or the means of x_{k+1} of `flow_sde`
+    where there is noise.
+
+    Args:
+        model: the adapted model, not its sampler.
+        processor: the robot's.
+        chunks: N of them.
+        num_steps: Euler steps.
+        level: that of `flow_sde`.
+    """
+    obs = processor.encode(chunks.observation, chunks.prompts)
+    prefix, aux = model.run_prefix(obs)
+    x, step = chunks.noise, chunks.step
+    if step is None:
+        flow = {"num_steps": num_steps, "slots": jnp.asarray(processor.flow_slots)}
+        mean, action_aux = model.run_flow(prefix, obs, x, **flow)
+    else:
+        v, action_aux = model.run_suffix(prefix, obs, x, 1 - step / num_steps)
+        mean = x - flow_sde.drift(x, v, step, num_steps, level) / num_steps
+    return mean, merge_action_aux(aux, action_aux)
 
 
 @functools.partial(traced.cached, files=(__file__,))

@@ -12,7 +12,7 @@ import optax
 from flax import nnx
 
 from lorasp_jax.peft.auxiliary import auxiliary_losses
-from lorasp_jax.reinforce import flow_sde, noise
+from lorasp_jax.reinforce import flow_sde, noise, rollout
 from lorasp_jax.reinforce.config import ReinforceConfig
 from lorasp_jax.reinforce.learner import Learner
 from lorasp_jax.reinforce.rollout import Chunks
@@ -78,12 +78,9 @@ def means(
     adapters: Any, frozen: Frozen, chunks: Chunks, graphdef: Any, config: ReinforceConfig
 ) -> tuple[jax.Array, Any]:
     """Return the means of the actions `[N, C, A]`, and the adapters' aux."""
-    model, count = nnx.merge(graphdef, adapters, frozen.parameters), config.evaluation.denoise_steps
-    inputs = model, frozen.processor, chunks.observation, chunks.prompts, chunks.noise
-    if chunks.step is None:
-        mean, aux = noise.means(*inputs, count)
-    else:
-        mean, aux = flow_sde.means(*inputs, chunks.step, count, config.online.noise_level)
+    model = nnx.merge(graphdef, adapters, frozen.parameters)
+    settings = config.evaluation.denoise_steps, config.online.noise_level
+    mean, aux = rollout.means(model, frozen.processor, chunks, *settings)
     return mean[:, : chunks.actions.shape[1]], aux
 
 

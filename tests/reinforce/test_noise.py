@@ -12,8 +12,9 @@ from jax.scipy.stats import multivariate_normal
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import LoRASP
-from lorasp_jax.reinforce import noise
+from lorasp_jax.reinforce import noise, rollout
 from lorasp_jax.reinforce.noise import Spread
+from lorasp_jax.reinforce.rollout import Chunks
 from tests.models.random_models import random_backbone
 from tests.runs import CONFIG, make_run
 
@@ -94,7 +95,8 @@ def inputs(policy, count=3):
 def test_the_mean_is_the_deterministic_sample(policy, steps):
     raw, prompts, flow = inputs(policy)
     processor = policy.processor
-    found, _ = noise.means(policy.model, processor, raw, prompts, flow, steps)
+    chunks = Chunks(raw, prompts, flow, flow)
+    found, _ = rollout.means(policy.model, processor, chunks, steps, 0.0)
     obs = processor.encode(raw, prompts)
     options = {"num_steps": steps, "noise": flow, "slots": processor.flow_slots}
     expected = policy.model.sample_actions(None, obs, **options)

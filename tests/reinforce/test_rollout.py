@@ -24,8 +24,7 @@ def collect(policy, room, std=0.2, sde=False):
 def test_the_recorded_noise_gives_the_mean_of_the_actions(policy):
     found = collect(policy, rooms.Room())
     chunks, processor = found.chunks, policy.processor.shared()
-    inputs = chunks.observation, chunks.prompts, chunks.noise
-    means, _ = noise.means(policy.model, processor, *inputs, 2)
+    means, _ = rollout.means(policy.model, processor, chunks, 2, 0.0)
     slots = noise.action_slots(processor)
     z = ((chunks.actions - means)[:, :2] / 0.2)[..., slots]
     np.testing.assert_allclose(chunks.actions[:, 2:], means[:, 2:], atol=1e-4)
@@ -37,8 +36,7 @@ def test_the_recorded_noise_gives_the_mean_of_the_actions(policy):
 
 def test_the_recorded_step_gives_the_mean_of_its_end(policy):
     chunks, processor = collect(policy, rooms.Room(), sde=True).chunks, policy.processor.shared()
-    inputs = chunks.observation, chunks.prompts, chunks.noise, chunks.step
-    means, _ = flow_sde.means(policy.model, processor, *inputs, 2, 0.2)
+    means, _ = rollout.means(policy.model, processor, chunks, 2, 0.2)
     slots = noise.action_slots(processor)
     z = (chunks.actions - means) / flow_sde.spread_of(chunks.step, 2, 0.2).std[..., None]
     z = z[:, :2, slots]
