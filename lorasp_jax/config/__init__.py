@@ -6,8 +6,9 @@ from typing import Literal
 from envs.scene.ranges import Randomization
 from lorasp_jax.config.augment import AugmentConfig
 from lorasp_jax.config.recap import RecapConfig
-from lorasp_jax.peft import Method, fields
+from lorasp_jax.peft import Method
 from lorasp_jax.peft.auxiliary import AUXILIARY_WEIGHTS
+from lorasp_jax.peft.fields import at_least, check_fields, require
 from lorasp_jax.peft.plan import RankPlan
 
 SCALES = ("smoke", "cpu", "accelerator")
@@ -17,24 +18,11 @@ MAX_NAME_BYTES = 200
 """Maximum length of a run name [bytes]. File systems allow 255; the run's lock file adds a few."""
 
 
-def _at_least(low: int, owner: object, *names: str) -> None:
-    """Raise ValueError if any of the named fields is below `low`."""
-    for name in names:
-        if getattr(owner, name) < low:
-            raise ValueError(f"{name} must be at least {low}, got {getattr(owner, name)}")
-
-
-def _require(holds: bool, rule: str, value: object) -> None:
-    """Raise ValueError unless the rule holds."""
-    if not holds:
-        raise ValueError(f"{rule}, got {value}")
-
-
 def _check_name(name: str) -> None:
     """Raise ValueError unless `name` is a single path component."""
     valid = name not in ("", ".", "..") and "/" not in name and name.isprintable()
     rule = f"name must be a printable folder name of at most {MAX_NAME_BYTES} bytes without '/'"
-    _require(valid and len(name.encode()) <= MAX_NAME_BYTES, rule, repr(name))
+    require(valid and len(name.encode()) <= MAX_NAME_BYTES, rule, repr(name))
 
 
 @dataclass(frozen=True)
@@ -86,8 +74,8 @@ class ModelConfig:
         return self.checkpoint.replace("{backbone}", self.backbone).replace("{size}", self.size)
 
     def __post_init__(self) -> None:
-        fields.check_fields(self)
-        _at_least(0, self, "max_tokens", "chunk")
+        check_fields(self)
+        at_least(0, self, "max_tokens", "chunk")
 
 
 @dataclass(frozen=True)
@@ -128,11 +116,11 @@ class DataConfig:
     def __post_init__(self) -> None:
         given = self.source if isinstance(self.source, list | tuple) else (self.source,)
         object.__setattr__(self, "source", tuple(filter(None, given)))
-        fields.check_fields(self)
-        _at_least(1, self, "episodes", "num_envs")
-        _at_least(0, self, "action_noise", "fresh_every")
-        _require(0 <= self.replay < 1, "data.replay must lie in [0, 1)", self.replay)
-        _require(min(self.weights, default=1) > 0, "data.weights must be above 0", self.weights)
+        check_fields(self)
+        at_least(1, self, "episodes", "num_envs")
+        at_least(0, self, "action_noise", "fresh_every")
+        require(0 <= self.replay < 1, "data.replay must lie in [0, 1)", self.replay)
+        require(min(self.weights, default=1) > 0, "data.weights must be above 0", self.weights)
         if not self.source and self.validation not in (("auto",), ("0",)):
             raise ValueError("data.validation holds episodes of a dataset out: add data.source")
         if self.fresh_every and (name := "source" if self.source else "replay" * bool(self.replay)):
@@ -183,15 +171,15 @@ class OptimConfig:
     only non-finite steps."""
 
     def __post_init__(self) -> None:
-        fields.check_fields(self)
-        _at_least(1, self, "steps", "batch_size", "accumulate", "max_skipped")
-        _at_least(0, self, "learning_rate", "final_learning_rate", "warmup_steps")
-        _at_least(0, self, "weight_decay", "state_noise", "rtc_max_delay")
+        check_fields(self)
+        at_least(1, self, "steps", "batch_size", "accumulate", "max_skipped")
+        at_least(0, self, "learning_rate", "final_learning_rate", "warmup_steps")
+        at_least(0, self, "weight_decay", "state_noise", "rtc_max_delay")
         for name in ("clip_norm", "time_shape"):
-            _require(getattr(self, name) > 0, f"{name} must be above 0", getattr(self, name))
-        _require(0 <= self.b2 < 1, "b2 must lie in [0, 1)", self.b2)
-        _require(not self.spike or self.spike > 1, "spike must be 0 or more than 1", self.spike)
-        _require(0 <= self.ema < 1, "ema must lie in [0, 1)", self.ema)
+            require(getattr(self, name) > 0, f"{name} must be above 0", getattr(self, name))
+        require(0 <= self.b2 < 1, "b2 must lie in [0, 1)", self.b2)
+        require(not self.spike or self.spike > 1, "spike must be 0 or more than 1", self.spike)
+        require(0 <= self.ema < 1, "ema must lie in [0, 1)", self.ema)
 
 
 @dataclass(frozen=True)
@@ -210,9 +198,9 @@ class AuxiliaryConfig:
     """Fraction of the steps over which the weights rise linearly from zero."""
 
     def __post_init__(self) -> None:
-        fields.check_fields(self)
-        _at_least(0, self, *AUXILIARY_WEIGHTS)
-        _require(0 <= self.warmup <= 1, "warmup must lie in [0, 1]", self.warmup)
+        check_fields(self)
+        at_least(0, self, *AUXILIARY_WEIGHTS)
+        require(0 <= self.warmup <= 1, "warmup must lie in [0, 1]", self.warmup)
 
 
 @dataclass(frozen=True)
@@ -242,13 +230,13 @@ class EvaluationConfig:
         return min(self.episodes, self.num_envs)
 
     def __post_init__(self) -> None:
-        fields.check_fields(self)
-        _at_least(1, self, "episodes", "num_envs", "execute_steps", "denoise_steps")
-        _at_least(1, self, "validate_every")
-        _at_least(0, self, "every")
+        check_fields(self)
+        at_least(1, self, "episodes", "num_envs", "execute_steps", "denoise_steps")
+        at_least(1, self, "validate_every")
+        at_least(0, self, "every")
         counts = f"{self.episodes} and {self.num_envs}"
         rule = "episodes must be a multiple of num_envs"
-        _require(self.episodes % self.worlds == 0, rule, counts)
+        require(self.episodes % self.worlds == 0, rule, counts)
 
 
 @dataclass(frozen=True)
@@ -333,25 +321,25 @@ class Config:
         if self.plan is None:
             return
         self.plan.rules(self.peft)
-        _require(not self.adapt, "plan and adapt cannot be combined: drop one", self.adapt)
+        require(not self.adapt, "plan and adapt cannot be combined: drop one", self.adapt)
         of, rule = self.plan.backbone, "model.backbone must be the plan's"
-        _require(of == self.model.backbone, f"{rule}, {of}", self.model.backbone)
+        require(of == self.model.backbone, f"{rule}, {of}", self.model.backbone)
 
     def _due(self, step: int, every: int) -> bool:
         return bool(every) and step // every > (step - self.log_every) // every
 
     def __post_init__(self) -> None:
-        fields.check_fields(self)
-        fields.check_fields(self.peft, "peft.")
-        fields.check_fields(self.scene, "scene.")
+        check_fields(self)
+        check_fields(self.peft, "peft.")
+        check_fields(self.scene, "scene.")
         _check_name(self.name)
-        _at_least(1, self, "fsdp", "log_every", "checkpoint_every", "image_size")
-        _require(self.control_dt > 0, "control_dt must be above 0", self.control_dt)
-        _require(0 <= self.seed < 2**32, "seed must lie in [0, 2**32)", self.seed)
+        at_least(1, self, "fsdp", "log_every", "checkpoint_every", "image_size")
+        require(self.control_dt > 0, "control_dt must be above 0", self.control_dt)
+        require(0 <= self.seed < 2**32, "seed must lie in [0, 2**32)", self.seed)
         self.scene.check(self.control_dt)
         self._check_plan()
         self.recap.check(self.learn, bool(self.data.source))
         every, rule = self.data.fresh_every, "data.fresh_every must be a multiple of log_every"
-        _require(every % self.log_every == 0, rule, f"{every} and {self.log_every}")
+        require(every % self.log_every == 0, rule, f"{every} and {self.log_every}")
         unique = 0 < len(self.tasks) == len(set(self.tasks))
-        _require(unique, "tasks must be non-empty and unique", self.tasks)
+        require(unique, "tasks must be non-empty and unique", self.tasks)

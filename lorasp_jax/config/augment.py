@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from lorasp_jax.peft import fields
+from lorasp_jax.peft.fields import at_least, check_fields, require
 
 _AUGMENT = {
     "openpi": {"crop": 0.95, "rotation": 5.0, "brightness": 0.3, "contrast": 0.4, "hue": 0.1},
@@ -68,11 +68,9 @@ class AugmentConfig:
         return None if self.preset == "none" else self
 
     def __post_init__(self) -> None:
-        fields.check_fields(self)
-        for name, value in self.given.items():
-            if value < 0:
-                raise ValueError(f"data.augment.{name} must be at least 0, got {value}")
-        if self.crop is not None and not 0 < self.crop <= 1:
-            raise ValueError(f"data.augment.crop must lie in (0, 1], got {self.crop}")
+        check_fields(self)
+        at_least(0, self, *self.given, prefix="data.augment.")
+        valid = self.crop is None or 0 < self.crop <= 1
+        require(valid, "data.augment.crop must lie in (0, 1]", self.crop)
         if self.preset != "auto":
             self.chosen(simulated=False)

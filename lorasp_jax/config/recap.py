@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from lorasp_jax.peft import fields
+from lorasp_jax.peft.fields import at_least, check_fields, require
 
 
 @dataclass(frozen=True)
@@ -25,10 +25,7 @@ class RecapConfig:
             raise ValueError(f"recap has settings, which learn {learn} ignores: add learn recap")
 
     def __post_init__(self) -> None:
-        fields.check_fields(self)
-        if self.steps < 1:
-            raise ValueError(f"recap.steps must be at least 1, got {self.steps}")
-        if not 0 < self.share < 1:
-            raise ValueError(f"recap.share must lie in (0, 1), got {self.share}")
-        if not 0 <= self.dropout < 1:
-            raise ValueError(f"recap.dropout must lie in [0, 1), got {self.dropout}")
+        check_fields(self)
+        at_least(1, self, "steps", prefix="recap.")
+        require(0 < self.share < 1, "recap.share must lie in (0, 1)", self.share)
+        require(0 <= self.dropout < 1, "recap.dropout must lie in [0, 1)", self.dropout)

@@ -60,6 +60,19 @@ def check_names(cls: type, name: str, values: Sequence[Any], fields: Iterable[st
             )
 
 
+def at_least(low: int, owner: object, *names: str, prefix: str = "") -> None:
+    """Raise ValueError if any of the named fields is below `low`."""
+    for name in names:
+        value = getattr(owner, name)
+        require(value >= low, f"{prefix}{name} must be at least {low}", value)
+
+
+def require(holds: bool, rule: str, value: object) -> None:
+    """Raise ValueError unless the rule holds for the value."""
+    if not holds:
+        raise ValueError(f"{rule}, got {value}")
+
+
 def positive_int(name: str, value: Any, maximum: int = MAX_INT) -> int:
     """Return the value; raise ValueError unless it is an integer from 1 to `maximum`."""
     if type(value) is not int or not 1 <= value <= maximum:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from lorasp_jax.peft.auxiliary import Aux
-from lorasp_jax.peft.fields import check_kernel, short
+from lorasp_jax.peft.fields import at_least, check_kernel, short
 from lorasp_jax.peft.method import Kernel, Mask, Method, Params, kaiming_uniform
 
 
@@ -50,8 +50,7 @@ class LoRA(Method):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.rank < 1:
-            raise ValueError(f"rank must be at least 1, got {self.rank}")
+        at_least(1, self, "rank")
         if self.ranks and not (min(self.ranks) >= 0 and 1 <= max(self.ranks) <= self.rank):
             raise ValueError(
                 f"ranks must be from 0 to rank {self.rank}, not all 0, got {short(self.ranks)}"

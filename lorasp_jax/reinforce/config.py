@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import tyro
 
 from lorasp_jax.config import Config
-from lorasp_jax.peft import fields
+from lorasp_jax.peft.fields import at_least, check_fields, require
 
 
 @dataclass(frozen=True)
@@ -70,29 +70,24 @@ class Learning:
     """Start no iteration after this time [min]; 0: no limit."""
 
     def __post_init__(self) -> None:
-        fields.check_fields(self)
-        for name in ("worlds", "epochs", "rounds", "gradient_steps"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"online.{name} must be at least 1, got {getattr(self, name)}")
+        check_fields(self)
+        at_least(1, self, "worlds", "epochs", "rounds", "gradient_steps", prefix="online.")
         rates = "critic_learning_rate", "teacher_learning_rate"
         for name in ("std", "clip", "max_kl", "max_start_kl", *rates):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"online.{name} must be above 0, got {getattr(self, name)}")
-        for name in ("discount", "trace"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"online.{name} must lie in (0, 1], got {getattr(self, name)}")
-        if self.teacher_worlds < 8:  # a quarter of them measures success
-            raise ValueError(f"online.teacher_worlds must be at least 8, got {self.teacher_worlds}")
-        if not 0 <= self.correlation < 1:
-            raise ValueError(f"online.correlation must lie in [0, 1), got {self.correlation}")
+            value = getattr(self, name)
+            require(value > 0, f"online.{name} must be above 0", value)
+        for name in ("discount", "trace", "noise_level"):
+            value = getattr(self, name)
+            require(0 < value <= 1, f"online.{name} must lie in (0, 1]", value)
+        # A quarter of them measures success.
+        at_least(8, self, "teacher_worlds", prefix="online.")
+        rule = "online.correlation must lie in [0, 1)"
+        require(0 <= self.correlation < 1, rule, self.correlation)
         if self.method == "noise" and self.std >= 1:
             raise ValueError(f"online.std must be below 1 for noise, got {self.std}")
         if self.exploration == "sde" and self.method != "ppo":
             raise ValueError(f"online.exploration sde is for ppo, not for {self.method}")
-        if not 0 < self.noise_level <= 1:
-            raise ValueError(f"online.noise_level must lie in (0, 1], got {self.noise_level}")
-        if self.minutes < 0:
-            raise ValueError(f"online.minutes must be at least 0, got {self.minutes}")
+        at_least(0, self, "minutes", prefix="online.")
 
 
 _IGNORED = (
