@@ -95,12 +95,10 @@ def locate_layers(
     ]
 
 
-def locate_matmul_layers(
-    root: nnx.List[Any], einsums: nnx_layers.Einsums = MappingProxyType({})
-) -> list[Location]:
+def locate_matmul_layers(root: nnx.List[Any]) -> list[Location]:
     """List dense layers and einsums, adapted or not; embeddings and convolutions are skipped."""
-    layers = locate_layers(root, einsums)
-    return [layer for layer in layers if not isinstance(layer.child, nnx.Embed | nnx.Conv)]
+    skipped = nnx.Embed | nnx.Conv
+    return [layer for layer in locate_layers(root) if not isinstance(layer.child, skipped)]
 
 
 def check_rules(rules: Any, valid: Callable[[Any], bool], what: str) -> None:

@@ -36,13 +36,9 @@ MIN_WIDTH, MIN_PRODUCTS, MIN_SIZE = 1024, 2**34, 2**25
 product in float8."""
 
 
+@jax.custom_vjp
 def frozen_matmul(x: jax.Array, kernel: Kernel) -> jax.Array:
     """Compute x W, [..., O], in the dtype of x [..., I]. W [I, O] receives no gradient."""
-    return _frozen_matmul(x, kernel)
-
-
-@jax.custom_vjp
-def _frozen_matmul(x: jax.Array, kernel: Kernel) -> jax.Array:
     return matmul(x, kernel)
 
 
@@ -103,4 +99,4 @@ def _backward(kernel: Kernel, g: jax.Array) -> tuple[jax.Array, None]:
     return matmul_transposed(g, kernel), None
 
 
-_frozen_matmul.defvjp(_forward, _backward)
+frozen_matmul.defvjp(_forward, _backward)

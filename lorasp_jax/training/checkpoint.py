@@ -89,8 +89,7 @@ class Checkpoints:
                 continue
             if corrupt:
                 self._rename_corrupt(corrupt, step)
-            names = [jax.tree_util.keystr(p) for p, _ in jax.tree_util.tree_leaves_with_path(like)]
-            return jax.tree.unflatten(jax.tree.structure(like), [leaves[n] for n in names])
+            return jax.tree.unflatten(jax.tree.structure(like), [leaves[n] for n in by_path(like)])
         if corrupt:
             reasons = "; ".join(f"step {step}: {reason}" for step, reason in corrupt.items())
             raise ValueError(

@@ -1,7 +1,6 @@
 """Grouped-query attention with masks and fp32 softmax."""
 
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -78,15 +77,7 @@ def _few_queries(
     return cached_attention(q, last, before, mask)
 
 
-def _few_queries_forward(*arrays: Any) -> tuple[jax.Array, Any]:
-    return jax.vjp(_concatenated, *arrays)
-
-
-def _few_queries_backward(vjp: Any, dy: jax.Array) -> tuple:
-    return vjp(dy)
-
-
-_few_queries.defvjp(_few_queries_forward, _few_queries_backward)
+_few_queries.defvjp(lambda *arrays: jax.vjp(_concatenated, *arrays), lambda vjp, dy: vjp(dy))
 
 
 def _concatenated(
