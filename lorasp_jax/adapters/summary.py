@@ -24,12 +24,8 @@ def summary(model: nnx.Module, aux: Mapping[str, Aux] | None = None) -> str:
     """Format a table of a model's layers, other trainable parameters and other matrices.
 
     Columns: path, method, kernel shape, rank, parameters (base and adapter), trainable parameters,
-    and, if `aux` is given, mean active rank. Lines below the table give the trainable share, the
-    modules that are entirely frozen and any unsupported classes.
-
-    Args:
-        model: adapted or not.
-        aux: from `collect_aux`.
+    and, if `aux` of `collect_aux` is given, mean active rank. Lines below the table give the
+    trainable share, the modules that are entirely frozen and any unsupported classes.
 
     Raises:
         ValueError: aux has a path that is not a layer of the model.

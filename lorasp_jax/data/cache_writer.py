@@ -39,12 +39,9 @@ class Column:
 
 
 def map_column(path: Path, dtype: Any, expected: int | tuple[int, ...]) -> np.ndarray:
-    """Memory-map an array.
+    """Memory-map the array of a .npy file.
 
-    Args:
-        path: the .npy file.
-        dtype: expected dtype.
-        expected: checksum of the array's bytes, for which all are read, or its shape.
+    `expected` is the checksum of its bytes, for which all are read, or its shape.
 
     Raises:
         ValueError: the file is missing or damaged.

@@ -59,10 +59,7 @@ def read(where: str | os.PathLike[str], image_size: int) -> tuple[str, Keys]:
 def write(file: Path, where: str, keys: Keys) -> None:
     """Write a dataset file with the options that are not the defaults.
 
-    Args:
-        file: the file.
-        where: the dataset; a local path is written relative to the file.
-        keys: its options.
+    A local path, in `where`, is written relative to the file.
     """
     path = where if hub.is_remote(where) else os.path.relpath(where, file.parent)
     # Strings, numbers and lists look the same in JSON and in TOML.

@@ -70,10 +70,7 @@ def _why_not_color(feature: Mapping[str, Any]) -> str:
 def dimension_names(features: Features, key: str, path: Path) -> list[str]:
     """Return the names of a feature's dimensions, or their indices if they are unnamed.
 
-    Args:
-        features: those of the dataset.
-        key: the feature.
-        path: meta/info.json.
+    Errors name `path`, that of meta/info.json.
 
     Raises:
         KeyError, TypeError, ValueError: the feature is missing, or is no vector.

@@ -26,9 +26,7 @@ _CONFIG: records.Schema = records.CONFIG | {
 def write(run: Path, task: str | None = None) -> Iterator[Path]:
     """Write rank_map_<task>.mp4 into the folder of a finished run; yield each file when complete.
 
-    Args:
-        run: folder of the run.
-        task: None films every task.
+    Without `task`, it films every task.
 
     Raises:
         ValueError: the run is unfinished, cannot be simulated, lacks the task, or has no active

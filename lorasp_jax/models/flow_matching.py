@@ -45,14 +45,7 @@ def sample_time(key: jax.Array, batch: int, shape: float = Times.shape) -> jax.A
 def draw(
     key: jax.Array, actions: jax.Array, times: Times = PI0_TIMES
 ) -> tuple[jax.Array, jax.Array]:
-    """Sample noise `[B, C, A]` f32 and flow times for actions `[B, C, A]`.
-
-    Do not reuse `key`.
-
-    Args:
-        key: typed PRNG key.
-        actions: only their shape matters.
-        times: how flow times are sampled.
+    """Sample noise `[B, C, A]` f32 and flow times for actions `[B, C, A]`; do not reuse `key`.
 
     Returns:
         The noise, and times `[B]`, or `[B, C]` if `times.max_delay` is above 0.
@@ -74,12 +67,9 @@ def first(length: jax.Array, chunk: int) -> jax.Array:
 def interpolate(
     noise: jax.Array, actions: jax.Array, flow_time: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Compute x_t = t noise + (1 - t) actions and its velocity u_t = noise - actions.
+    """Compute x_t = t noise + (1 - t) actions and its velocity u_t = noise - actions, `[B, C, A]`.
 
-    Args:
-        noise: `[B, C, A]`.
-        actions: `[B, C, A]`.
-        flow_time: t, `[B]` or `[B, C]`.
+    t is `[B]`, or `[B, C]` with one time per action.
     """
     t = flow_time[:, None, None] if flow_time.ndim == 1 else flow_time[:, :, None]
     return t * noise + (1 - t) * actions, noise - actions

@@ -164,10 +164,6 @@ class Method(Bottleneck):
     ) -> tuple[jax.Array, Aux]:
         """Compute what the adapter adds to x @ kernel, [...tokens, O], and aux.
 
-        Args:
-            params: from `init`.
-            x: [...tokens, I].
-
         Raises:
             ValueError: the method is not additive, x is not floating point, or the parameters
                 belong to another method.

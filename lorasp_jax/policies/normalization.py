@@ -46,13 +46,7 @@ class _AffineMap(NamedTuple):
 def normalize(
     values: jax.Array, stats: Mapping[str, jax.Array], mode: Mode, convention: Convention
 ) -> jax.Array:
-    """Normalize states or actions to `[..., J+1]` f32.
-
-    Args:
-        values: `[..., J+1]` [rad, m].
-        stats: their statistics by name, `[J+1]` each.
-        mode: see the module docstring.
-        convention: see the module docstring.
+    """Normalize states or actions `[..., J+1]` [rad, m], given their statistics `[J+1]`, to f32.
 
     Raises:
         ValueError: a statistic that the mode needs is missing.

@@ -63,15 +63,9 @@ class Offline:
     def encode(
         self, texts: Sequence[str], max_tokens: int, *, complete: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Encode P texts, padded on the right with id 0.
+        """Encode texts as `Tokenizer.encode` does, padded with id 0; case is ignored.
 
-        Args:
-            texts: instructions; case is ignored.
-            max_tokens: T.
-            complete: has no effect, because there is no prompt template.
-
-        Returns:
-            ids `[P, T]` int32, valid `[P, T]` bool.
+        `complete` has no effect, because there is no prompt template.
 
         Raises:
             ValueError: a text is empty, needs more than `max_tokens` tokens, or contains characters

@@ -201,14 +201,7 @@ def means(
     """Return the means of the actions `[N, C, A]` of chunks, differentiable, and the adapters' aux.
 
     They are what `sample_actions` returns, up to rounding, or the means of x_{k+1} of `flow_sde`
-    where there is noise.
-
-    Args:
-        model: the adapted model, not its sampler.
-        processor: the robot's.
-        chunks: N of them.
-        num_steps: Euler steps.
-        level: that of `flow_sde`.
+    where there is noise. `model` is the adapted one, not its sampler.
     """
     obs = processor.encode(chunks.observation, chunks.prompts)
     prefix, aux = model.run_prefix(obs)

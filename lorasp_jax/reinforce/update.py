@@ -175,9 +175,7 @@ def improve(
 ) -> tuple[Learner, dict[str, np.ndarray]]:
     """Take gradient steps on minibatches of chunks until the policy has changed enough.
 
-    Args:
-        batch: chunks with any means.
-        key: orders the chunks.
+    The means of the chunks are computed first; `key` orders the chunks.
 
     Returns:
         The state, and the metrics of all steps; none if no action is valid.

@@ -68,11 +68,7 @@ def with_data(
 ) -> Run:
     """Return a finished run with its data; a dataset stays on the disk.
 
-    Args:
-        config: the run's.
-        folder: the run's.
-        model: config of its backbone.
-        collect: loads or collects its demonstrations.
+    `collect` loads or collects its demonstrations.
 
     Raises:
         ValueError: its recordings are gone, or are others.

@@ -45,11 +45,7 @@ Model = TypeVar("Model", bound=nnx.Module)
 
 
 def save(folder: Folder, model: Any) -> None:
-    """Save a model without adapters, replacing any model in the folder.
-
-    Args:
-        folder: created if missing.
-        model: a backbone.
+    """Save a backbone without adapters, replacing any model in the folder.
 
     Raises:
         ValueError: the model has adapters or quantized kernels, or the folder is a URL.

@@ -158,15 +158,7 @@ def positions(valid: jax.Array) -> jax.Array:
 
 
 def valid_first(x: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Move the valid tokens before the others; their own order is kept.
-
-    Args:
-        x: `[B, T, D]`.
-        valid: `[B, T]` bool.
-
-    Returns:
-        x and valid in the new order.
-    """
+    """Return x `[B, T, D]` and valid `[B, T]` with the valid tokens first, in their own order."""
     order = jnp.argsort(~valid, axis=1, stable=True)
 
     def permute(x: jax.Array, order: jax.Array) -> jax.Array:
@@ -181,14 +173,8 @@ def block_mask(
 ) -> jax.Array:
     """Create a mask: valid queries attend to valid keys of their own and earlier token blocks.
 
-    Args:
-        query_block: `[T]` int, block number of each query token.
-        key_block: `[S]` int, block number of each key token.
-        query_valid: `[B, T]` bool.
-        key_valid: `[B, S]` bool.
-
-    Returns:
-        `[B, T, S]` bool.
+    Each token's block has a number: `query_block` is `[T]`, `key_block` `[S]`, and the mask
+    `[B, T, S]`.
     """
     order = key_block[None, :] <= query_block[:, None]
     return jnp.asarray(order) & query_valid[:, :, None] & key_valid[:, None, :]
@@ -197,12 +183,7 @@ def block_mask(
 def rope_table(position: jax.Array, head_dim: int) -> tuple[jax.Array, jax.Array]:
     """Compute RoPE's sine and cosine of position / 10000^(2i/H) (arXiv 2104.09864).
 
-    Args:
-        position: `[B, T]` int32.
-        head_dim: H.
-
-    Returns:
-        Sine and cosine, each `[B, T, 1, H/2]` f32.
+    For positions `[B, T]` and heads of width H, both are `[B, T, 1, H/2]` f32.
     """
     wavelength = 10_000.0 ** (np.arange(0, head_dim, 2, dtype=np.float32) / head_dim)
     angle = position[:, :, None, None].astype(jnp.float32) / wavelength
