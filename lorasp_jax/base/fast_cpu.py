@@ -55,6 +55,20 @@ def without_simulation() -> dict[str, str | bool] | None:
     return {_NAME: True} if _NEEDED and jax.default_backend() == "cpu" else None
 
 
+def jit_policy(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+    """Apply `jax.jit` to a function that does not simulate, with `without_simulation`."""
+
+    @functools.cache  # at the first call, because the compiler options start JAX's backend
+    def jitted() -> Callable[..., Any]:
+        return jax.jit(function, **options, compiler_options=without_simulation())
+
+    @functools.wraps(function)
+    def call(*arguments: Any, **named: Any) -> Any:
+        return jitted()(*arguments, **named)
+
+    return call
+
+
 def jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     """Apply `jax.jit`, with fast simulation on CPU even if it was too late to set the flag."""
     plain = jax.jit(function, **options)

@@ -118,7 +118,7 @@ class SplitRollout:
             compiling.append(pool.submit(observe.compile))
             prompts, done = shape(worlds, dtype="int32"), shape(worlds, dtype="bool")
             inputs = jax.tree.map(blank, (observe.out_info, prompts, done))
-            predict = functools.partial(_predict(), denoise_steps=self.denoise_steps)
+            predict = functools.partial(_predict, denoise_steps=self.denoise_steps)
             # Called, because several threads' calls compile this shared program only once.
             compiling.append(pool.submit(predict, policy, key, np.int32(0), *inputs))
             actions = shape(worlds, self.execute_steps, len(slots), dtype="float32")
@@ -177,7 +177,7 @@ class Worlds:
         """Observe the worlds and sample a chunk in each; see `predict`."""
         observation, done = self.observe(), self.state.done
         inputs = (self.sample_key, np.int32(call), observation, self._prompts, done)
-        actions, ranks = _predict()(self.policy, *inputs, denoise_steps=denoise_steps, **previous)
+        actions, ranks = _predict(self.policy, *inputs, denoise_steps=denoise_steps, **previous)
         return jax.device_put(actions, self._place), ranks
 
     def act(self, actions: jax.Array, execute_steps: int) -> Poses:
@@ -222,6 +222,9 @@ def predict(
     ranks = metrics.layer_ranks(aux, ~done)
     histogram = metrics.rank_histogram(aux, ~done, _max_rank(policy))
     return actions, (ranks, histogram, jnp.sum(~done))
+
+
+_predict = fast_cpu.jit_policy(predict, static_argnames="denoise_steps")
 
 
 def _shareable(policy: Policy) -> Policy:
@@ -273,13 +276,6 @@ def _act(env: Env, state: State, actions: jax.Array) -> tuple[State, Poses]:
 @_cached
 def _hold(env: Env, state: State, action: jax.Array, steps: jax.Array) -> State:
     return jax.lax.fori_loop(0, steps, lambda _, state: env.step(state, action), state)
-
-
-@functools.cache
-def _predict() -> Callable[..., Any]:
-    """Return the jitted `predict`; not a constant, because its options start JAX's backend."""
-    options = fast_cpu.without_simulation()
-    return jax.jit(predict, static_argnames="denoise_steps", compiler_options=options)
 
 
 def _placement(policy: Policy) -> Any:

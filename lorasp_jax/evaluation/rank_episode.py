@@ -1,9 +1,8 @@
 """Play an episode of a run's policy and record active ranks at every control step."""
 
-import functools
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -76,7 +75,7 @@ def play(policy: Policy, env: Env, config: Mapping[str, Any], key: jax.Array) ->
         call, index = divmod(len(steps), settings["execute_steps"])
         arguments = policy, jax.random.fold_in(sample_key, call), env.observe(state), row
         with messages.announce("the policy"):
-            actions, *ranks = _sample()(*arguments, denoise_steps=settings["denoise_steps"])
+            actions, *ranks = _sample(*arguments, denoise_steps=settings["denoise_steps"])
         steps.append(jax.tree.map(np.asarray, (Poses.of(state.data), *ranks)))
         chunk = chunk if index else actions
         state = env.step(state, chunk[:, index])
@@ -84,13 +83,6 @@ def play(policy: Policy, env: Env, config: Mapping[str, Any], key: jax.Array) ->
     poses = jax.tree.map(lambda x: x[:, 0], poses)
     success = bool(state.info["success"][0])
     return RankEpisode(env.instructions[instruction], success, poses, patches, towers, draw)
-
-
-@functools.cache
-def _sample() -> Callable[..., Any]:
-    """Return the jitted policy; not a constant, because its options start JAX's backend."""
-    options = fast_cpu.without_simulation()
-    return jax.jit(sample, static_argnames="denoise_steps", compiler_options=options)
 
 
 def sample(
@@ -105,6 +97,9 @@ def sample(
         if linears
     }
     return actions, patch_ranks(aux, policy), towers
+
+
+_sample = fast_cpu.jit_policy(sample, static_argnames="denoise_steps")
 
 
 def patch_ranks(aux: metrics.Reports, policy: Policy) -> dict[str, jax.Array]:

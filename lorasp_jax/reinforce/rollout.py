@@ -110,7 +110,7 @@ def collect(
     def act(key: jax.Array, worlds: Worlds) -> tuple[jax.Array, Chunks]:
         prompts = rows[worlds.state.info["instruction"]]
         inputs = key, worlds.observe(), prompts, spread, denoise_steps, execute_steps, sde
-        return _explore()(worlds.policy, *inputs)
+        return _explore(worlds.policy, *inputs)
 
     return play(env, policy, act, key, execute_steps=execute_steps, ranges=ranges)
 
@@ -159,13 +159,6 @@ def _over_devices(tree: Any, policy: Policy) -> Any:
     return jax.device_put(tree, meshes.batch_sharding(sharding.mesh))
 
 
-@functools.cache
-def _explore() -> Callable[..., Any]:
-    """Return the jitted `explore`; not a constant, because its options start JAX's backend."""
-    options = fast_cpu.without_simulation()
-    return jax.jit(explore, static_argnums=(5, 6, 7), compiler_options=options)
-
-
 def explore(
     policy: Policy,
     key: jax.Array,
@@ -193,6 +186,9 @@ def explore(
         whole = jnp.concatenate([actions, mean[:, execute_steps:]], axis=1)
         chunks = Chunks(observation, prompts, initial, whole)
     return processor.decode(actions, observation["state"]), chunks
+
+
+_explore = fast_cpu.jit_policy(explore, static_argnums=(5, 6, 7))
 
 
 def means(

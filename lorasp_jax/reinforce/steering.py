@@ -6,7 +6,6 @@ actor learns, from what the policy sees, by proximal policy optimization.
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -135,17 +134,10 @@ def _collect(setting: Setting, task: str, policy: Policy, key: jax.Array) -> Exp
 
     def act(key: jax.Array, worlds: Worlds) -> tuple[jax.Array, Shifts]:
         prompts = rows[worlds.state.info["instruction"]]
-        return _explore()(worlds.policy, key, worlds.observe(), prompts, *counts)
+        return _explore(worlds.policy, key, worlds.observe(), prompts, *counts)
 
     ranges = setting.config.ranges
     return rollout.play(env, policy, act, key, execute_steps=counts[1], ranges=ranges)
-
-
-@functools.cache
-def _explore() -> Callable[..., Any]:
-    """Return the jitted `explore`; not a constant, because its options start JAX's backend."""
-    options = fast_cpu.without_simulation()
-    return jax.jit(explore, static_argnums=(4, 5), compiler_options=options)
 
 
 def explore(
@@ -172,3 +164,6 @@ def explore(
     executed = change[:, :execute_steps, np.array(processor.action_slots)]
     effect = jnp.mean(jnp.square(executed), axis=(1, 2))
     return actions, Shifts(seen, mean, chosen, effect)
+
+
+_explore = fast_cpu.jit_policy(explore, static_argnums=(4, 5))
