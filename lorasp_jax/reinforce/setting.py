@@ -18,6 +18,7 @@ from lorasp_jax.config import OptimConfig
 from lorasp_jax.models import noise_actor
 from lorasp_jax.models.noise_actor import PATH, NoiseActor
 from lorasp_jax.peft import AdaLoRA, FullFineTuning
+from lorasp_jax.peft.fields import require
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.reinforce import descent, noise, rollout, student, update
 from lorasp_jax.reinforce.config import ReinforceConfig
@@ -105,18 +106,12 @@ def prepare(run: Run) -> tuple[Setting, Learner, Any]:
     assert isinstance(config, ReinforceConfig)
     learning = config.online
     environments = {task: environment(config, task, learning.worlds) for task in config.tasks}
-    gyms = {}
     mesh = meshes.make_mesh(config.fsdp, run.devices)
-    if learning.method == "teacher":
-        # The engine would simulate all worlds once for each of several devices.
-        backend = "mujoco" if jax.default_backend() == "cpu" and mesh.size == 1 else None
-        sizes = learning.teacher_worlds, backend
-        gyms = {task: environment(config, task, *sizes) for task in config.tasks}
+    gyms = _gyms(config, mesh.size)
     check_memory(config, environments)
     for name in ("worlds", "teacher_worlds") if gyms else ("worlds",):
-        if (count := getattr(learning, name)) % mesh.size:
-            devices = f"the number of devices ({mesh.size})"
-            raise ValueError(f"online.{name} must be a multiple of {devices}, got {count}")
+        rule = f"online.{name} must be a multiple of the number of devices ({mesh.size})"
+        require((count := getattr(learning, name)) % mesh.size == 0, rule, count)
     if run.policy.model.noise_actor is not None:
         raise ValueError("the policy has learned its initial noise: start from an earlier one")
     if learning.method == "noise":
@@ -144,6 +139,16 @@ def prepare(run: Run) -> tuple[Setting, Learner, Any]:
     shapes = jax.tree.map(meshes.with_sharding, jax.eval_shape(lambda: state), shardings)
     fixed = config, environments, programs, frozen, start, policy, shardings, imitate, gyms
     return Setting(*fixed), state, shapes
+
+
+def _gyms(config: ReinforceConfig, devices: int) -> dict[str, Env]:
+    """Return by task the worlds in which teachers practise; none without teachers."""
+    if config.online.method != "teacher":
+        return {}
+    # The engine would simulate all worlds once for each of several devices.
+    backend = "mujoco" if jax.default_backend() == "cpu" and devices == 1 else None
+    sizes = config.online.teacher_worlds, backend
+    return {task: environment(config, task, *sizes) for task in config.tasks}
 
 
 def _steered(config: ReinforceConfig, policy: Policy) -> Policy:

@@ -134,19 +134,8 @@ def load(run: Run, source: Source, free_bytes: float) -> None:
     metadata = cache.metadata
     facts = (metadata[name] for name in ("tasks", "robot", "physics_dt"))
     run.recordings, run.simulated = cache, is_simulated(*facts)
-    tasks, phrases = _labels(cache, data)
-    learn = run.config.learn
     chosen = offline.choose(cache, run.config)
-    among = None if learn == "imitation" else [n for n in chosen.successes if n < len(tasks)]
-    offline.check(chosen, cache, (), learn)
-    options = {"recorded": not run.simulated, "among": among}
-    run.held_out = held_out(data.validation, tasks, phrases, **options)
-    if among is not None and (wrong := sorted({*run.held_out} - {*among})):
-        raise ValueError(
-            f"data.validation names episode_{wrong[0]}, which did not succeed, so --learn {learn} "
-            "cannot be measured on it: name one that did"
-        )
-    offline.check(chosen, cache, run.held_out, learn)
+    run.held_out = _held_out(run, cache, chosen)
     unused = {*run.held_out, *chosen.left_out}
     steps = corrected_only(without(cache.steps, unused), cache, {*chosen.corrected} - unused)
     run.dataset, run.chosen = mixed(steps, data), chosen
@@ -167,7 +156,27 @@ def load(run: Run, source: Source, free_bytes: float) -> None:
         run.config, robot=metadata["robot"], tasks=tuple(metadata["tasks"])
     )
     _describe(run, cache, identity.get("datasets", []))
-    offline.describe(chosen, cache, run.held_out, learn, run.console)
+    offline.describe(chosen, cache, run.held_out, run.config.learn, run.console)
+
+
+def _held_out(run: Run, cache: Cache, chosen: offline.Chosen) -> list[int]:
+    """Return the episodes to hold out, which succeeded unless the policy imitates all.
+
+    Raises:
+        ValueError: there are too few episodes, or one was named that did not succeed.
+    """
+    validation, learn = run.config.data.validation, run.config.learn
+    tasks, phrases = _labels(cache, run.config.data)
+    among = None if learn == "imitation" else [n for n in chosen.successes if n < len(tasks)]
+    offline.check(chosen, cache, (), learn)
+    found = held_out(validation, tasks, phrases, recorded=not run.simulated, among=among)
+    if among is not None and (wrong := sorted({*found} - {*among})):
+        raise ValueError(
+            f"data.validation names episode_{wrong[0]}, which did not succeed, so --learn {learn} "
+            "cannot be measured on it: name one that did"
+        )
+    offline.check(chosen, cache, found, learn)
+    return found
 
 
 def _labels(cache: Cache, data: DataConfig) -> tuple[list[str], list[str]]:

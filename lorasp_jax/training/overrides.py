@@ -77,10 +77,7 @@ def parse(arguments: Sequence[str], program: str = "python train.py") -> Command
         config = dataclasses.replace(config, plan=plan.read(known.plan))
     _check_simulated(config)
     _check_rules(config, ["--method"] * bool(known.method) + rest)
-    options = (text.partition("=")[0] for text in rest if text.startswith("--"))
-    given = frozenset(option.lstrip("-").replace("-", "_") for option in options)
-    given |= {"peft"} if known.method else set()
-    given |= {"plan"} if known.plan else set()
+    given = _given(known, rest)
     if "tasks" in given and config.data.source:
         raise ValueError("--tasks names simulated tasks, but --data.source decides them: drop it")
     if known.plan and "peft.rank" in given:
@@ -88,6 +85,13 @@ def parse(arguments: Sequence[str], program: str = "python train.py") -> Command
             "--peft.rank and --plan, which has the ranks, cannot be combined: drop one"
         )
     return Command(config, known.resume, known.dry_run, known.wandb, known.fit, given)
+
+
+def _given(known: argparse.Namespace, rest: Sequence[str]) -> frozenset[str]:
+    """Return the names of the fields that the command line sets."""
+    options = (text.partition("=")[0] for text in rest if text.startswith("--"))
+    given = frozenset(option.lstrip("-").replace("-", "_") for option in options)
+    return given | ({"peft"} if known.method else set()) | ({"plan"} if known.plan else set())
 
 
 def _option_parser(program: str = "", method: str = "") -> argparse.ArgumentParser:
