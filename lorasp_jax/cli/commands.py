@@ -16,10 +16,7 @@ COMMANDS = {
         "lorasp_jax.evaluation.__main__",
         "measure a run on recorded episodes, or record its own in simulation",
     ),
-    "study": (
-        "lorasp_jax.extras.study.__main__",
-        "run many experiments",
-    ),
+    "study": ("lorasp_jax.extras.study.__main__", "run many experiments"),
     "judge": ("lorasp_jax.extras.judge.__main__", "judge a policy in a Gymnasium environment"),
     "latency": (
         "lorasp_jax.extras.latency.__main__",

@@ -149,14 +149,7 @@ class Pi0(Backbone):
         self._make_projections(config.action.width, rngs)
 
     def embed_prefix(self, obs: Observation) -> tuple[jax.Array, jax.Array, ModelAux]:
-        """Embed images and instruction as tokens.
-
-        Returns:
-            tokens `[B, P, D]`, valid `[B, P]` bool, aux of the vision tower's adapters.
-
-        Raises:
-            ValueError: a camera is missing or an image has the wrong size.
-        """
+        """Embed images and instruction as tokens; for results and errors see `encode_images`."""
         image_tokens, image_valid, aux = self.encode_images(obs)
         tokens = jnp.concatenate([image_tokens, self.language.embed(obs.tokens)], axis=1)
         return tokens, jnp.concatenate([image_valid, obs.token_mask], axis=1), aux

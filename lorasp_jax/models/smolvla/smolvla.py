@@ -145,14 +145,7 @@ class SmolVLA(Backbone):
         self._make_projections(config.language.width, rngs)
 
     def embed_prefix(self, obs: Observation) -> tuple[jax.Array, jax.Array, ModelAux]:
-        """Embed images, instruction and state as tokens.
-
-        Returns:
-            tokens `[B, P, D]`, valid `[B, P]` bool, the adapters' aux.
-
-        Raises:
-            ValueError: a camera is missing or an image has the wrong size.
-        """
+        """Embed images, instruction and state as `encode_images` does images."""
         image_tokens, image_valid, aux = self.encode_images(obs)
         state_valid = jnp.ones((obs.state.shape[0], 1), bool)
         state = obs.state[:, None].astype(jnp.float32)
