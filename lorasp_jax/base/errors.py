@@ -28,7 +28,7 @@ _REQUIREMENTS = {"PIL": "pillow", "can": "piper-sdk", "warp": "mujoco-mjx[warp]"
 
 def run_command(
     command: Callable[[], int | None],
-    errors: "Console",
+    errors: "Console | None" = None,
     interrupted: str = "interrupted",
     remedy: str = "",
 ) -> int:
@@ -36,10 +36,14 @@ def run_command(
 
     Args:
         command: returns the exit code; None means 0.
-        errors: console to print to.
+        errors: console to print to; by default, that of standard error.
         interrupted: printed after Ctrl-C, unless the exception says more.
         remedy: see `report_error`.
     """
+    if errors is None:
+        from rich.console import Console
+
+        errors = Console(stderr=True)
     try:
         return command() or 0
     except Exception as error:  # prints one sentence for bad input, re-raises bugs

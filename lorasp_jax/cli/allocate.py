@@ -4,8 +4,6 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-
 from lorasp_jax.base import arguments as types
 from lorasp_jax.base.errors import run_command
 
@@ -13,7 +11,7 @@ from lorasp_jax.base.errors import run_command
 def main(arguments: Sequence[str], program: str = "lorasp-jax allocate") -> int:
     """Write a plan; return the exit code, one of `lorasp_jax.base.errors`."""
     options = parser(program).parse_args(arguments)
-    return run_command(lambda: _run(options), Console(stderr=True))
+    return run_command(lambda: _run(options))
 
 
 def parser(program: str) -> argparse.ArgumentParser:
@@ -43,7 +41,8 @@ def _run(options: argparse.Namespace) -> None:
     plan = from_run(options.run, rank=options.rank, least=options.least, drop=options.drop)
     plan.save(options.out)
     ranks = [rank for each in plan.ranks.values() for rank in each]
-    count = plan.count(shapes(RecordedPolicy.read(options.run), plan.ranks))
+    config = RecordedPolicy.read(options.run).config
+    count = plan.count(shapes(config, frozenset(plan.ranks)))
     print(
         f"written: {options.out}, ranks from {min(ranks)} to {max(ranks)} in {len(ranks)} layers, "
         f"{count:,} of at most {plan.budget:,} parameters"

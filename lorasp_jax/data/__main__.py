@@ -29,7 +29,7 @@ def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.data") -
     jax.config.update("jax_platforms", "cpu")  # leave accelerators to other processes
     interrupted = "interrupted; temporary files were removed"
     command = functools.partial(options.command, options, Console())
-    return run_command(command, Console(stderr=True), interrupted)
+    return run_command(command, interrupted=interrupted)
 
 
 def inspect(options: argparse.Namespace, console: Console) -> None:

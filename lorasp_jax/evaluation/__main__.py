@@ -29,7 +29,7 @@ def main(arguments: Sequence[str], program: str = "lorasp-jax evaluate") -> int:
     options = own.parse_args(arguments)
     _refuse_unused(own, options)
     command = record if options.record else evaluate
-    return run_command(lambda: command(options, Console()), Console(stderr=True))
+    return run_command(lambda: command(options, Console()))
 
 
 def parser(program: str) -> argparse.ArgumentParser:

@@ -25,7 +25,7 @@ def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.report")
         for path in write(options):
             Console().print(f"{what}: {path}", soft_wrap=True, highlight=False, markup=False)
 
-    return run_command(show, Console(stderr=True))
+    return run_command(show)
 
 
 def _report(options: argparse.Namespace) -> Iterable[Path]:

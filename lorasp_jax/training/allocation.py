@@ -1,12 +1,13 @@
 """Make a plan of ranks from the active ranks of a finished run."""
 
+import functools
 import re
-from collections.abc import Iterable
 from pathlib import Path
 
 from flax import nnx
 
 from lorasp_jax.adapters.io import native
+from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.peft.plan import RankPlan, Shapes, allocate
 from lorasp_jax.training import export, records, rules
 from lorasp_jax.training.run_folder import read_json
@@ -49,7 +50,7 @@ def from_run(run: Path, *, rank: float | None = None, least: int = 1, drop: int 
         ranks = {path: found[rules.tower(path)][rules.short_name(path)] for path in methods}
     except KeyError as error:
         raise ValueError(f"{run / RESULTS} has no active ranks of {error}") from error
-    sizes = shapes(recorded, methods)
+    sizes = shapes(recorded.config, frozenset(methods))
     most = max(settings["rank"] for settings in methods.values())
     mean = results["active_rank"]["mean"] if rank is None else rank
     if mean > most:
@@ -61,7 +62,8 @@ def from_run(run: Path, *, rank: float | None = None, least: int = 1, drop: int 
     return RankPlan(recorded.fields["backbone"], planned, source, rule, budget)
 
 
-def shapes(run: export.RecordedPolicy, layers: Iterable[str]) -> Shapes:
-    """Return the shapes of the layers with these paths in a run's model."""
-    model = nnx.eval_shape(lambda: run.config.create(nnx.Rngs(0)))
+@functools.lru_cache(maxsize=1)  # a command plans, then counts
+def shapes(config: BackboneConfig, layers: frozenset[str]) -> Shapes:
+    """Return the shapes of the layers with these paths in a backbone."""
+    model = nnx.eval_shape(lambda: config.create(nnx.Rngs(0)))
     return rules.shapes(model, [f"^{re.escape(path)}$" for path in layers])

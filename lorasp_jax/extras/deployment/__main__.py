@@ -6,15 +6,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-
 from lorasp_jax.base.errors import run_command
 
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.deployment") -> int:
     """Measure all variants, or save one; return the exit code, one of `lorasp_jax.base.errors`."""
     options = parser(program).parse_args(arguments)
-    return run_command(lambda: _run(options), Console(stderr=True))
+    return run_command(lambda: _run(options))
 
 
 def parser(program: str) -> argparse.ArgumentParser:

@@ -7,8 +7,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-
 from lorasp_jax.base.errors import run_command
 from lorasp_jax.base.files import check_local
 from lorasp_jax.extras.latency import curve, figure
@@ -27,7 +25,7 @@ def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.l
     """Measure runs and draw the figure; return the exit code, one of `lorasp_jax.base.errors`."""
     options = parser(program).parse_args(arguments)
     interrupted = "interrupted; the same command continues"
-    return run_command(lambda: _measure(options), Console(stderr=True), interrupted)
+    return run_command(lambda: _measure(options), interrupted=interrupted)
 
 
 def _measure(options: argparse.Namespace) -> None:

@@ -36,7 +36,7 @@ QUESTION = "success (s), failure (f), again (a) or quit (q)?"
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.piper") -> int:
     """Run episodes; return the exit code: `HELD`, or one of `lorasp_jax.base.errors`."""
     options = parser(program).parse_args(arguments)
-    return run_command(lambda: _run(options), Console(stderr=True))
+    return run_command(lambda: _run(options))
 
 
 def parser(program: str) -> argparse.ArgumentParser:

@@ -36,8 +36,7 @@ def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.s
     Exit with 1 if the policy hangs then.
     """
     options = parser(program).parse_args(arguments)
-    console = Console(stderr=True)
-    return run_command(lambda: _serve(options, Console()), console)
+    return run_command(lambda: _serve(options, Console()))
 
 
 def parser(program: str) -> argparse.ArgumentParser:

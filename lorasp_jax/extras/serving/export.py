@@ -17,7 +17,7 @@ def main(
 ) -> int:
     """Export runs; return the exit code, one of `lorasp_jax.base.errors`."""
     options = parser(program).parse_args(arguments)
-    return run_command(lambda: _export(options, Console()), Console(stderr=True))
+    return run_command(lambda: _export(options, Console()))
 
 
 def parser(program: str) -> argparse.ArgumentParser:

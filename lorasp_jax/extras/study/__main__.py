@@ -29,7 +29,7 @@ def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.s
     """
     options = parser(program).parse_args(arguments)
     interrupted = "stopped; to resume, give the same command"
-    return run_command(lambda: _execute(options, Console()), Console(stderr=True), interrupted)
+    return run_command(lambda: _execute(options, Console()), interrupted=interrupted)
 
 
 def parser(program: str) -> argparse.ArgumentParser:

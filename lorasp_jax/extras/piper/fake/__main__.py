@@ -42,8 +42,7 @@ _CHANNELS = itertools.count()  # the SDK keeps one interface per name in a proce
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.extras.piper.fake") -> int:
     """Run episodes; return the exit code, one of `lorasp_jax.base.errors`."""
     options = parser(program).parse_args(arguments)
-    console = Console()
-    return run_command(lambda: _run(options, console), Console(stderr=True))
+    return run_command(lambda: _run(options, Console()))
 
 
 def parser(program: str) -> argparse.ArgumentParser:
