@@ -113,9 +113,9 @@ def _difference_table(results: Results, backbone: str) -> str:
         cells = []
         for n in COUNTS:
             both = ([cell(backbone, m, "none", n, s) for s in SEEDS] for m in (method, STEPPED))
-            pair = [outcomes(found, "recorded") for found in ran(results, *both)]
-            cells.append(statistics.bootstrap(lambda x, y: (x - y).mean(-1), *pair))
-        rows.append([label, *map(page.points, cells)])
+            pair = (outcomes(found, "recorded") for found in ran(results, *both))
+            cells.append(page.difference(*pair))
+        rows.append([label, *cells])
     head = [f"{BACKBONES[backbone]}, points", *(f"N = {n}" for n in COUNTS)]
     return page.table(head, rows)
 
@@ -127,8 +127,7 @@ def _parts_table(results: Results) -> str:
         cells = []
         for backbone, scene in itertools.product(BACKBONES, SCENES):
             result = results.get(cell(backbone, STEPPED, part, COUNTS[-1], SEEDS[0]))
-            rate = statistics.success(outcomes([result], scene)) if result else None
-            cells.append(page.percent(rate) if rate else page.NONE)
+            cells.append(page.success(outcomes([result], scene) if result else None))
         rows.append([label, *cells])
     head = [f"{name}, {scene}" for name in BACKBONES.values() for scene in SCENES.values()]
     return page.table(["augmentation", *head], rows)

@@ -66,7 +66,7 @@ def _estimate(results: Results, backbone: str, policy: str, steps: int, tasks: A
 
 
 def _success(*where: Any) -> str:
-    return page.percent(_estimate(*where))
+    return page.success(outcomes(*where))
 
 
 def _jerk(results: Results, *where: Any) -> str:
@@ -112,8 +112,7 @@ def _task_table(results: Results, backbone: str) -> str:
         cells = []
         for n in STEPS[:-1]:
             fewer = outcomes(results, backbone, "lora_sp", n, [task])
-            difference = statistics.bootstrap(lambda x, y: (x - y).mean(-1), fewer, most)
-            cells.append(page.points(difference))
+            cells.append(page.difference(fewer, most))
         rows.append([task, *cells, f"{100 * most.mean():.1f}"])
     head = [f"{BACKBONES[backbone]}, LoRA-SP", *(f"n = {n}" for n in STEPS[:-1])]
     return page.table([*head, f"success at n = {STEPS[-1]} [%]"], rows)

@@ -94,14 +94,12 @@ def _row(
     found, order = _stacked(seeds), sorted(seeds[0]["outcomes"])
     rates = dict(zip(order, found.mean((0, 2)), strict=True))
     means = [np.mean([rates[task] for task in members]) for members in columns.values()]
-    difference = NONE
-    if reference is not seeds:
-        difference = page.points(statistics.difference(found, _stacked(reference)))
+    difference = NONE if reference is seeds else page.difference(found, _stacked(reference))
     trained = seeds[0]["trainable_parameters"] / seeds[0]["total_parameters"]
     rate = seeds[0]["config"]["optim"]["learning_rate"]
     facts = [f"{rate:g}", f"{100 * trained:.1f} %", _ranks(seeds)]
     success = [f"{100 * mean:.1f}" for mean in means]
-    return [label, *facts, *success, page.percent(statistics.success(found)), difference]
+    return [label, *facts, *success, page.success(found), difference]
 
 
 def _ranks(seeds: Seeds) -> str:
@@ -120,8 +118,8 @@ def _size_table(results: Results, backbone: str) -> str:
         row = [str(len(SETS[stage]))]
         if found := _outcomes(results, backbone, [((stage,), m) for m in GROWING], SETS[stage]):
             *others, own = found
-            row += [page.percent(statistics.success(each)) for each in found]
-            row += [page.points(statistics.difference(own, other)) for other in others]
+            row += map(page.success, found)
+            row += [page.difference(own, other) for other in others]
             leads[stage] = statistics.draw(statistics.minus, (own, others[-1]))
             if SIZES[0] in leads and stage != SIZES[0]:
                 (value, draws), (first, first_draws) = leads[stage], leads[SIZES[0]]
@@ -147,11 +145,11 @@ def _shared_table(results: Results, backbone: str) -> str:
     for label, stages in cases.items():
         row, own = [label], [(stages, method) for method in SHARED]
         if found := _outcomes(results, backbone, own, shared):
-            row += [page.percent(statistics.success(each)) for each in found]
+            row += map(page.success, found)
         both = [*own, *((alone, method) for method in SHARED)]
         if stages != alone and (found := _outcomes(results, backbone, both, shared)):
             pairs = [*zip(found[: len(own)], found[len(own) :], strict=True)]
-            row += [page.points(statistics.difference(*pair)) for pair in pairs]
+            row += [page.difference(*pair) for pair in pairs]
             row.append(
                 page.points(statistics.bootstrap(statistics.interaction, *pairs[-1], *pairs[-2]))
             )
@@ -166,9 +164,9 @@ def _rank_table(results: Results, backbone: str) -> str:
     rows, every = [], []
     for rank, pair in RANKS.items():
         ran = [_outcomes(results, backbone, [(("mt50",), method)], SETS["mt50"]) for method in pair]
-        row = [page.percent(statistics.success(*found)) if found else NONE for found in ran]
+        row = [page.success(*found) if found else NONE for found in ran]
         lora, own = ran
-        row.append(page.points(statistics.difference(*own, *lora)) if lora and own else NONE)
+        row.append(page.difference(*own, *lora) if lora and own else NONE)
         rates = [_rate(results, f"{backbone}/mt50/{method}/s{SEEDS[0]}") for method in pair]
         rows.append([str(rank), *row, *rates])
         if rank != UNTUNED:

@@ -47,10 +47,9 @@ def main_result(book: Book) -> str:
         row = [title]
         for backbone in BACKBONES:
             pair = [f"{backbone}/multi/{m}" for m in ("lora_sp", method)]
-            lead = statistics.difference(*map(book.outcomes, pair))
             theirs = published.compute(statistics.minus, pair, RANK)
             paper = NONE if theirs is None else page.signed(100 * float(theirs))
-            row += [page.points(lead), paper]
+            row += [page.difference(*map(book.outcomes, pair)), paper]
         rows.append(row)
     titles = [t for name in BACKBONES.values() for t in (name, f"{name} in the paper")]
     return page.table(["LoRA-SP minus LoRA with", *titles], rows)
@@ -93,7 +92,7 @@ def _titled(title: str, table: str) -> str:
 
 def _success(book: Book, prefix: str) -> str:
     """Return a method's mean success and its interval."""
-    return page.percent(statistics.success(book.outcomes(prefix)))
+    return page.success(book.outcomes(prefix))
 
 
 def _with(ours: str, paper: float | None, digits: int = 1) -> str:

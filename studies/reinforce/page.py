@@ -1,6 +1,7 @@
 """The tables and figures of README.md, from the results of all policies alone."""
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,8 @@ RANKS = {
 """New adapters that learn from success after those of the start are merged."""
 MODULES = ("vision", "language", "action")
 COLORS = {16: "#4269d0", 32: "#ff725c", 64: "#3ca951"}
+Ran = Sequence[Mapping[str, Any]]
+"""Results of one policy, by seed."""
 
 
 def cell(backbone: str, count: int, policy: str, seed: int) -> str:
@@ -54,12 +57,11 @@ def cell(backbone: str, count: int, policy: str, seed: int) -> str:
 
 def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
     """Write the figures into `folder`; return the tables, with the seeds that have run."""
-    seeds = {(b, n): _seeds(results, b, n, "teacher") for b in BACKBONES for n in COUNTS}
     _figure(results, folder / "progress.svg")
     _rank_figure(results, folder / "ranks.svg")
     return {
-        "success": _success_table(results, seeds),
-        "tasks": _task_table(results, seeds),
+        "success": _success_table(results),
+        "tasks": _task_table(results),
         "ranks": _rank_table(results),
         "active": _active_table(results),
         "scenes": _scene_table(results),
@@ -69,54 +71,50 @@ def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
     }
 
 
-def _seeds(results: Results, backbone: str, count: int, policy: str) -> list[int]:
-    """Return the seeds of which a policy has run."""
-    return [s for s in SEEDS if cell(backbone, count, policy, s) in results]
+def _ran(
+    results: Results, backbone: str, count: int, policy: str, seeds: Sequence[int] = SEEDS
+) -> Ran:
+    """Return the results of a policy, of the seeds that have run."""
+    names = (cell(backbone, count, policy, seed) for seed in seeds)
+    return [results[name] for name in names if name in results]
 
 
 def _outcomes(
-    results: Results,
-    where: tuple[str, int],
-    policy: str,
-    seeds: Sequence[int],
-    tasks: Sequence[str] = TASKS,
-    when: str = "outcomes",
-    prefix: str = "",
-) -> np.ndarray:
-    """Stack the episodes of a policy's seeds, bool `[S, T, N]`; `when` "before": of its start.
+    found: Ran, tasks: Sequence[str] = TASKS, when: str = "outcomes", prefix: str = ""
+) -> np.ndarray | None:
+    """Stack the episodes of a policy's seeds, bool `[S, T, N]`, or None without seeds.
 
-    That is the start that it began from, which each computer has trained for itself. With `when`
-    "shifted", they are those in a shifted scene, of which `prefix` says "before/" or "after/".
+    With `when` "before", they are those of the start that it began from, which each computer has
+    trained for itself; with "shifted", those in a shifted scene, of which `prefix` says "before/"
+    or "after/".
     """
-    found = [results[cell(*where, policy, seed)][when] for seed in seeds]
-    return statistics.stacked([{task: x[prefix + task] for task in tasks} for x in found])
+    rows = [{task: each[when][prefix + task] for task in tasks} for each in found]
+    return statistics.stacked(rows) if rows else None
 
 
-def _success_table(results: Results, seeds: dict[tuple[str, int], list[int]]) -> str:
+def _success_table(results: Results) -> str:
     """Return success before and after, and what it took."""
     rows = []
-    for (backbone, count), own in seeds.items():
-        row = [BACKBONES[backbone], str(count), str(len(own))]
-        if own:
-            at = results, (backbone, count)
-            stacked = [
-                _outcomes(*at, "teacher", own, tasks, when)
-                for tasks in (TASKS, HARD)
-                for when in ("before", "outcomes")
-            ]
-            row += [page.percent(statistics.success(x)) for x in stacked]
-            row += [f"{_last(*at, own, 'environment_steps') / 1e6:.1f} M"]
-            row += [f"{_last(*at, own, 'minutes'):.0f}"]
+    for backbone, count in itertools.product(BACKBONES, COUNTS):
+        found = _ran(results, backbone, count, "teacher")
+        row = [BACKBONES[backbone], str(count), str(len(found))]
+        for tasks, when in itertools.product((TASKS, HARD), ("before", "outcomes")):
+            row.append(page.success(_outcomes(found, tasks, when)))
+        if found:
+            last = [each["progress"][-1] for each in found]
+            steps, minutes = (
+                np.mean([row[name] for row in last]) for name in ("environment_steps", "minutes")
+            )
+            row += [f"{steps / 1e6:.1f} M", f"{minutes:.0f}"]
         rows.append(row)
     for backbone in BACKBONES:
-        own = _seeds(results, backbone, CEILING, "imitation")
-        row = [BACKBONES[backbone], f"{CEILING}, imitation alone", str(len(own))]
-        if own:
-            at = results, (backbone, CEILING), "imitation", own
-            estimates = [statistics.success(_outcomes(*at, tasks)) for tasks in (TASKS, HARD)]
-            row += [page.NONE, page.percent(estimates[0]), page.NONE, page.percent(estimates[1])]
-            seconds = [results[cell(backbone, CEILING, "imitation", s)]["seconds"] for s in own]
-            row += [page.NONE, f"{np.mean([x['total'] for x in seconds]) / 60:.0f}"]
+        found = _ran(results, backbone, CEILING, "imitation")
+        row = [BACKBONES[backbone], f"{CEILING}, imitation alone", str(len(found))]
+        for tasks in (TASKS, HARD):
+            row += [page.NONE, page.success(_outcomes(found, tasks))]
+        if found:
+            seconds = np.mean([each["seconds"]["total"] for each in found])
+            row += [page.NONE, f"{seconds / 60:.0f}"]
         rows.append(row)
     heads = ("", "demonstrations", "seeds", "before", "after")
     hard = " and ".join(HARD)
@@ -125,32 +123,19 @@ def _success_table(results: Results, seeds: dict[tuple[str, int], list[int]]) ->
     )
 
 
-def _last(results: Results, where: tuple[str, int], seeds: Sequence[int], name: str) -> float:
-    """Return the mean over seeds of what the last row of progress says."""
-    found = [results[cell(*where, "teacher", s)]["progress"][-1][name] for s in seeds]
-    return float(np.mean(found))
-
-
-def _task_table(results: Results, seeds: dict[tuple[str, int], list[int]]) -> str:
+def _task_table(results: Results) -> str:
     """Return the gains by task over paired episodes."""
-    rows = []
-    for (backbone, count), own in seeds.items():
-        gains = _gains(results, (backbone, count), "teacher", own)
-        rows.append([BACKBONES[backbone], str(count), *gains])
+    rows = [
+        [BACKBONES[b], str(n), *_gains(_ran(results, b, n, "teacher"))]
+        for b, n in itertools.product(BACKBONES, COUNTS)
+    ]
     return page.table(["gain [points]", "demonstrations", *TASKS], rows)
 
 
-def _gains(
-    results: Results, where: tuple[str, int], policy: str, seeds: Sequence[int]
-) -> list[str]:
-    """Return the gains of a policy over its start, by task; none without seeds."""
-    if not seeds:
-        return []
-    pairs = [
-        [_outcomes(results, where, policy, seeds, [task], when) for when in ("outcomes", "before")]
-        for task in TASKS
-    ]
-    return [page.points(statistics.difference(*pair)) for pair in pairs]
+def _gains(found: Ran) -> list[str]:
+    """Return the gains of a policy over its start, by task."""
+    pairs = ([_outcomes(found, [task], when) for when in ("outcomes", "before")] for task in TASKS)
+    return [page.difference(*pair) for pair in pairs]
 
 
 def _rank_table(results: Results) -> str:
@@ -159,31 +144,26 @@ def _rank_table(results: Results) -> str:
     for name, label in RANKS.items():
         row = [label]
         for backbone in BACKBONES:
-            where = backbone, COUNTS[0]
-            own = _seeds(results, *where, name)
-            row.append(str(len(own)))
-            estimates = [
-                page.percent(statistics.success(_outcomes(results, where, name, own, tasks)))
-                for tasks in ((TASKS, HARD) if own else ())
-            ]
-            row += estimates or [page.NONE, page.NONE]
+            found = _ran(results, backbone, COUNTS[0], name)
+            row.append(str(len(found)))
+            row += [page.success(_outcomes(found, tasks)) for tasks in (TASKS, HARD)]
         rows.append(row)
-    heads = [
-        f"{label}, {what}"
-        for label in BACKBONES.values()
-        for what in ("seeds", "four tasks", " and ".join(HARD))
-    ]
-    return page.table([f"new adapters, N = {COUNTS[0]}", *heads], rows)
+    return page.table([f"new adapters, N = {COUNTS[0]}", *_heads("seeds")], rows)
+
+
+def _heads(*first: str) -> list[str]:
+    """Return the heads of columns of each backbone, the last ones for all and for `HARD` tasks."""
+    columns = (*first, "four tasks", " and ".join(HARD))
+    return [f"{label}, {what}" for label in BACKBONES.values() for what in columns]
 
 
 def _active_table(results: Results) -> str:
     """Return LoRA-SP's mean active rank by module in the first and the last iteration."""
     rows = []
-    for backbone in BACKBONES:
-        own = _seeds(results, backbone, COUNTS[0], "lora_sp")
-        runs = [results[cell(backbone, COUNTS[0], "lora_sp", s)]["progress"] for s in own]
-        row = [BACKBONES[backbone], str(len(own))]
-        for name in MODULES if own else ():
+    for backbone, label in BACKBONES.items():
+        runs = [each["progress"] for each in _ran(results, backbone, COUNTS[0], "lora_sp")]
+        row = [label, str(len(runs))]
+        for name in MODULES if runs else ():
             first, last = (
                 np.mean([run[i][f"active_rank/{name}"] for run in runs]) for i in (0, -1)
             )
@@ -196,52 +176,37 @@ def _scene_table(results: Results) -> str:
     """Return success as recorded and in a shifted scene."""
     rows = []
     for backbone in BACKBONES:
-        where = backbone, COUNTS[0]
-        for label, name, when in (
-            ("before", "teacher", "before"),
-            ("learned as recorded", "teacher", "after"),
-            ("learned in shifted scenes", "randomized", "after"),
+        for label, name, when, prefix in (
+            ("before", "teacher", "before", "before/"),
+            ("learned as recorded", "teacher", "outcomes", "after/"),
+            ("learned in shifted scenes", "randomized", "outcomes", "after/"),
         ):
-            own = _seeds(results, *where, name)
-            row = [BACKBONES[backbone], label, str(len(own))]
-            if own:
-                recorded = "before" if when == "before" else "outcomes"
-                stacked = [
-                    _outcomes(results, where, name, own, when=recorded),
-                    _outcomes(results, where, name, own, when="shifted", prefix=f"{when}/"),
-                ]
-                row += [page.percent(statistics.success(x)) for x in stacked]
-            rows.append(row)
+            found = _ran(results, backbone, COUNTS[0], name)
+            recorded = page.success(_outcomes(found, when=when))
+            shifted = page.success(_outcomes(found, when="shifted", prefix=prefix))
+            rows.append([BACKBONES[backbone], label, str(len(found)), recorded, shifted])
     return page.table([f"N = {COUNTS[0]}", "", "seeds", "as recorded", "shifted"], rows)
 
 
 def _forgetting_table(results: Results) -> str:
     """Return the gains of policies that learned `HARD` alone, by task over paired episodes."""
     rows = []
-    for backbone in BACKBONES:
-        own = _seeds(results, backbone, COUNTS[0], "some")
-        gains = _gains(results, (backbone, COUNTS[0]), "some", own)
-        rows.append([BACKBONES[backbone], str(len(own)), *gains])
+    for backbone, label in BACKBONES.items():
+        found = _ran(results, backbone, COUNTS[0], "some")
+        rows.append([label, str(len(found)), *_gains(found)])
     return page.table(["gain [points]", "seeds", *TASKS], rows)
 
 
 def _owner_table(results: Results) -> str:
     """Return success in one task by the number of own episodes."""
+    cases = {"before": [f"noise_{EPISODES[1]}"], "its 16 demonstrations alone": ["imitation_0"]}
+    cases |= {label: [f"{x}_{n}" for n in EPISODES] for x, label in OWNERS.items()}
     rows = []
-    for backbone in BACKBONES:
-        cases = {"before": (f"noise_{EPISODES[1]}",)}
-        cases |= {"its 16 demonstrations alone": ("imitation_0",)}
-        cases |= {label: tuple(f"{x}_{n}" for n in EPISODES) for x, label in OWNERS.items()}
-        for label, names in cases.items():
-            row, when = [BACKBONES[backbone], label], "before" if label == "before" else "outcomes"
-            for name in names:
-                own = _seeds(results, backbone, COUNTS[0], name)
-                where = results, (backbone, COUNTS[0]), name, own, [OWNED], when
-                row.append(
-                    page.percent(statistics.success(_outcomes(*where))) if own else page.NONE
-                )
-            at = 3 - len(names)
-            rows.append([*row, *[""] * at])
+    for backbone, (label, names) in itertools.product(BACKBONES, cases.items()):
+        when = "before" if label == "before" else "outcomes"
+        ran = [_ran(results, backbone, COUNTS[0], name) for name in names]
+        row = [page.success(_outcomes(found, [OWNED], when)) for found in ran]
+        rows.append([BACKBONES[backbone], label, *row, *[""] * (len(EPISODES) - len(row))])
     return page.table([OWNED, "", *(f"{n} episodes" for n in EPISODES)], rows)
 
 
@@ -251,21 +216,11 @@ def _pilot_table(results: Results) -> str:
     for name, label in PILOTS.items():
         row = [label]
         for backbone in BACKBONES:
-            where = backbone, COUNTS[0]
-            there = cell(*where, name, PILOT_SEED) in results
-            row += [
-                f"{100 * _outcomes(results, where, name, [PILOT_SEED], tasks).mean():.1f}"
-                if there
-                else page.NONE
-                for tasks in (TASKS, HARD)
-            ]
+            found = _ran(results, backbone, COUNTS[0], name, [PILOT_SEED])
+            for stacked in (_outcomes(found, tasks) for tasks in (TASKS, HARD)):
+                row.append(page.NONE if stacked is None else f"{100 * stacked.mean():.1f}")
         rows.append(row)
-    heads = [
-        f"{label}, {what}"
-        for label in BACKBONES.values()
-        for what in ("four tasks", " and ".join(HARD))
-    ]
-    return page.table(["pilots", *heads], rows)
+    return page.table(["pilots", *_heads()], rows)
 
 
 @mpl.rc_context(STYLE)
@@ -299,13 +254,10 @@ def _rank_figure(results: Results, path: Path) -> None:
         axes, (("four tasks", TASKS), (" and ".join(HARD), HARD)), strict=True
     ):
         for number, (backbone, label) in enumerate(BACKBONES.items()):
-            where, color = (backbone, COUNTS[0]), list(COLORS.values())[number]
-            own = {name: _seeds(results, *where, name) for name in ("start", *RANKS)}
-            found = {
-                name: statistics.success(_outcomes(results, where, name, seeds, tasks))
-                for name, seeds in own.items()
-                if seeds
-            }
+            color = list(COLORS.values())[number]
+            own = {name: _ran(results, backbone, COUNTS[0], name) for name in ("start", *RANKS)}
+            stacked = {name: _outcomes(each, tasks) for name, each in own.items()}
+            found = {n: statistics.success(x) for n, x in stacked.items() if x is not None}
             if "start" in found:
                 start = 100 * found.pop("start").value
                 axis.axhline(start, color=color, linestyle="dotted", label=f"{label}, before")

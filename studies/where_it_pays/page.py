@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.figure import Figure
 
 from lorasp_jax.evaluation.figure_style import STYLE
@@ -122,10 +123,8 @@ def _rank_table(results: Results, backbone: str) -> str:
         row = [str(rank)]
         both = _pair(results, backbone, ("lora_sp", rank), ("lora", rank))
         for scene in SCENES:
-            stacked = [outcomes(found, scene) for found in both] if both[0] else []
-            row += [page.percent(statistics.success(x)) for x in reversed(stacked)]
-            row += [page.points(statistics.difference(*stacked))] if stacked else []
-            row += [page.NONE] * (0 if stacked else 3)
+            own, lora = (_outcomes(found, scene) for found in both)
+            row += [page.success(lora), page.success(own), page.difference(own, lora)]
         for found in reversed(both):
             count = found[0]["trainable_parameters"] / 1e6 if found else 0
             row.append(f"{count:.2f} M" if found else page.NONE)
@@ -192,7 +191,7 @@ def _layer_table(results: Results, backbone: str) -> str:
     rows = []
     for label, methods in ALLOCATED.items():
         pairs = [_pair(results, backbone, *((x, rank) for x in methods)) for rank in BUDGETS]
-        rows.append([label, *(_compared(both, "recorded")[1] for both in pairs)])
+        rows.append([label, *(_difference(both, "recorded") for both in pairs)])
     heads = [f"mean r = {rank}" for rank in BUDGETS]
     return page.table([f"{BACKBONES[backbone]}, points", *heads], rows)
 
@@ -204,12 +203,10 @@ def _form_table(results: Results, backbone: str) -> str:
         row, size, count = [label], page.NONE, 0
         for healed in (False, True):
             (own,) = ran(results, _formed(backbone, name, healed))
-            row.append(
-                page.percent(statistics.success(outcomes(own, "recorded"))) if own else page.NONE
-            )
+            row.append(page.success(_outcomes(own, "recorded")))
             for other in ("whole", "merged"):
                 both = ran(results, *(_formed(backbone, x, healed) for x in (name, other)))
-                row.append(_compared(both, "recorded", itself=name == other)[1])
+                row.append(page.NONE if name == other else _difference(both, "recorded"))
         if own:
             size, count = f"{own[0]['bytes'] / 1e6:.1f} MB", len(own)
         rows.append([*row, size, str(count)])
@@ -228,7 +225,7 @@ def _base_table(results: Results, backbone: str) -> str:
     rows = []
     for kind, methods in BASE_ROWS.items():
         if base := results.get(names.base(backbone, kind)):
-            rate = page.percent(statistics.success(statistics.stacked([base["outcomes"]])))
+            rate = page.success(statistics.stacked([base["outcomes"]]))
             rows.append([kind, "the base itself, on the Panda", rate, *[page.NONE] * 3, "1"])
         for method, label in methods.items():
             both = ran(results, *(_policies_on(backbone, kind, x) for x in (method, "lora")))
@@ -271,11 +268,16 @@ def _compared(
     both: Sequence[Sequence[Mapping[str, Any]]], scene: str, *, itself: bool = False
 ) -> list[str]:
     """Return success of the first of two methods, and that minus the second's, unless `itself`."""
-    if not both[0]:
-        return [page.NONE, page.NONE]
-    stacked = [outcomes(found, scene) for found in both]
-    minus = page.NONE if itself else page.points(statistics.difference(*stacked))
-    return [page.percent(statistics.success(stacked[0])), minus]
+    minus = page.NONE if itself else _difference(both, scene)
+    return [page.success(_outcomes(both[0], scene)), minus]
+
+
+def _difference(both: Sequence[Sequence[Mapping[str, Any]]], scene: str) -> str:
+    return page.difference(*(_outcomes(found, scene) for found in both))
+
+
+def _outcomes(found: Sequence[Mapping[str, Any]], scene: str) -> np.ndarray | None:
+    return outcomes(found, scene) if found else None
 
 
 def _pair(

@@ -108,8 +108,8 @@ def table(results: Results, backbone: str, sequences: Sequences) -> str:
     rows = []
     for method, label in METHODS.items():
         (found,) = ran(results, _together(backbone, method, sequences))
-        rate = statistics.success(_of_all(found, sequences)) if found else None
-        row = [page.percent(rate) if rate else page.NONE, *[page.NONE] * 7, str(len(found))]
+        rate = page.success(_of_all(found, sequences) if found else None)
+        row = [rate, *[page.NONE] * 7, str(len(found))]
         rows.append([f"{label}, all tasks together", *row])
     for kind in sequences.kinds:
         row, count = _row(results, backbone, kind, sequences)
@@ -129,8 +129,7 @@ def _row(results: Results, backbone: str, kind: str, sequences: Sequences) -> tu
     together = _of_all(joint, sequences)
     if kind in SINGLE:
         after = _outcomes(found[0], {t: f"{k}/{t}" for k, t in enumerate(orders[0], 1)})
-        rate = page.percent(statistics.success(after))
-        minus = page.points(statistics.difference(after, together))
+        rate, minus = page.success(after), page.difference(after, together)
         return [rate, minus, rate, *[page.NONE] * 5], len(joint)
     rates = [_rates(*pair) for pair in zip(found, orders, strict=True)]
     minus = statistics.bootstrap(_mean_minus, together, *(each.end for each in rates))

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import statistics as medians
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -125,19 +125,15 @@ def table(results: Results, prefix: str = "") -> str:
     Success, averaged over tasks, has a Wilson interval over all episodes, since that of resampling
     is empty at 100 %; its difference to `WHOLE` is paired.
     """
-    whole, rows = _outcomes(results[prefix + WHOLE]), []
+    whole, rows = statistics.stacked([results[prefix + WHOLE]["outcomes"]]), []
     for name in (name for name in VARIANTS if prefix + name in results):
         found = results[prefix + name]
-        outcomes, measures = _outcomes(found), found["measures"]
+        outcomes, measures = statistics.stacked([found["outcomes"]]), found["measures"]
         bounds = wilson_interval(int(outcomes.sum()), outcomes.size)
         success = page.percent(Estimate(float(outcomes.mean()), *bounds))
-        difference = page.points(statistics.difference(outcomes, whole))
+        difference = page.difference(outcomes, whole)
         weights, loss = measures["bytes"] / 1e6, measures["loss"]
         cells = [f"{loss:.4f}", f"{weights:.2f} MB", f"{measures['milliseconds']:.1f} ms"]
         rows.append([name, success, difference if name != WHOLE else "", *cells])
     titles = ["success [%]", "minus whole", "held-out loss", "weights", "policy call"]
     return page.table(["variant", *titles], rows)
-
-
-def _outcomes(result: Mapping[str, Any]) -> Any:
-    return statistics.outcomes([[result]])

@@ -4,7 +4,10 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from lorasp_jax.base.writing import write_text
+from lorasp_jax.extras.study import statistics
 from lorasp_jax.extras.study.statistics import Estimate
 
 NONE = "–"
@@ -36,6 +39,16 @@ def table(headers: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     lines = [headers, ["---"] * len(headers), *filled]
     text = "".join(f"| {' | '.join(line)} |\n" for line in lines)
     return _UNBREAKABLE.sub("\u00a0", text)
+
+
+def success(outcomes: np.ndarray | None) -> str:
+    """Return a method's success with its interval; a dash if it has not run."""
+    return NONE if outcomes is None else percent(statistics.success(outcomes))
+
+
+def difference(a: np.ndarray | None, b: np.ndarray | None) -> str:
+    """Return a method's success minus another's with its interval; a dash if one has not run."""
+    return NONE if a is None or b is None else points(statistics.difference(a, b))
 
 
 def percent(estimate: Estimate) -> str:

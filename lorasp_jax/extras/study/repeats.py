@@ -128,7 +128,7 @@ def _differences(again: Mapping[str, Any], first: Mapping[str, Any]) -> Iterator
     for label, tasks in parts.items():
         both = ({task: run["outcomes"][task] for task in tasks} for run in (again, first))
         pair = (statistics.stacked([each]) for each in both)
-        yield f"{label} {page.points(statistics.difference(*pair))}"
+        yield f"{label} {page.difference(*pair)}"
 
 
 def _is_even(result: Mapping[str, Any]) -> bool:
