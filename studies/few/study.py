@@ -108,6 +108,7 @@ SMOKE = Scale(
 
 
 _pilot = functools.partial(judge, scenes=("recorded",))
+_cropped = functools.partial(judge, cropped=True)
 
 
 def get_study(scale: str) -> Study:
@@ -119,12 +120,12 @@ def get_study(scale: str) -> Study:
 
 def _cells(scale: Scale, backbone: str) -> Iterator[Cell]:
     """Yield all policies of a backbone: the pilots, then seed by seed."""
-    make = functools.partial(_config, scale, backbone)
     pool = scale.counts[-1]
     for method in METHODS:
         if method not in TUNED_AS:
             for name in _pilots(backbone, method):
-                config = make(method, scale.pilot_count, PILOT_SEED, rate=rate_of(name))
+                count, rate = scale.pilot_count, rate_of(name)
+                config = _config(scale, backbone, method, count, PILOT_SEED, rate=rate)
                 yield Cell(name, config, (), f"{backbone}/{method}", evaluate=_pilot, pool=pool)
     kinds = [(m, a, scale.counts, {"augment": _PRESETS[a]}) for m in METHODS for a in page.AUGMENT]
     kinds += [
@@ -134,26 +135,17 @@ def _cells(scale: Scale, backbone: str) -> Iterator[Cell]:
     ]
     for seed in scale.seeds:
         for method, kind, counts, changes in kinds:
-            pilots = _pilots(backbone, method)
             for count in counts:
                 name = page.cell(backbone, method, kind, count, seed)
-                config = functools.partial(_tuned, pilots, make, method, count, seed, changes)
-                group = f"{backbone}/{method}/{kind}"
-                yield Cell(name, config, pilots, group, evaluate=judge, pool=pool)
-    yield from _parts(scale, backbone, make)
-
-
-def _parts(scale: Scale, backbone: str, make: Callable[..., Config]) -> Iterator[Cell]:
-    """Yield the policies that learn with parts of augmentation."""
-    if not scale.stepped:
-        return
-    pool, seed, pilots = scale.counts[-1], scale.seeds[0], _pilots(backbone, page.STEPPED)
-    for part, augment in PARTS.items():
-        name = page.cell(backbone, page.STEPPED, part, pool, seed)
-        changes = {"augment": augment}
-        config = functools.partial(_tuned, pilots, make, page.STEPPED, pool, seed, changes)
-        shown = functools.partial(judge, cropped=part.endswith("cropped"))
-        yield Cell(name, config, pilots, f"{backbone}/{part}", evaluate=shown, pool=pool)
+                config = _tuned(scale, backbone, method, count, seed, **changes)
+                after, group = _pilots(backbone, method), f"{backbone}/{method}/{kind}"
+                yield Cell(name, config, after, group, evaluate=judge, pool=pool)
+    for part, augment in PARTS.items() if scale.stepped else ():
+        method, seed = page.STEPPED, scale.seeds[0]
+        name = page.cell(backbone, method, part, pool, seed)
+        config = _tuned(scale, backbone, method, pool, seed, augment=augment)
+        after, shown = _pilots(backbone, method), _cropped if part.endswith("cropped") else judge
+        yield Cell(name, config, after, f"{backbone}/{part}", evaluate=shown, pool=pool)
 
 
 def _pilots(backbone: str, method: str) -> tuple[str, ...]:
@@ -161,16 +153,16 @@ def _pilots(backbone: str, method: str) -> tuple[str, ...]:
 
 
 def _tuned(
-    pilots: tuple[str, ...],
-    make: Callable[..., Config],
-    method: str,
-    count: int,
-    seed: int,
-    changes: dict[str, Any],
-    results: Results,
-) -> Config:
-    """Return a config with the rate of the best pilot."""
-    return make(method, count, seed, rate=best_rate(results, pilots), **changes)
+    scale: Scale, backbone: str, method: str, *rest: int, **changes: Any
+) -> Callable[[Results], Config]:
+    """Return what makes a config with the rate of the best pilot; arguments as for `_config`."""
+    pilots = _pilots(backbone, method)
+
+    def config(results: Results) -> Config:
+        rate = best_rate(results, pilots)
+        return _config(scale, backbone, method, *rest, rate=rate, **changes)
+
+    return config
 
 
 def _config(

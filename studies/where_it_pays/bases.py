@@ -30,12 +30,7 @@ the rows of the paper's Table I."""
 
 
 def cells(
-    backbone: str,
-    seeds: Sequence[int],
-    pool: int,
-    make: Callable[..., Config],
-    pilots: Mapping[str, Sequence[str]],
-    scale: str,
+    backbone: str, seeds: Sequence[int], pool: int, make: Callable[..., Config], scale: str
 ) -> Iterator[Cell]:
     """Yield the bases of a backbone and their policies; arguments as in `recipes.cells`."""
     for kind, (size, seed, steps, rate) in BASES.items():
@@ -48,8 +43,9 @@ def cells(
         yield Cell(names.base(backbone, kind), base, (), f"{backbone}/base_{kind}")
     policy = functools.partial(_policy, backbone=backbone, pool=pool, make=make)
     for method, settings in SECOND.items():
+        pilots = names.pilots(backbone, method, names.WIDE)
         for seed in seeds:
-            yield policy("second", method, settings, f"s{seed}", seed, tuple(pilots[method]))
+            yield policy("second", method, settings, f"s{seed}", seed, pilots)
     for method, (settings, rates) in MEDIUM.items():
         tried = [names.on_base(backbone, "medium", method, f"pilot/{rate}") for rate in rates]
         for rate in rates:
@@ -75,7 +71,7 @@ def _policy(
 
     def config(results: Results) -> Config:
         rate = best_rate(results, pilots) if pilots else rate_of(name)
-        found = make(settings, seed=seed, rate=rate)
+        found = make(backbone, settings, seed=seed, rate=rate)
         where = str(Path("runs") / names.STUDY / source / "base")
         size = BASES[kind][0] if found.scale == "accelerator" else found.model.size
         return replace(found, model=replace(found.model, checkpoint=where, size=size))

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -47,26 +47,22 @@ RECIPES: Mapping[str, tuple[Method, dict[str, Any]]] = {
 
 
 def cells(
-    backbone: str,
-    seed: int,
-    pool: int,
-    make: Callable[..., Config],
-    pilots: Mapping[str, Sequence[str]],
+    backbone: str, seed: int, pool: int, make: Callable[..., Config]
 ) -> Iterator[Cell | Derived]:
     """Yield the policies of a seed.
 
     Args:
-        make: returns a config, given method, seed, rate and other settings.
-        pilots: names of the policies that decide the rate, by method.
+        make: returns a config, given backbone, method, seed, rate and other settings.
     """
     for name, (method, changes) in RECIPES.items():
-        tried = [pilots[x] for x in (("lora_sp", "lora") if "adapt" in changes else ("lora_sp",))]
+        methods = ("lora_sp", "lora") if "adapt" in changes else ("lora_sp",)
+        tried = [names.pilots(backbone, x, names.WIDE) for x in methods]
 
         def config(
             results: Results, method: Method = method, changes: Any = changes, tried: Any = tried
         ) -> Config:
             rate = min(best_rate(results, each) for each in tried)
-            return make(method, seed=seed, rate=rate, **changes)
+            return make(backbone, method, seed=seed, rate=rate, **changes)
 
         own, group = names.recipe(backbone, name, seed), f"{backbone}/{name}"
         after = tuple(pilot for each in tried for pilot in each)

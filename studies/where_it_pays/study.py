@@ -9,7 +9,7 @@ layer takes that of LoRA with their mean, AdaLoRA that of one mean rank.
 """
 
 import functools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -80,12 +80,17 @@ _SMOKE = Scale(
 def get_study(scale: str) -> Study:
     """Return the study; scale smoke only shows that all of it runs."""
     chosen = {"accelerator": _ACCELERATOR, "smoke": _SMOKE}[scale]
-    cells = [
-        cell
-        for part in (_ranked, _formed, _in_sequence, _layered, _changed, _on_bases)
-        for backbone in page.BACKBONES
-        for cell in part(chosen, backbone)
-    ]
+    pool, seeds, make = chosen.pool, chosen.seeds, functools.partial(_config, chosen)
+    base = {"seeds": seeds, "pool": pool, "make": make, "scale": scale}
+    parts = (
+        functools.partial(_ranked, chosen),
+        _by_seed(seeds, forms.cells, pool=pool, steps=chosen.heal),
+        _by_seed(seeds, sequences.cells, pool=pool, ranks=chosen.ranks),
+        _by_seed(seeds, functools.partial(_allocated, chosen)),
+        _by_seed(page.RECIPE_SEEDS[: len(seeds)], recipes.cells, pool=pool, make=make),
+        functools.partial(bases.cells, **base),
+    )
+    cells = [cell for part in parts for backbone in page.BACKBONES for cell in part(backbone)]
     return Study(names.STUDY, tuple(cells), page=page.blocks, partial=True)
 
 
@@ -103,35 +108,11 @@ def _ranked(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
             yield _cell(scale, backbone, method, rank, seed)
 
 
-def _formed(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
-    for seed in scale.seeds:
-        yield from forms.cells(backbone, seed, scale.pool, scale.heal)
-
-
-def _in_sequence(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
-    for seed in scale.seeds:
-        yield from sequences.cells(backbone, seed, scale.pool, scale.ranks)
-
-
-def _layered(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
-    for seed in scale.seeds:
-        yield from _allocated(scale, backbone, seed)
-
-
-def _changed(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
-    for seed in page.RECIPE_SEEDS[: len(scale.seeds)]:
-        yield from recipes.cells(backbone, seed, scale.pool, *_makers(scale, backbone))
-
-
-def _on_bases(scale: Scale, backbone: str) -> Iterator[Cell | Derived]:
-    makers = _makers(scale, backbone)
-    yield from bases.cells(backbone, scale.seeds, scale.pool, *makers, scale.config.scale)
-
-
-def _makers(scale: Scale, backbone: str) -> tuple[Callable[..., Config], dict[str, Any]]:
-    """Return what makes a config of method, seed, rate and more, and pilots by method."""
-    pilots = {method: names.pilots(backbone, method, names.WIDE) for method in names.METHODS}
-    return functools.partial(_config, scale, backbone), pilots
+def _by_seed(
+    seeds: Sequence[int], cells: Callable[..., Iterator[Cell | Derived]], **settings: Any
+) -> Callable[[str], Iterator[Cell | Derived]]:
+    """Return what yields the cells of a backbone, seed by seed."""
+    return lambda backbone: (x for seed in seeds for x in cells(backbone, seed, **settings))
 
 
 def _allocated(scale: Scale, backbone: str, seed: int) -> Iterator[Cell | Derived]:
@@ -279,6 +260,7 @@ def _shapes(backbone: str, size: str, targets: tuple[str, ...]) -> plan.Shapes:
 def _config(
     scale: Scale, backbone: str, method: Method, seed: int, rate: float, **changes: Any
 ) -> Config:
+    """Return the config of a policy's run."""
     config = scale.config
     return replace(
         config,
