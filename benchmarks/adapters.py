@@ -14,11 +14,11 @@ import functools
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from rich.console import Console
 
+from benchmarks import backbones
 from benchmarks.measuring import best, machine, print_table
 from lorasp_jax import adapt, peft
 from lorasp_jax.adapters import adaptation
@@ -81,13 +81,6 @@ def _near(key: jax.Array, array: jax.Array) -> jax.Array:
     return array + (0.01 * jax.random.normal(key, array.shape)).astype(array.dtype)
 
 
-def observations(config: Any, batch: int) -> Observation:
-    """Return random observations, images in [-1, 1]."""
-    rng = np.random.default_rng(1)
-    draw = lambda s: jnp.asarray(rng.integers(0, 2, s.shape).astype(s.dtype))  # noqa: E731
-    return jax.tree.map(draw, abstract_observation(config, batch))
-
-
 @functools.partial(jax.jit, static_argnames="steps", compiler_options=sampling_options())
 def sample(sampler: Any, obs: Observation, noise: jax.Array, *, steps: int) -> jax.Array:
     """Sample with one adapter."""
@@ -116,9 +109,8 @@ def batch_rows(
     config: Any, samplers: list[SharedSampler], alone: Any, batch: int, steps: int
 ) -> list[dict[str, Any]]:
     """Time batches."""
-    obs = observations(config, batch)
-    shape = batch, config.chunk, config.action_dim
-    noise = jnp.asarray(np.random.default_rng(2).normal(size=shape).astype(np.float32))
+    obs = backbones.noise(abstract_observation(config, batch))
+    noise = jax.random.normal(jax.random.key(1), (batch, config.chunk, config.action_dim))
     single = [jax.tree.map(lambda a, i=i: a[i : i + 1], (obs, noise)) for i in range(batch)]
     chosen = [samplers[i % len(samplers)] for i in range(batch)]
     placed = [dataclasses.replace(each, own=jax.device_put(each.own)) for each in chosen]

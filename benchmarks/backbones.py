@@ -17,7 +17,6 @@ import argparse
 import dataclasses
 import functools
 import itertools
-import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -28,7 +27,7 @@ from flax import nnx
 from jax.sharding import Mesh
 from rich.console import Console
 
-from benchmarks.measuring import best, machine, print_table
+from benchmarks.measuring import best, machine, print_table, write_json
 from lorasp_jax import peft
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config, ModelConfig, OptimConfig
@@ -48,23 +47,23 @@ from lorasp_jax.training.step import init_state, train_step
 CAMERAS = {"pi05": 3, "pi0": 3, "smolvla": 2}
 
 
-def of_size(name: str, size: str) -> BackboneConfig:
-    """Return the config of a size of a backbone in `CAMERAS`."""
+def of_size(name: str, options: argparse.Namespace, cameras: int = 0) -> BackboneConfig:
+    """Return the config of a backbone in `CAMERAS`, with parameters in the compute dtype.
+
+    Of its cameras, it has the first ones; 0: as many as `CAMERAS` says.
+    """
     family, suffix = ("pi0", "_pi05") if name == "pi05" else (name, "")
-    return getattr(backbone.find(family), size + suffix)()
+    config = getattr(backbone.find(family), options.size + suffix)()
+    shown = config.cameras[: cameras or CAMERAS[name]]
+    dtypes = {"dtype": options.dtype, "param_dtype": options.dtype}
+    return dataclasses.replace(config, cameras=shown, remat="none", **dtypes)
 
 
 def sized(name: str, options: argparse.Namespace, remat: Remat = "none") -> BackboneConfig:
-    """Return the backbone's config of the chosen size, with parameters in the compute dtype."""
-    config = of_size(name, options.size)
-    return dataclasses.replace(
-        config,
-        cameras=config.cameras[: CAMERAS[name]],
-        dtype=options.dtype,
-        param_dtype=options.dtype,
-        remat=remat,
-        unroll=config.unroll if options.unroll is None else options.unroll == "yes",
-    )
+    """Return the config of `of_size` with the chosen rematerialization and loop over layers."""
+    config = of_size(name, options)
+    unroll = config.unroll if options.unroll is None else options.unroll == "yes"
+    return dataclasses.replace(config, remat=remat, unroll=unroll)
 
 
 def run_config(
@@ -282,8 +281,7 @@ def main() -> None:
         for table in [options.only] if options.only else tables:
             for row in rows(name, table, options):
                 tables[table].append(row)
-                if options.json:
-                    options.json.write_text(json.dumps(results | tables, indent=1))
+                write_json(options.json, results | tables)
             print_table(console, [row for row in tables[table] if row["backbone"] == name])
 
 

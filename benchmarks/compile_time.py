@@ -10,7 +10,6 @@ and the best of several repeats. Ratios are relative to qwix's LoRA in the same 
 
 import argparse
 import importlib.util
-import json
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,7 +21,7 @@ from flax import nnx
 from rich.console import Console
 
 import lorasp_jax
-from benchmarks.measuring import machine, print_table
+from benchmarks.measuring import machine, print_table, write_json
 from benchmarks.peers.stacks import Stack
 from lorasp_jax import peft
 from lorasp_jax.adapters.adaptation import adapt
@@ -111,8 +110,7 @@ def main(arguments: list[str] | None = None) -> None:
     )
     rows = list(measure(options))
     print_table(console, rows)
-    if options.json:
-        options.json.write_text(json.dumps({"machine": name, "rows": rows}, indent=1))
+    write_json(options.json, {"machine": name, "rows": rows})
 
 
 if __name__ == "__main__":

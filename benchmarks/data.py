@@ -28,7 +28,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from rich.console import Console
 
-from benchmarks.measuring import machine, print_table
+from benchmarks.measuring import machine, print_table, write_json
 from envs.datasets.episodes import Episodes
 from lorasp_jax.data import cache
 from lorasp_jax.data.lerobot import Keys, LeRobot
@@ -216,8 +216,7 @@ def main() -> None:
     console.print(name)
     for title, rows in tables.items():
         print_table(console, rows, title)
-    if options.json:
-        options.json.write_text(json.dumps({"machine": name, **tables}, indent=1))
+    write_json(options.json, {"machine": name, **tables})
 
 
 if __name__ == "__main__":

@@ -37,10 +37,9 @@ from unittest import mock
 
 import jax
 import jax.numpy as jnp
-import ml_dtypes
-import numpy as np
 from flax import nnx
 
+from benchmarks import measuring
 from benchmarks.backbones import CAMERAS, noise, of_size, run_config
 from benchmarks.measuring import best, machine
 from lorasp_jax.adapters import adaptation, paths
@@ -90,14 +89,6 @@ def cases(backbones: Sequence[str]) -> tuple[list[Case], list[Case]]:
     return table, sorted(others, key=lambda case: case[:2])  # equal weights follow each other
 
 
-def sized(name: str, options: argparse.Namespace) -> BackboneConfig:
-    """Return the backbone's config of the chosen size, with parameters in the compute dtype."""
-    config = of_size(name, options.size)
-    cameras = config.cameras[: options.cameras or CAMERAS[name]]
-    dtypes = {"dtype": options.dtype, "param_dtype": options.dtype}
-    return dataclasses.replace(config, cameras=cameras, remat="none", **dtypes)
-
-
 def abstract_sampler(case: Case, config: BackboneConfig, rank: int) -> Sampler:
     """Return the shapes of a sampler."""
 
@@ -130,17 +121,6 @@ def halve(model: Backbone) -> None:
         layer.adapter = AdapterParam({**params, "bank": bank})
 
 
-def filled(sampler: Sampler) -> Sampler:
-    """Fill shapes with noise, on the host: a program for each shape would take long to compile."""
-    pattern = 0.02 * np.random.default_rng(0).standard_normal(2**20 + 7, np.float32)
-    by_dtype = {np.dtype(d): pattern.astype(d) for d in (np.float32, ml_dtypes.bfloat16)}
-
-    def fill(leaf: jax.ShapeDtypeStruct) -> jax.Array:
-        return jnp.asarray(np.resize(by_dtype[np.dtype(leaf.dtype)], leaf.shape))
-
-    return jax.tree.map(fill, sampler)
-
-
 class Program(NamedTuple):
     """A program that is being compiled, and the shapes of its arguments."""
 
@@ -168,9 +148,8 @@ def programs(table: Sequence[Case], options: argparse.Namespace) -> dict[Case, P
     pool = ThreadPoolExecutor()
     for case in table:
         try:
-            sampler, observation, program = lowered(
-                case, sized(case.backbone, options), options.rank
-            )
+            config = of_size(case.backbone, options, options.cameras)
+            sampler, observation, program = lowered(case, config, options.rank)
         except Exception as error:
             found[case] = error
             continue
@@ -196,7 +175,7 @@ def measured(
     }
     for case, program in started.items():
         if keys[case] not in weights:
-            weights[keys[case]] = filled(program.sampler)
+            weights[keys[case]] = measuring.random_weights(program.sampler)
     wait([program.compiled for program in started.values()])
     for case, program in found.items():
         row: dict[str, Any] = case._asdict()

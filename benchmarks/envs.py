@@ -18,7 +18,6 @@ import argparse
 import dataclasses
 import importlib.util
 import itertools
-import json
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -34,7 +33,7 @@ from rich.console import Console
 
 import envs
 from benchmarks import measuring
-from benchmarks.measuring import best, print_table, text
+from benchmarks.measuring import best, print_table, text, write_json
 from envs.env import Env
 from envs.physics import physics
 from envs.rendering.renderer import RayRenderer
@@ -206,8 +205,7 @@ def main() -> None:
         print_table(console, results[PLAYGROUND], f"MuJoCo Playground's {PLAYGROUND}")
     else:
         console.print(f"mujoco_playground is not installed: skipping its {PLAYGROUND}")
-    if options.json:
-        options.json.write_text(json.dumps(results, indent=1))
+    write_json(options.json, results)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ GPU, the step is compiled without CUDA graphs, whose kernels the profiler cannot
 import argparse
 import collections
 import dataclasses
-import json
 import re
 import tempfile
 from collections.abc import Iterable
@@ -23,7 +22,7 @@ from jax.profiler import ProfileData
 from rich.console import Console
 
 from benchmarks.backbones import CAMERAS, Step, add_options, arrays, run_config, sized
-from benchmarks.measuring import machine, print_table
+from benchmarks.measuring import machine, print_table, write_json
 from lorasp_jax import peft
 
 SLOWEST = 40
@@ -165,8 +164,7 @@ def main() -> None:
         by_kind, slowest = profile(step, options.calls)
         print_table(console, by_kind, f"{name}: {100 * by_kind[0]['ms'] / by_kind[0]['%']:.4g} ms")
         results[name] = {"kinds": by_kind, "slowest": slowest}
-        if options.json:
-            options.json.write_text(json.dumps(results, indent=1))
+        write_json(options.json, results)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,6 @@ calls are queued at once (for the gate, one call with 20 gates).
 
 import argparse
 import functools
-import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ import jax
 import jax.numpy as jnp
 from rich.console import Console
 
-from benchmarks.measuring import best, machine, print_table
+from benchmarks.measuring import best, machine, print_table, write_json
 from lorasp_jax import peft
 from lorasp_jax.dense import DenseLayer, dense_shared_input
 from lorasp_jax.kernels.energy_gate import energy_gate
@@ -65,12 +64,17 @@ def layers(rank: int) -> Iterator[tuple[str, Layer, Any]]:
     yield "usual LoRA", usual_lora, peft.LoRA(rank=rank)
     for name in peft.names():
         method = make(name, rank)
+        yield name, adapted(method), method
 
-        def layer(params: Any, x: jax.Array, kernel: jax.Array, method: Any = method) -> Any:
-            y, aux = method.apply(params, x, kernel)
-            return y, dict(aux.losses)
 
-        yield name, layer, method
+def adapted(method: peft.Method) -> Layer:
+    """Return the layer of a method."""
+
+    def layer(params: Any, x: jax.Array, kernel: jax.Array) -> tuple[jax.Array, Any]:
+        y, aux = method.apply(params, x, kernel)
+        return y, dict(aux.losses)
+
+    return layer
 
 
 def make(name: str, rank: int) -> peft.Method:
@@ -241,8 +245,7 @@ def main() -> None:
     print_table(console, results["together"])
     results["gate"] = measure_gate(options)
     print_table(console, [results["gate"]])
-    if options.json:
-        options.json.write_text(json.dumps(results, indent=1))
+    write_json(options.json, results)
 
 
 if __name__ == "__main__":

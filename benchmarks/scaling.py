@@ -11,7 +11,6 @@ program's memory per device.
 
 import argparse
 import dataclasses
-import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -20,7 +19,7 @@ import jax
 from rich.console import Console
 
 from benchmarks import backbones
-from benchmarks.measuring import best, machine, print_table
+from benchmarks.measuring import best, machine, print_table, write_json
 from lorasp_jax import peft
 from lorasp_jax.training.cost.preflight import GIB
 from lorasp_jax.training.distributed import mesh as meshes
@@ -85,8 +84,7 @@ def main() -> None:
         options.size = size
         results[size] = [*rows(options)]
         print_table(console, results[size])
-        if options.json:
-            options.json.write_text(json.dumps(results, indent=1))
+        write_json(options.json, results)
 
 
 if __name__ == "__main__":

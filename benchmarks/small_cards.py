@@ -26,7 +26,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ from flax import nnx
 from rich.console import Console
 
 from benchmarks.backbones import Step
-from benchmarks.measuring import best, print_table
+from benchmarks.measuring import best, print_table, random_weights
 from lorasp_jax import peft
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config, DataConfig, ModelConfig, OptimConfig
@@ -101,18 +101,6 @@ def run_configs(row: dict[str, Any]) -> Iterator[Config]:
     raise ValueError(f"nothing fits into {row['limit']}: expected {least / GIB:.1f} GiB or more")
 
 
-def values(shapes: Any, place: Callable[[np.ndarray], Any] = jnp.asarray) -> Any:
-    """Fill arrays with random numbers on the host, one at a time, and `place` them."""
-    normal = np.random.default_rng(0).standard_normal(2**20, np.float32)
-
-    def fill(leaf: jax.ShapeDtypeStruct) -> Any:
-        is_code = jnp.issubdtype(leaf.dtype, jnp.integer)
-        block = (normal * (40 if is_code else 0.02)).astype(np.int8 if is_code else leaf.dtype)
-        return place(np.resize(block.astype(leaf.dtype), leaf.shape))
-
-    return jax.tree.map(fill, shapes)
-
-
 def measure(row: dict[str, Any], lock: Path) -> dict[str, Any]:
     """Train for some steps and return a row of the table."""
     for config in run_configs(row):
@@ -122,7 +110,7 @@ def measure(row: dict[str, Any], lock: Path) -> dict[str, Any]:
     _, adapters, frozen = adaptation.split(shapes)
     with lock.open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        step.load(values(adapters), values(frozen))
+        step.load(random_weights(adapters), random_weights(frozen))
         seconds = best(step, repeats=2) / LOOP
     stats = jax.local_devices()[0].memory_stats() or {}
     used = {name: stats.get(key, 0) / GIB for name, key in STATS.items()}
@@ -159,7 +147,7 @@ def whole_run(size: str, folder: Path) -> dict[str, Any]:
     jax.config.update("jax_platforms", "cpu")
     backbone = dataclasses.replace(sized("pi0", size), param_dtype="bfloat16")
     graphdef, state = nnx.split(nnx.eval_shape(lambda: backbone.create(nnx.Rngs(0))))
-    native.save(folder / "base", nnx.merge(graphdef, values(state, np.asarray)))
+    native.save(folder / "base", nnx.merge(graphdef, random_weights(state, np.asarray)))
     cache.write([Noise(500, 224, 224)], folder / "recordings", lambda *_: None)
     options = {
         "--config": "configs/multitask_pi0.py",

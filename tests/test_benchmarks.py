@@ -153,7 +153,7 @@ DUMMY = argparse.Namespace(
 
 @pytest.mark.slow
 def test_merged_adapters_run_the_program_of_the_base():
-    config = deployment.sized("pi0", DUMMY)
+    config = deployment.of_size("pi0", DUMMY)
     text = {
         adapters: deployment.lowered(Case("pi0", adapters, 1), config, 16)[2].as_text()
         for adapters in ("none", "merged", "whole")
@@ -162,7 +162,7 @@ def test_merged_adapters_run_the_program_of_the_base():
 
 
 def test_half_of_the_bank_is_smaller():
-    config = deployment.sized("pi0", DUMMY)
+    config = deployment.of_size("pi0", DUMMY)
     sizes = [
         sum(leaf.size for leaf in jax.tree.leaves(deployment.abstract_sampler(case, config, 16)))
         for case in (Case("pi0", name) for name in ("none", "half", "whole"))

@@ -152,12 +152,7 @@ def single_layers(job: Job) -> Iterator[Row]:
             jnp.asarray(array, jnp.bfloat16)
             for array in workloads.layer_arrays(shape, sizes.tokens)
         )
-        params = jax.jit(method.init)(jax.random.key(0), kernel)[0]
-
-        def layer(params: Any, x: jax.Array, w: jax.Array, method: Any = method) -> Any:
-            y, aux = method.apply(params, x, w)
-            return y, dict(aux.losses)
-
+        params, layer = jax.jit(method.init)(jax.random.key(0), kernel)[0], layers.adapted(method)
         forward = jax.jit(lambda params, x, w, layer=layer: layer(params, x, w)[0])
         both = jax.jit(functools.partial(layers.with_gradients, layer))
         name, arrays = "x".join(map(str, shape)), (params, x, kernel)
