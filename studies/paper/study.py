@@ -28,11 +28,11 @@ from lorasp_jax.extras.study.results import best_pilot, best_rate
 from lorasp_jax.extras.study.study import Results
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP, Method
 from lorasp_jax.policies.policy import Policy
-from lorasp_jax.training.demonstrations import Demonstrations
-from studies.paper import page, transforms
+from studies.paper import page
 from studies.paper.claims import make_claims
 from studies.paper.measures import measure
 from studies.paper.tables import RANK
+from studies.paper.transforms import cut, pruned
 
 MakeMethod = Callable[[Results], Method]
 PILOT_SEED = 1000
@@ -105,7 +105,7 @@ def _cells(backbone: str) -> Iterator[Cell | Derived]:
         for seed in SEEDS:
             source = f"{backbone}/multi/{method}/s{seed}"
             name = f"{backbone}/multi/{method}_pruned/s{seed}"
-            yield Derived(name, source, _pruned)
+            yield Derived(name, source, lambda policy, _, episodes: pruned(policy, episodes))
     for method in (*small, f"lora_r{RANK}", "full", "lora_sp"):
         yield from _single(backbone, method)
 
@@ -252,9 +252,4 @@ def _mean_rank(results: Results, cells: Sequence[str]) -> float:
 
 def _cut(ranked: Sequence[str], policy: Policy, results: Results, _: Mapping) -> Policy:
     """Cut a LoRA policy to LoRA-SP's mean rank by one threshold (PARA, arXiv 2604.27796)."""
-    return transforms.cut(policy, _mean_rank(results, ranked))
-
-
-def _pruned(policy: Policy, _: Results, episodes: Demonstrations) -> Policy:
-    """Drop the directions that LoRA-SP does not use on held-out demonstrations."""
-    return transforms.pruned(policy, episodes)
+    return cut(policy, _mean_rank(results, ranked))

@@ -18,10 +18,11 @@ from flax import nnx
 import lorasp_jax
 from lorasp_jax.adapters import paths
 from lorasp_jax.dense import AdaptedLayer, AdapterParam
+from lorasp_jax.extras.deployment import variants
 from lorasp_jax.peft import AdaLoRA, LoRA
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training.demonstrations import Demonstrations
-from lorasp_jax.training.fixed_batches import forward, keyed_batches
+from lorasp_jax.training.fixed_batches import forward
 
 
 def cut(policy: Policy, mean_rank: float, *, by_size: bool = False) -> Policy:
@@ -113,24 +114,7 @@ def _triplets(
     }
 
 
-def pruned(
-    policy: Policy,
-    episodes: Demonstrations,
-    *,
-    tolerance: float = 0.0,
-    batch_size: int = 64,
-    batches: int = 8,
-) -> Policy:
-    """Prune a LoRA-SP policy to the directions in use on held-out data.
-
-    Args:
-        policy: not modified.
-        episodes: held-out episodes by task; all count alike.
-        tolerance: largest fraction of tokens for which a pruned direction is active.
-        batch_size: windows per batch.
-        batches: batches per task.
-    """
-    by_task = keyed_batches(policy, episodes, batch_size, batches)
-    together = [pair for pairs in by_task.values() for pair in pairs]
-    model, _ = lorasp_jax.prune(policy.model, together, tolerance, forward=forward)
+def pruned(policy: Policy, episodes: Demonstrations) -> Policy:
+    """Prune a LoRA-SP policy to the directions in use on held-out episodes by task."""
+    model, _ = lorasp_jax.prune(policy.model, variants.batches(policy, episodes), forward=forward)
     return dataclasses.replace(policy, model=model)

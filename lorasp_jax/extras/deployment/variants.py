@@ -116,7 +116,7 @@ def in_form(
     model = in_bf16(policy.model)
     policy = dataclasses.replace(policy, model=model)
     if _needs_data(policy, form):
-        policy = dataclasses.replace(policy, model=FORMS[form](model, _batches(policy, data)))
+        policy = dataclasses.replace(policy, model=FORMS[form](model, batches(policy, data)))
     if heal:
         policy = heal(policy)
     if form == "merged":
@@ -129,7 +129,7 @@ def _needs_data(policy: lorasp_jax.policies.Policy, form: str) -> bool:
     return form != "whole" and any(map(_is_bank, adaptation.methods(policy.model).values()))
 
 
-def _batches(policy: lorasp_jax.policies.Policy, data: Demonstrations | Run) -> Batches:
+def batches(policy: lorasp_jax.policies.Policy, data: Demonstrations | Run) -> Batches:
     """Return what calibrates a form of a policy; see `in_form`."""
     if isinstance(data, Run):
         return [*activations.sampled(data, policy.processor, policy.model.config.chunk)]

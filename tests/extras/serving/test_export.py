@@ -13,8 +13,8 @@ from lorasp_jax.models.inputs import InputConfig
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
 from lorasp_jax.training import load_policy
+from lorasp_jax.training.fixed_batches import forward, keyed_batches
 from lorasp_jax.training.run_folder import to_json, write_json
-from studies.paper import transforms
 from tests.extras.serving.test_exported import arguments, in_process
 from tests.extras.serving.test_policies import SIMULATED, make_policy
 from tests.runs import CONFIG, random_episodes
@@ -124,14 +124,16 @@ def quantized(policy, kind):
 
 def pruned(policy):
     episodes = {"press": random_episodes("press", 5)}
-    return transforms.pruned(policy, episodes, batch_size=4, batches=1, tolerance=0.5)
+    (batches,) = keyed_batches(policy, episodes, 4, 1).values()
+    model, _ = lorasp_jax.prune(policy.model, batches, 0.5, forward=forward)
+    return dataclasses.replace(policy, model=model)
 
 
 def merged(policy):
     """Return the policy distilled to adapters that do not depend on the input, and merged."""
     episodes = {"press": random_episodes("press", 5)}
-    pairs = transforms.keyed_batches(policy, episodes, 4, 1)["press"]
-    model, _ = lorasp_jax.distill(policy.model, pairs, 4, forward=transforms.forward)
+    pairs = keyed_batches(policy, episodes, 4, 1)["press"]
+    model, _ = lorasp_jax.distill(policy.model, pairs, 4, forward=forward)
     return dataclasses.replace(policy, model=adaptation.merge(model))
 
 

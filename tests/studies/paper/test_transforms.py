@@ -11,6 +11,7 @@ from flax import nnx
 import lorasp_jax
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.dense import AdapterParam, Dense
+from lorasp_jax.extras.deployment import variants
 from lorasp_jax.peft import AdaLoRA, LoRA
 from lorasp_jax.policies.policy import Policy
 from studies.paper import transforms
@@ -121,8 +122,10 @@ def test_exact_zeros_do_not_count_as_rank():
 
 
 @pytest.mark.slow
-def test_pruning_drops_directions_that_no_task_uses(tmp_path):
+def test_pruning_drops_directions_that_no_task_uses(tmp_path, monkeypatch):
     """Two directions of the output layer are never active."""
+    monkeypatch.setattr(variants, "BATCH_SIZE", 4)
+    monkeypatch.setattr(variants, "BATCHES", 2)
     config = dataclasses.replace(CONFIG, targets=("action_out_proj",))
     run = make_run(tmp_path / "run", config)
     layer = add_noise(run.policy.model, 0.1).action_out_proj
@@ -133,7 +136,7 @@ def test_pruning_drops_directions_that_no_task_uses(tmp_path):
         "w2": router["w2"].at[:, jnp.array([1, 4])].set(0.0),
     }
     layer.adapter = AdapterParam(params | {"router": router})
-    smaller = transforms.pruned(run.policy, run.episodes, batch_size=4, batches=2)
+    smaller = transforms.pruned(run.policy, run.episodes)
     after = smaller.model.action_out_proj.adapter.get_value()
     assert after["bank"]["u"].shape == (6, params["bank"]["u"].shape[1])
     np.testing.assert_array_equal(after["bank"]["u"], np.delete(params["bank"]["u"], [1, 4], 0))
