@@ -1,7 +1,6 @@
 """The training loop: resume, train, log, save. Evaluation and reports are callbacks."""
 
 import contextlib
-import dataclasses
 import functools
 import math
 import tempfile
@@ -67,8 +66,7 @@ def trained(run: Run) -> Policy:
     The run keeps the policy that it has. For errors see `train`.
     """
     with tempfile.TemporaryDirectory() as folder:
-        learner = dataclasses.replace(run, folder=Path(folder), devices=jax.devices()[:1])
-        learner.policy = run.policy
+        learner = run.with_policy(run.policy, folder=Path(folder), devices=jax.devices()[:1])
         train(learner)
     return learner.policy
 

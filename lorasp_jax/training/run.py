@@ -79,6 +79,12 @@ class Run:
         self.seconds = {"total": 0.0, **read_json(self.folder / TIMES_FILE, records.TIMES)}
         self._before = self.seconds["total"]
 
+    def with_policy(self, policy: Policy, **changes: Any) -> "Run":
+        """Return a copy that has a policy, and other fields where `changes` says so."""
+        run = replace(self, **changes)
+        run.policy = policy
+        return run
+
     @property
     def steps(self) -> Steps:
         """All steps to train on."""

@@ -68,11 +68,8 @@ def judge(run: Run, scenes: Iterable[str] = SCENES, *, cropped: bool = False) ->
 
 def outcomes(run: Run, scene: str, tasks: Sequence[str] = ()) -> dict[str, str]:
     """Return the outcomes of a run's policy in a scene by task; by default, of its own tasks."""
-    shown = dataclasses.replace(
-        run, config=dataclasses.replace(run.config, tasks=tuple(tasks or run.config.tasks))
-    )
-    shown.policy = run.policy
-    found = judge(shown, (scene,))["outcomes"]
+    config = dataclasses.replace(run.config, tasks=tuple(tasks or run.config.tasks))
+    found = judge(run.with_policy(run.policy, config=config), (scene,))["outcomes"]
     return {name.partition("/")[2]: text for name, text in found.items()}
 
 

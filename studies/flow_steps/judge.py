@@ -60,8 +60,7 @@ def judge_distilled(run: Run, loss: Literal["endpoint", "snapflow"], steps: int)
         ),
     }
     made = DistillFlowConfig(**settings, distill=Distillation(loss=loss))
-    student = dataclasses.replace(run, config=made, folder=run.folder / "distilled")
-    student.policy = run.policy
+    student = run.with_policy(run.policy, config=made, folder=run.folder / "distilled")
     student.folder.mkdir(exist_ok=True)
     loop.train(command.student(student), resume=True)
     run.policy, run.config = student.policy, made

@@ -47,9 +47,7 @@ def judge(run: Run, kind: str, order: int, episodes: int) -> dict[str, Any]:
         return dataclasses.replace(stage, dataset=dataset.without(cache.steps, left_out))
 
     def success(policy: Policy, tasks: Sequence[str]) -> dict[str, str]:
-        shown = dataclasses.replace(run)
-        shown.policy = policy
-        return outcomes(shown, tasks, episodes, 0)
+        return outcomes(run.with_policy(policy), tasks, episodes, 0)
 
     tasks = page.SEQUENCES.orders[order]
     return sequences.judged(run, kind, tasks, demonstrate, success, whole=False)

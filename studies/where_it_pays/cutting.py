@@ -16,7 +16,7 @@ from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training.run import Run
 from studies.few.judge import judge as judge_scenes
 from studies.paper.transforms import cut
-from studies.where_it_pays.judge import with_policy
+from studies.where_it_pays.judge import padded
 
 
 def judge(run: Run, rank: int, steps: int, pool: int) -> dict[str, Any]:
@@ -28,8 +28,8 @@ def judge(run: Run, rank: int, steps: int, pool: int) -> dict[str, Any]:
     if steps:
         episodes = shared_demonstrations(run.folder.parents[3], pool, run.config)
         policy = healing.train_on(policy, dataclasses.replace(run, episodes=episodes), steps)
-    found = judge_scenes(with_policy(run, policy), ("recorded",))
-    return found | {"trainable_parameters": count}
+    shown = run.with_policy(padded(policy, run.config.targets))
+    return judge_scenes(shown, ("recorded",)) | {"trainable_parameters": count}
 
 
 def as_lora(policy: Policy) -> tuple[Policy, int]:

@@ -29,15 +29,8 @@ def judge(run: Run, scenes: Iterable[str] = SCENES) -> dict[str, Any]:
     ranks, trained = training_ranks(run), {"trainable_parameters": run.parameters[0]}
     if isinstance(run.config.peft, LoRASP) and not ranks:
         raise ValueError("its active ranks are lost with the process that trained it: delete it")
-    shown = with_policy(run, run.policy)
+    shown = run.with_policy(padded(run.policy, run.config.targets))
     return judge_scenes(shown, scenes) | trained | {"layer_active_rank": ranks}
-
-
-def with_policy(run: Run, policy: Policy) -> Run:
-    """Return a copy of a run that has a policy, `padded`."""
-    shown = dataclasses.replace(run)
-    shown.policy = padded(policy, run.config.targets)
-    return shown
 
 
 def padded(policy: Policy, targets: Sequence[str]) -> Policy:
@@ -48,7 +41,11 @@ def padded(policy: Policy, targets: Sequence[str]) -> Policy:
     """
     root, wide = nnx.List([nnx.clone(policy.model)]), LoRA(rank=names.WIDE)
     patterns = presets.patterns(targets)
-    found = [x.child for x in paths.locate(root, AdaptedLayer) if _matches(patterns, x.path)]
+    found = [
+        location.child
+        for location in paths.locate(root, AdaptedLayer)
+        if any(re.search(pattern, location.path) for pattern in patterns)
+    ]
     for method in (layer.method for layer in found if layer.method):
         if type(method) is not LoRA or method.scale != wide.scale or method.rank > wide.rank:
             return policy
@@ -60,7 +57,3 @@ def padded(policy: Policy, targets: Sequence[str]) -> Policy:
             a, b = a.at[..., :rank].set(params["lora_a"]), b.at[..., :rank, :].set(params["lora_b"])
         layer.method, layer.adapter = wide, AdapterParam({"lora_a": a, "lora_b": b})
     return dataclasses.replace(policy, model=root[0])
-
-
-def _matches(patterns: Sequence[str], path: str) -> bool:
-    return any(re.search(pattern, path) for pattern in patterns)

@@ -1,6 +1,5 @@
 """LoRA-SP with one change each: pilots that decide whether a change is worth a table."""
 
-import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
@@ -78,8 +77,7 @@ def cells(
 def judge_changed(run: Run, name: str, pool: int) -> dict[str, Any]:
     """Train the run's policy anew, with one of `CHANGES` of its new adapters."""
     episodes = shared_demonstrations(run.folder.parents[2], pool, run.config)
-    learner = dataclasses.replace(run, episodes=episodes)
-    learner.policy = run.policy  # which is no argument of a run
+    learner = run.with_policy(run.policy, episodes=episodes)
     model = CHANGES[name](learner, setup.build(run.config, run.folder).model)
     learner.policy = replace(run.policy, model=model)
     learner.policy = loop.trained(learner)

@@ -23,7 +23,7 @@ from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Run
 from studies.few import judge as scenes
 from studies.where_it_pays import names, page
-from studies.where_it_pays.judge import with_policy
+from studies.where_it_pays.judge import padded
 from studies.where_it_pays.sequence_page import KINDS, SINGLE, Sequences
 
 RATE = 1e-3
@@ -73,7 +73,8 @@ def judge(run: Run, kind: str, order: int, pool: int) -> dict[str, Any]:
         return dataclasses.replace(stage, episodes=some(every, counts))
 
     def success(policy: Policy, shown: Sequence[str]) -> dict[str, str]:
-        return scenes.outcomes(with_policy(run, policy), "recorded", shown)
+        own = run.with_policy(padded(policy, run.config.targets))
+        return scenes.outcomes(own, "recorded", shown)
 
     return judged(run, kind, tasks, demonstrate, success)
 

@@ -109,9 +109,8 @@ def train_on(
         ValueError: see `loop.train`.
     """
     config, console = _config(run.config, steps), Console(stderr=True)
-    learner = dataclasses.replace(run, config=config, console=console, objective=objective)
-    learner.policy = policy
-    return loop.trained(learner)
+    changes = {"config": config, "console": console, "objective": objective}
+    return loop.trained(run.with_policy(policy, **changes))
 
 
 def _config(config: Config, steps: int) -> Config:
