@@ -1,4 +1,4 @@
-"""Success of a policy as recorded, and in a scene that was shifted."""
+"""Success of a policy as recorded and in a scene that was shifted, and its held-out error."""
 
 import dataclasses
 import functools
@@ -11,9 +11,12 @@ import jax.numpy as jnp
 import envs
 from envs import Env, Randomization
 from envs.state import State
-from lorasp_jax.evaluation import metrics
+from lorasp_jax.evaluation import held_out, metrics
 from lorasp_jax.evaluation.programs import Rollout, make_rollout
 from lorasp_jax.evaluation.results import evaluate, map_rollouts
+from lorasp_jax.extras.study.held_out import AllTasks
+from lorasp_jax.policies.policy import Policy
+from lorasp_jax.training.demonstrations import Demonstrations
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Run
 from studies.few.page import SCENES
@@ -71,6 +74,19 @@ def outcomes(run: Run, scene: str, tasks: Sequence[str] = ()) -> dict[str, str]:
     config = dataclasses.replace(run.config, tasks=tuple(tasks or run.config.tasks))
     found = judge(run.with_policy(run.policy, config=config), (scene,))["outcomes"]
     return {name.partition("/")[2]: text for name, text in found.items()}
+
+
+def measure(run: Run, episodes: Demonstrations, _: Policy | None) -> dict[str, float]:
+    """Return the loss and the action error on held-out demonstrations; see `held_out.measure`."""
+    source: Any = AllTasks(episodes)
+    windows = held_out.windows(source, range(len(source)), run.policy)
+    found = held_out.measure(run.policy, windows, num_steps=run.config.evaluation.denoise_steps)
+    return {
+        "loss": found.loss,
+        "action_error": found.policy.mean,
+        "hold_error": found.hold.mean,
+        "repeat_error": found.repeat.mean,
+    }
 
 
 @functools.cache

@@ -1,19 +1,22 @@
-"""The tables of README.md, from the results of all policies alone."""
+"""The tables and the figure of README.md, from the results of all policies alone."""
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
+from matplotlib.figure import Figure
 from scipy import stats
 
+from lorasp_jax.evaluation.figure_style import STYLE
 from lorasp_jax.extras.study import Study, page, statistics
+from lorasp_jax.extras.study import figure as figures
 from lorasp_jax.extras.study.page import BACKBONES
 from lorasp_jax.extras.study.results import ran
 from lorasp_jax.extras.study.statistics import Estimate
 from lorasp_jax.extras.study.study import Results
-from studies.few import figure
 
 LABELS = {
     "lora_r16": "LoRA, r = 16",
@@ -22,6 +25,15 @@ LABELS = {
     "vlm_lora": "LoRA on the VLM, full expert",
     "full": "full fine-tuning",
 }
+COLORS = {
+    "lora_r16": "#97bbf5",
+    "lora_r64": "#4269d0",
+    "lora_sp": "#ff725c",
+    "vlm_lora": "#3ca951",
+    "full": "#9498a0",
+}
+Points = Mapping[tuple[str, str, str], Mapping[str, Sequence[Estimate]]]
+"""Success by (backbone, scene, augmentation), then method, for each of `COUNTS`."""
 AUGMENT = {"none": "no", "openpi": "openpi's"}
 """Preset of augmentation -> its label."""
 COUNTS = (10, 25, 50, 120, 512)
@@ -70,7 +82,7 @@ def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
         for kind in AUGMENT
     }
     if backbones:
-        figure.write(folder / "success.svg", backbones, points)
+        _figure(folder / "success.svg", backbones, points)
     made = {"augmentation": _parts_table(results)}
     for backbone in backbones:
         for scene in SCENES:
@@ -81,7 +93,7 @@ def blocks(_: Study, results: Results, folder: Path) -> dict[str, str]:
     return made
 
 
-def _success_table(results: Results, points: Mapping[Any, Any], backbone: str, scene: str) -> str:
+def _success_table(results: Results, points: Points, backbone: str, scene: str) -> str:
     head = [f"{BACKBONES[backbone]}, {SCENES[scene]} [%]", "augmentation"]
     head += [f"N = {n}" for n in COUNTS]
     rows = []
@@ -198,3 +210,22 @@ def outcomes(found: Iterable[Mapping[str, Any]], scene: str) -> np.ndarray:
     """Stack the episodes of some policies in a scene, bool `[S, T, N]`."""
     every = (result["outcomes"].items() for result in found)
     return statistics.stacked([{k: o for k, o in x if k.startswith(f"{scene}/")} for x in every])
+
+
+@mpl.rc_context(STYLE)
+def _figure(path: Path, backbones: Sequence[str], points: Points) -> None:
+    """Draw a row per scene, and a column per backbone and augmentation; write it as SVG."""
+    columns = [(backbone, kind) for backbone in backbones for kind in AUGMENT]
+    figure = Figure(figsize=(1.2 + 3.2 * len(columns), 5.4), layout="constrained")
+    axes = figure.subplots(len(SCENES), len(columns), sharex=True, sharey=True, squeeze=False)
+    for column, (backbone, kind) in enumerate(columns):
+        for row, scene in enumerate(SCENES):
+            methods = points[backbone, scene, kind]
+            curves = {LABELS[name]: (COLORS[name], found) for name, found in methods.items()}
+            figures.panel(axes[row, column], COUNTS, curves)
+        title = f"{BACKBONES[backbone]}, {AUGMENT[kind]} augmentation"
+        axes[0, column].set_title(title, loc="left")
+        axes[-1, column].set_xlabel("demonstrations of each task")
+    for row, label in zip(axes, SCENES.values(), strict=True):
+        row[0].set_ylabel(f"success, {label} [%]")
+    figures.write(figure, path, "few")

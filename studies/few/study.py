@@ -26,8 +26,7 @@ from lorasp_jax.extras.study.results import best_rate, rate_of
 from lorasp_jax.extras.study.study import Results
 from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP, Method
 from studies.few import page
-from studies.few.judge import judge
-from studies.few.measure import measure
+from studies.few.judge import judge, measure
 
 METHODS: dict[str, tuple[Method, tuple[str, ...]]] = {
     "lora_r16": (LoRA(rank=16), ()),

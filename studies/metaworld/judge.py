@@ -36,7 +36,8 @@ def judge(tasks: str, episodes: int, first_seed: int, run: Run) -> dict[str, Any
     """
     found = outcomes(run, SETS[tasks], episodes, first_seed) if episodes else {}
     last = read_metrics(run.folder)[-1]
-    ranks = {key.split("/")[1]: value for key, value in last.items() if _is_rank(key)}
+    parts = ((key.split("/"), value) for key, value in last.items())  # a layer's has three
+    ranks = {key[1]: value for key, value in parts if key[0] == "active_rank" and len(key) == 2}
     trainable, total = adaptation.count(run.policy.model)
     sizes = {"trainable_parameters": trainable, "total_parameters": total}
     return {"outcomes": found, "active_rank": ranks, **sizes}
@@ -86,8 +87,3 @@ async def _judged(run: Run, command: Sequence[str]) -> int:
                     await judge.wait()
     finally:
         serving.close()
-
-
-def _is_rank(key: str) -> bool:
-    """Say whether a metric is the active rank of a module, not of a layer."""
-    return key.startswith("active_rank/") and key.count("/") == 1

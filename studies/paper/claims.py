@@ -56,7 +56,10 @@ class _Maker:
             return ()
         number = published.compute(statistic, prefixes, self.rank)
         paper = None if number is None else float(number)
-        estimate = functools.partial(_outcomes, interval, statistic, methods)
+
+        def estimate(results: Results) -> Estimate:
+            return interval(statistic, *(naming.outcomes(results, m) for m in methods))
+
         return (Criterion(measure, naming.flat(*methods), estimate, paper=paper, **fields),)
 
     def difference(self, a: str, b: str, **fields: Any) -> tuple[Criterion, ...]:
@@ -70,22 +73,15 @@ class _Maker:
         methods = [self.cells(prefix) for prefix in prefixes]
         if not all(methods):
             return ()
-        estimate = functools.partial(_over_seeds, values, methods)
+
+        def estimate(results: Results) -> Estimate:
+            return estimates.over_seeds(values(results, *methods))
+
         return (Criterion(cells=naming.flat(*methods), estimate=estimate, **fields),)
 
 
 Criteria = Callable[[_Maker, str], tuple[Criterion, ...]]
 """Makes criteria for a backbone."""
-
-
-def _outcomes(
-    interval: Any, statistic: Any, methods: Sequence[naming.Seeds], results: Results
-) -> Estimate:
-    return interval(statistic, *(naming.outcomes(results, m) for m in methods))
-
-
-def _over_seeds(values: Any, methods: Sequence[naming.Seeds], results: Results) -> Estimate:
-    return estimates.over_seeds(values(results, *methods))
 
 
 def _lead(method: str, title: str, bound: float, reason: str) -> Criteria:

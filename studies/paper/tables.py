@@ -1,5 +1,6 @@
 """Tables of the study of the paper, in Markdown, beside the paper's numbers."""
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -12,8 +13,8 @@ from studies.paper import naming, published
 from studies.paper.book import TASKS, Book
 from studies.paper.naming import TOWERS
 
-Column = tuple[str, Callable[[str], str]]
-"""Title of a column, and its text for a method."""
+Column = tuple[str, Callable[[Book, str], str]]
+"""Title of a column, and its text for a method of the results."""
 RANK = 64
 """R, LoRA's highest rank and the size of LoRA-SP's bank."""
 
@@ -81,7 +82,7 @@ def success_table(
         ours = book.rates(prefix)
         cells = [_with(f"{100 * ours[task]:.1f}", paper.get(task)) for task in TASKS]
         cells.append(_with(_success(book, prefix), _mean(paper)))
-        rows.append([name, *(text(prefix) for _, text in columns), *cells])
+        rows.append([name, *(text(book, prefix) for _, text in columns), *cells])
     headers = ["method", *(t for t, _ in columns), *TASKS.values(), "mean [95 % interval]"]
     return page.table(headers, rows)
 
@@ -107,7 +108,7 @@ def _mean(paper: Mapping[str, float]) -> float | None:
 
 def table_1(book: Book, backbone: str) -> str:
     """Return Table I: methods, their size, active rank and multi-task success, after the base's."""
-    columns = [("trainable %", _trainable(book)), ("active rank", _rank(book))]
+    columns = [("trainable %", _trainable), ("active rank", _rank)]
     labels = _labels(book.table_1_methods(backbone))
     table = success_table(book, backbone, "multi", labels, columns, with_base=True)
     return _titled(BACKBONES[backbone], table)
@@ -160,7 +161,7 @@ def table_3(book: Book, backbone: str) -> str:
     methods = ["lora_sp_no_spectral", "lora_sp"]
     if methods[0] not in book.methods(backbone, "multi"):
         return ""
-    columns = [(tower, _tower(book, index)) for index, tower in enumerate(TOWERS)]
+    columns = [(tower, functools.partial(_tower, tower)) for tower in TOWERS]
     table = success_table(book, backbone, "multi", _labels(methods), columns)
     return _titled(BACKBONES[backbone], table)
 
@@ -173,7 +174,7 @@ def table_4(book: Book, backbone: str) -> str:
         return ""
     methods.insert(-1, "lora_sp")  # .9 comes before .99
     labels = _labels(methods) | {"lora_sp": f"LoRA-SP, η = {LoRASP().energy_target:g}"}
-    table = success_table(book, backbone, "multi", labels, [("active rank", _rank(book))])
+    table = success_table(book, backbone, "multi", labels, [("active rank", _rank)])
     return _titled(BACKBONES[backbone], table)
 
 
@@ -243,27 +244,18 @@ def _labels(methods: Sequence[str]) -> dict[str, str]:
     return {method: naming.label(method, RANK) for method in methods}
 
 
-def _trainable(book: Book) -> Callable[[str], str]:
-    def text(prefix: str) -> str:
-        own, total = (book.mean(prefix, f"{k}_parameters") or 1 for k in ("trainable", "total"))
-        return _with(f"{100 * own / total:.1f}", published.cell(prefix, RANK).get("trainable"))
-
-    return text
+def _trainable(book: Book, prefix: str) -> str:
+    own, total = (book.mean(prefix, f"{k}_parameters") or 1 for k in ("trainable", "total"))
+    return _with(f"{100 * own / total:.1f}", published.cell(prefix, RANK).get("trainable"))
 
 
-def _rank(book: Book) -> Callable[[str], str]:
-    def text(prefix: str) -> str:
-        mean = book.mean(prefix, "active_rank", "mean")
-        paper = published.cell(prefix, RANK).get("active_rank")
-        return _with("" if mean is None else f"{mean:.1f}", paper, 0)
-
-    return text
+def _rank(book: Book, prefix: str) -> str:
+    mean = book.mean(prefix, "active_rank", "mean")
+    paper = published.cell(prefix, RANK).get("active_rank")
+    return _with("" if mean is None else f"{mean:.1f}", paper, 0)
 
 
-def _tower(book: Book, index: int) -> Callable[[str], str]:
-    def text(prefix: str) -> str:
-        paper = published.cell(prefix, RANK).get("towers")
-        ours = f"{book.mean(prefix, 'active_rank', TOWERS[index]):.1f}"
-        return _with(ours, paper and paper[index], 0)
-
-    return text
+def _tower(tower: str, book: Book, prefix: str) -> str:
+    paper = published.cell(prefix, RANK).get("towers")
+    ours = f"{book.mean(prefix, 'active_rank', tower):.1f}"
+    return _with(ours, paper and paper[TOWERS.index(tower)], 0)

@@ -13,6 +13,7 @@ from lorasp_jax.evaluation.figure_style import STYLE
 from lorasp_jax.extras.study import Study, page, statistics
 from lorasp_jax.extras.study import figure as figures
 from lorasp_jax.extras.study.page import BACKBONES
+from lorasp_jax.extras.study.results import ran
 from lorasp_jax.extras.study.study import Results
 
 COUNTS = (16, 32, 64)
@@ -75,8 +76,7 @@ def _ran(
     results: Results, backbone: str, count: int, policy: str, seeds: Sequence[int] = SEEDS
 ) -> Ran:
     """Return the results of a policy, of the seeds that have run."""
-    names = (cell(backbone, count, policy, seed) for seed in seeds)
-    return [results[name] for name in names if name in results]
+    return ran(results, [cell(backbone, count, policy, seed) for seed in seeds])[0]
 
 
 def _outcomes(
@@ -204,8 +204,8 @@ def _owner_table(results: Results) -> str:
     rows = []
     for backbone, (label, names) in itertools.product(BACKBONES, cases.items()):
         when = "before" if label == "before" else "outcomes"
-        ran = [_ran(results, backbone, COUNTS[0], name) for name in names]
-        row = [page.success(_outcomes(found, [OWNED], when)) for found in ran]
+        every = (_ran(results, backbone, COUNTS[0], name) for name in names)
+        row = [page.success(_outcomes(found, [OWNED], when)) for found in every]
         rows.append([BACKBONES[backbone], label, *row, *[""] * (len(EPISODES) - len(row))])
     return page.table([OWNED, "", *(f"{n} episodes" for n in EPISODES)], rows)
 

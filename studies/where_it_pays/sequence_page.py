@@ -132,7 +132,8 @@ def _row(results: Results, backbone: str, kind: str, sequences: Sequences) -> tu
         rate, minus = page.success(after), page.difference(after, together)
         return [rate, minus, rate, *[page.NONE] * 5], len(joint)
     rates = [_rates(*pair) for pair in zip(found, orders, strict=True)]
-    minus = statistics.bootstrap(_mean_minus, together, *(each.end for each in rates))
+    mean_minus = lambda joint, *ends: np.mean([statistics.minus(x, joint) for x in ends], axis=0)  # noqa: E731
+    minus = statistics.bootstrap(mean_minus, together, *(each.end for each in rates))
     row = [page.percent(estimate(at_end, rates, orders)), page.points(minus)]
     row += [page.percent(estimate(statistic, rates, orders)) for statistic in (learned, last)]
     row += [page.points(estimate(forgotten, rates, orders)), page.NONE]
