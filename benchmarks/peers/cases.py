@@ -46,11 +46,7 @@ TABLES: dict[str, tuple[tuple[str, str], ...]] = {
     "layer-lora": ((OURS, "LoRA"), (OURS, "LoRA-SP"), ("peft", "LoRA")),
     "layer-dora": ((OURS, "DoRA"), ("peft", "DoRA")),
     "stack": ((OURS, "LoRA"), (OURS, "LoRA-SP"), ("qwix", "LoRA")),
-    "stack-nf4": (
-        (OURS, "LoRA on nf4"),
-        (OURS, "LoRA-SP on nf4"),
-        ("qwix", "LoRA on nf4"),
-    ),
+    "stack-nf4": ((OURS, "LoRA on nf4"), (OURS, "LoRA-SP on nf4"), ("qwix", "LoRA on nf4")),
 }
 INSTALL = {
     OURS: "pip install -e .",

@@ -30,10 +30,8 @@ def language_model_config(job: Job) -> Any:
     """Return transformers' config of the vision-language model; token ids lie in the vocabulary."""
     from transformers import LlamaConfig, SmolVLMConfig  # pyright: ignore[reportMissingImports]
 
-    sizes, ids = (
-        workloads.SMOLVLA_TOWERS[job.size],
-        {"bos_token_id": 1, "eos_token_id": 2, "pad_token_id": 2},
-    )
+    sizes = workloads.SMOLVLA_TOWERS[job.size]
+    ids = {"bos_token_id": 1, "eos_token_id": 2, "pad_token_id": 2}
     return SmolVLMConfig(
         text_config=LlamaConfig(**sizes["text"], **ids),
         vision_config={**sizes["vision"], "image_size": workloads.SMOLVLA[job.size].image},

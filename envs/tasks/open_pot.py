@@ -6,18 +6,7 @@ All numbers are our choices; both arms solve the task with them.
 import jax
 import jax.numpy as jnp
 
-from envs.tasks import (
-    Layout,
-    Task,
-    View,
-    Waypoints,
-    gate,
-    near,
-    open_box,
-    raised,
-    route,
-    scatter,
-)
+from envs.tasks import Layout, Task, View, Waypoints, gate, near, open_box, raised, route, scatter
 
 # m, the pot: half its inner width, half the thickness of its walls, its height
 _INSIDE, _WALL, _HEIGHT = 0.043, 0.005, 0.055

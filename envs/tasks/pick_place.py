@@ -6,18 +6,7 @@ All numbers are our choices; both arms solve the task with them.
 import jax
 import jax.numpy as jnp
 
-from envs.tasks import (
-    Layout,
-    Task,
-    View,
-    Waypoints,
-    gate,
-    near,
-    open_box,
-    raised,
-    route,
-    scatter,
-)
+from envs.tasks import Layout, Task, View, Waypoints, gate, near, open_box, raised, route, scatter
 
 _RADIUS = 0.015  # m, a large table grape (12 g)
 _INSIDE = 0.046  # m, half the inner width of the basket

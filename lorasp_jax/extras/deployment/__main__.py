@@ -1,7 +1,6 @@
 """Compare or save the deployment variants of a run (`lorasp-jax deploy --help`)."""
 
 import argparse
-import functools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -60,16 +59,12 @@ def _run(options: argparse.Namespace) -> None:
     from lorasp_jax.extras.study import Study
     from lorasp_jax.extras.study.workers import run_here
 
-    checked = (variants.check(name, options.run) for name in options.variants)
-    chosen = dict.fromkeys((variants.WHOLE, *checked))
+    chosen = [variants.check(name, options.run) for name in options.variants]
+    names = dict.fromkeys((variants.WHOLE, *chosen)) if chosen else variants.of_run(options.run)
     tasks, prefix = ((options.task,), f"{options.task}/") if options.task else ((), "")
     cells = measurement.cells(options.run, options.episodes, prefix, tasks)
     study = Study("deployment", cells, measure=measurement.measure)
-    names = [
-        prefix + name for name in (chosen if options.variants else variants.of_run(options.run))
-    ]
-    say = functools.partial(print, file=sys.stderr)
-    results = run_here(study, options.run / study.name, names, say)
+    results = run_here(study, options.run / study.name, [prefix + name for name in names])
     print(measurement.table(results, prefix), end="")
 
 

@@ -1,7 +1,6 @@
 """Evaluate runs under latency: `python -m lorasp_jax.extras.latency --help`."""
 
 import argparse
-import functools
 import math
 import sys
 from collections.abc import Sequence
@@ -33,11 +32,9 @@ def _measure(options: argparse.Namespace) -> None:
     path = options.figure or options.runs[0] / "latency.svg"
     check_local(path)
     studies = [_study(run, options) for run in options.runs]
-    say = functools.partial(print, file=sys.stderr)
     curves = list[tuple[str, Results]]()
     for run, study in zip(options.runs, studies, strict=True):
-        names = [cell.name for cell in study.cells]
-        results = run_here(study, run / study.name, names, say)
+        results = run_here(study, run / study.name, [cell.name for cell in study.cells])
         curves.append((run.name, results))
         print(f"written: {run / study.name}")
     figure.write(path, curves)

@@ -75,18 +75,11 @@ def average(results: Results, execution: str) -> list[dict[str, Any]]:
             continue
         outcomes = "".join(text for point in points for text in point["outcomes"].values())
         successes, episodes = outcomes.count("1"), len(outcomes)
-        averages.append(
-            {
-                "delay": delay,
-                "success": 100 * successes / episodes,
-                "ci95": [100 * bound for bound in wilson_interval(successes, episodes)],
-                **{
-                    n: float(np.mean([p["motion"][n] for p in points]))
-                    for n in ROWS
-                    if n != "success"
-                },
-            }
-        )
+        motions = [point["motion"] for point in points]
+        means = {n: float(np.mean([m[n] for m in motions])) for n in ROWS if n != "success"}
+        bounds = [100 * bound for bound in wilson_interval(successes, episodes)]
+        success = {"success": 100 * successes / episodes, "ci95": bounds}
+        averages.append({"delay": delay, **success, **means})
     return averages
 
 

@@ -21,9 +21,7 @@ MAX_PIXELS = 2**23
 MAX_SCANS = 4
 """Maximum number of scans, of which cameras write 1. Each costs the time of decoding all pixels,
 however few bytes it has."""
-_SCAN = (
-    b"\xff\xda"  # occurs nowhere else: within a scan, ff is followed by 0 or by a restart marker
-)
+_SCAN = b"\xff\xda"  # occurs nowhere else: within a scan, ff is followed by 0 or a restart marker
 
 
 def compress(observation: Mapping[str, Any], quality: int) -> dict[str, Any]:

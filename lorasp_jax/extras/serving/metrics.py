@@ -5,21 +5,7 @@ from collections import defaultdict
 from collections.abc import Container, Mapping, Sequence
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-SECONDS = (
-    0.001,
-    0.002,
-    0.005,
-    0.01,
-    0.02,
-    0.05,
-    0.1,
-    0.2,
-    0.5,
-    1.0,
-    2.0,
-    5.0,
-    10.0,
-)
+SECONDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 """Bounds of buckets of durations [s]; our choice."""
 RANKS = tuple(map(float, (1, 2, 4, 8, 16, 32, 64, 128)))
 """The same of mean active ranks."""

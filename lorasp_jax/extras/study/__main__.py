@@ -49,12 +49,8 @@ def parser(program: str) -> argparse.ArgumentParser:
     add("--shard", type=_shard, default=(1, 1), metavar="I/N", help="run the I-th of N parts")
     add("--dry-run", action="store_true", help="list the cells, then exit")
     add("--no-run", action="store_true", help="run no cell, but write the results")
-    add(
-        "--out",
-        type=Path,
-        default=Path("runs"),
-        help="parent of the study's folder (default: runs)",
-    )
+    text = "parent of the study's folder (default: runs)"
+    add("--out", type=Path, default=Path("runs"), help=text)
     text = "results to start from, and to add to; its README.md gets the new tables and figures"
     add("--results", type=Path, metavar="FILE", help=text)
     return parser

@@ -28,7 +28,8 @@ def load(load_study: Callable[[], Study], folder: Path) -> Study:
     """
     study = load_study()
     statuses = progress.read(study, folder)
-    cells = [_fixed(cell, statuses) for cell in study.cells if _can_run_again(statuses[cell.name])]
+    known = {name for name, x in statuses.items() if x.state is CellState.FINISHED and x.config}
+    cells = [_fixed(cell, statuses) for cell in study.cells if cell.name in known]
     return dataclasses.replace(study, cells=tuple(cells), finished={})
 
 
@@ -81,10 +82,6 @@ def compare(results: Results) -> Iterator[str]:
         deviation, degrees = statistics.between_runs(runs)
         found = f"{100 * deviation:.1f} points of mean success, {degrees} degrees of freedom"
         yield f"standard deviation between runs of a cell: {found}"
-
-
-def _can_run_again(status: Status) -> bool:
-    return status.state is CellState.FINISHED and status.config is not None
 
 
 def _fixed(cell: Cell | Derived, statuses: Mapping[str, Status]) -> Cell | Derived:

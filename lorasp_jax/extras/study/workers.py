@@ -127,8 +127,16 @@ def _work(
         sys.exit(INTERRUPTED)
 
 
+def _to_stderr(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
 def run_here(
-    study: Study, folder: Path, names: Collection[str], say: Say, run_cell: RunCell = _run_cell
+    study: Study,
+    folder: Path,
+    names: Collection[str],
+    say: Say = _to_stderr,
+    run_cell: RunCell = _run_cell,
 ) -> dict[str, dict[str, Any]]:
     """Run some cells in this process; write and return the results of all that are finished.
 
