@@ -257,6 +257,25 @@ def waiting(rows: list[dict[str, Any]], results: Path) -> list[dict[str, Any]]:
     return [row for row in rows if not any(row.items() <= each.items() for each in done)]
 
 
+def run_all(left: list[dict[str, Any]], options: argparse.Namespace) -> None:
+    """Run the rows in processes, as many at a time as fit into the GPU's memory together."""
+    began, total = time.perf_counter(), gpu_bytes("total")
+    running: list[tuple[subprocess.Popen, float]] = []
+    while (left or running) and time.perf_counter() - began < options.seconds:
+        running = [(process, held) for process, held in running if process.poll() is None]
+        alone = left and left[0].get("row") == "context"
+        slots = 1 if alone or any(held == 0 for _, held in running) else options.parallel
+        if left and len(running) < slots:
+            held = fit.read_size(left[0]["limit"])
+            if sum(held for _, held in running) + held < 0.96 * total:
+                row = left.pop(0)
+                running.append((start(row, options, total), 0 if alone else held))
+                continue
+        time.sleep(0.5)
+    for process, _ in running:
+        process.kill()
+
+
 def main() -> None:
     """Run the benchmark from the command line."""
     if sys.argv[1:2] == ["--train"]:
@@ -273,26 +292,11 @@ def main() -> None:
         work(options.row, options.json)
         return
     jax.config.update("jax_platforms", "cpu")  # the GPU is for the processes of the rows
-    began, total = time.perf_counter(), gpu_bytes("total")
     whole = {"size": options.sizes[1], "limit": "12GB", "row": "whole run"}
     rows = [{"row": "context", "limit": "12GB"}, whole, *table(options.sizes)]
     only = options.only
     rows = [row for row in rows if only is None or any(value in only for value in row.values())]
-    left = waiting(rows, options.json)
-    running: list[tuple[subprocess.Popen, float]] = []
-    while (left or running) and time.perf_counter() - began < options.seconds:
-        running = [(process, held) for process, held in running if process.poll() is None]
-        alone = left and left[0].get("row") == "context"
-        slots = 1 if alone or any(held == 0 for _, held in running) else options.parallel
-        if left and len(running) < slots:
-            held = fit.read_size(left[0]["limit"])
-            if sum(held for _, held in running) + held < 0.96 * total:
-                row = left.pop(0)
-                running.append((start(row, options, total), 0 if alone else held))
-                continue
-        time.sleep(0.5)
-    for process, _ in running:
-        process.kill()
+    run_all(waiting(rows, options.json), options)
     columns = (
         "size method limit batch parts base remat expected evaluating planned peak ms samples/s"
     )
