@@ -9,8 +9,6 @@ noise for every quality; pictures and requests take the server's way.
 
 import argparse
 import asyncio
-import subprocess
-import sys
 import threading
 import time
 from typing import Any
@@ -22,7 +20,7 @@ from rich.console import Console
 
 import envs
 from benchmarks.measuring import machine, print_table
-from benchmarks.serving import WARM_UP, waiting_command
+from benchmarks.serving import WARM_UP, started, waiting_command
 from lorasp_jax.base import compilation_cache
 from lorasp_jax.base.intervals import wilson_interval
 from lorasp_jax.extras.serving import jpeg, requests, wire
@@ -117,16 +115,11 @@ def over_link(
     round_trip: float,
 ) -> list[float]:
     """Return the times of calls [ms] over a link, to a server whose policy takes 20 ms."""
-    command = [sys.executable, *waiting_command(SIZE, CAMERAS, 0.02)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
-        try:
-            assert server.stdout
-            port = int(server.stdout.readline().rpartition(":")[2])
-            with Link(port, bits=bits, round_trip=round_trip) as link:
-                address = f"ws://127.0.0.1:{link.port}"
-                return [calls(address, observation, each, number) for each in qualities]
-        finally:
-            server.terminate()
+    with started(waiting_command(SIZE, CAMERAS, 0.02)) as server:
+        port = int(server.rpartition(":")[2])
+        with Link(port, bits=bits, round_trip=round_trip) as link:
+            address = f"ws://127.0.0.1:{link.port}"
+            return [calls(address, observation, each, number) for each in qualities]
 
 
 class Closed:

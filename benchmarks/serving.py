@@ -9,11 +9,12 @@ time hardly depends on the batch.
 """
 
 import argparse
+import contextlib
 import multiprocessing
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -139,12 +140,18 @@ def measure(command: Sequence[str], calls: int) -> list[tuple[float, np.ndarray]
     Returns:
         Requests per second and the times of each call `[calls, 3]`, for 1 and for 8 clients.
     """
+    with started(command) as address:
+        return [run_clients(address, clients, calls) for clients in (1, 8)]
+
+
+@contextlib.contextmanager
+def started(command: Sequence[str]) -> Iterator[str]:
+    """Start a server with the arguments of a Python process; yield its address."""
     arguments: Any = {"stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen([sys.executable, *command], **arguments) as server:
         try:
             lines = server.stdout or ()
-            address = next(line.split()[-1] for line in lines if line.startswith("listening on"))
-            return [run_clients(address, clients, calls) for clients in (1, 8)]
+            yield next(line.split()[-1] for line in lines if line.startswith("listening on"))
         finally:
             server.terminate()
 
