@@ -152,14 +152,14 @@ def _pilots(backbone: str, method: str) -> tuple[str, ...]:
 
 
 def _tuned(
-    scale: Scale, backbone: str, method: str, *rest: int, **changes: Any
+    scale: Scale, backbone: str, method: str, count: int, seed: int, **changes: Any
 ) -> Callable[[Results], Config]:
     """Return what makes a config with the rate of the best pilot; arguments as for `_config`."""
     pilots = _pilots(backbone, method)
 
     def config(results: Results) -> Config:
         rate = best_rate(results, pilots)
-        return _config(scale, backbone, method, *rest, rate=rate, **changes)
+        return _config(scale, backbone, method, count, seed, rate=rate, **changes)
 
     return config
 
