@@ -52,8 +52,7 @@ def judge(run: Run, delay: int) -> dict[str, Any]:
 def judge_distilled(run: Run, loss: Literal["endpoint", "snapflow"], steps: int) -> dict[str, Any]:
     """Distill the policy of a run to a number of flow steps, then judge it with these."""
     config, optim = run.config, run.config.optim
-    settings = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
-    settings |= {
+    settings = vars(config) | {
         "evaluation": dataclasses.replace(config.evaluation, denoise_steps=steps),
         "optim": dataclasses.replace(
             optim, steps=min(_TRAINED, optim.steps), learning_rate=0.3 * optim.learning_rate

@@ -59,8 +59,7 @@ class Trial:
         source = run.folder.parents[1] / "start" / run.folder.name
         adapters = "merge" if self.method else "continue"
         evaluation = dataclasses.replace(run.config.evaluation, before=True, every=self.every)
-        fields = {x.name: getattr(run.config, x.name) for x in dataclasses.fields(run.config)}
-        fields |= {
+        fields = vars(run.config) | {
             "peft": self.method or run.config.peft,
             "tasks": self.tasks or run.config.tasks,
             "optim": self.optim,
