@@ -113,7 +113,7 @@ def run(
 ) -> None:
     """Distill a start run, evaluate before and after, export the policy, write the report."""
     distilled = prepare(config, folder, console, started)
-    judge = Evaluation() if distilled.simulated else NoEvaluation()
+    judge = Evaluation(learned=True) if distilled.simulated else NoEvaluation()
     callbacks = [Validation(), DistilledExport(), judge, Report()]
     loop.train(distilled, callbacks, resume=resume)
     report = folder / "report.html"

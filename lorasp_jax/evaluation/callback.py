@@ -40,9 +40,10 @@ class Evaluation(Callback):
     background during training, in the foreground after it.
     """
 
-    def __init__(self, *, media: bool = True) -> None:
-        """Create the callback; `media`: whether to write videos and images."""
-        self._media = media
+    def __init__(self, *, media: bool = True, learned: bool = False) -> None:
+        """Create the callback; `media`: whether to write videos and images; `learned`: whether the
+        first policy is that of a finished run, not a base."""
+        self._media, self._learned = media, learned
         self._rollouts: dict[str, tuple[Env, Callable]] = {}
         self._video_thread = ThreadPoolExecutor(1)
         self._pending_videos: Future | None = None
@@ -121,7 +122,7 @@ class Evaluation(Callback):
         progress_bars = bars(run.console, "episodes", shown=not episodes)
         with run.timed("evaluate"), progress_bars as progress:
             policy = run.policy.with_sampler()  # once for all tasks
-            if when == "before":  # the base knows no good or bad actions
+            if when == "before" and not self._learned:  # the base knows no good or bad actions
                 inputs = policy.processor
                 inputs = dataclasses.replace(inputs, prompts=inputs.prompts.plain())
                 policy = dataclasses.replace(policy, processor=inputs)

@@ -19,7 +19,7 @@ def run(
 ) -> None:
     """Learn from a start run, evaluate before and after, export the policy, write the report."""
     learned = start.load(config, folder, console, started)
-    callbacks = [start.PolicyExport(), Evaluation(), Films(learned.policy), Report()]
+    callbacks = [start.PolicyExport(), Evaluation(learned=True), Films(learned.policy), Report()]
     loop.train(learned, callbacks, resume=resume)
     report = folder / "report.html"
     console.print(f"finished in {learned.seconds['total']:.0f} s: {report}", markup=False)

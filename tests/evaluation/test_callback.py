@@ -88,8 +88,9 @@ def test_rows_that_the_device_computes_wrongly_are_reported(run, monkeypatch):
     assert "warning: success depends on bit 0 of an episode's index" in run.console.file.getvalue()
 
 
-def test_the_base_is_not_asked_for_good_actions(run, monkeypatch):
-    """The trained policy is."""
+@pytest.mark.parametrize(("learned", "first"), [(False, 2), (True, 0)])
+def test_the_base_is_not_asked_for_good_actions(run, monkeypatch, learned, first):
+    """The trained policy is, also where another run starts from it."""
     asked = []
 
     def evaluate(policy, env, key, episodes, **_):
@@ -97,10 +98,10 @@ def test_the_base_is_not_asked_for_good_actions(run, monkeypatch):
         return Result(0.5, episodes, (0.4, 0.6), (), 30.0, {}, {}, poses=(), draw=None)
 
     monkeypatch.setattr(callback, "evaluate", evaluate)
-    evaluation = Evaluation(media=False)
+    evaluation = Evaluation(media=False, learned=learned)
     evaluation.on_start(run)
     evaluation.on_log(run, 120, {})
-    assert [int(prompts.start.ids[0, 0]) for prompts in asked] == [2, 2, 0, 0]
+    assert [int(prompts.start.ids[0, 0]) for prompts in asked] == [first, first, 0, 0]
 
 
 def test_evaluation_can_be_disabled(run, monkeypatch):

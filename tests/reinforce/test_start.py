@@ -15,7 +15,7 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.cli.train import _resolved
 from lorasp_jax.config import ModelConfig
 from lorasp_jax.peft import LoRASP
-from lorasp_jax.reinforce import setting, start
+from lorasp_jax.reinforce import command, setting, start
 from lorasp_jax.reinforce.config import Learning, ReinforceConfig
 from lorasp_jax.training.export import load_policy
 from lorasp_jax.training.finished_run import recorded_config
@@ -198,6 +198,15 @@ def test_adapters_are_merged_under_new_ones(few, tmp_path):
     assert any(not leaf.any() for leaf in adapters.values())  # new ones add nothing
     start.PolicyExport().on_end(run)
     np.testing.assert_array_equal(outputs(load_policy(run.folder)), outputs(run.policy))
+
+
+def test_the_start_is_measured_as_it_acts(few, tmp_path, monkeypatch):
+    """A run that learned by recap asks for good actions."""
+    asked = []
+    monkeypatch.setattr(command, "Evaluation", lambda **given: asked.append(given))
+    monkeypatch.setattr(command.loop, "train", lambda *_, **__: None)
+    command.run(resolve("--from", few), tmp_path, Console(quiet=True), 0.0, resume=False)
+    assert asked == [{"learned": True}]
 
 
 def test_worlds_that_do_not_fit_are_refused():
