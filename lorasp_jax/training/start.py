@@ -43,9 +43,11 @@ def with_kept(
     """
     for name in names:
         values = getattr(config, name), getattr(recorded, name)
-        if name in {field.partition(".")[0] for field in given} and values[0] != values[1]:
+        own = sorted(field for field in given if field.partition(".")[0] == name)
+        if own and values[0] != values[1]:
             what = f" ({values[1]})" if isinstance(values[1], str) else ""
-            raise ValueError(f"--{name.replace('_', '-')} is that of {start}{what}: drop it")
+            option = "method" if own[0] == "peft" else own[0].replace("_", "-")
+            raise ValueError(f"--{option} is that of {start}{what}: drop it")
     if (start / BASE).is_dir():
         raise ValueError(f"{start} has no adapters, it trained its base: start from another run")
     refuse_actor(start, "start from the run that it started from")
