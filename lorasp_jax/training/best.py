@@ -4,6 +4,7 @@ from pathlib import Path
 
 import jax
 from flax import nnx
+from safetensors import SafetensorError
 from safetensors.flax import load_file, save_file
 
 from lorasp_jax.adapters import adaptation
@@ -40,7 +41,8 @@ def load(folder: Path, policy: Policy) -> tuple[int, Policy]:
         ValueError: there is none, or a file is damaged.
     """
     path, best = folder / WEIGHTS, read_json(folder / BEST, records.BEST)
-    with as_value_error(path, remedy=": resume with --keep last under another --name"):
+    remedy = f": delete {BEST} and add --resume to keep the last adapters"
+    with as_value_error(path, SafetensorError, remedy=remedy):
         leaves = load_file(path)
         if not best or digest(leaves) != best["weights"]:
             raise ValueError(f"it does not match {BEST}")

@@ -147,6 +147,12 @@ def test_the_best_adapters_are_kept(tmp_path):
     for name, leaf in adapters(run).items():
         np.testing.assert_array_equal(leaf, judge.seen[2][name])
     assert "kept the adapters of iteration 2" in run.console.file.getvalue()
+    (tmp_path / best.WEIGHTS).write_bytes(b"damaged")
+    with pytest.raises(ValueError, match=r"delete best\.json and add --resume"):
+        train(tmp_path, resume=True)
+    (tmp_path / best.BEST).unlink()
+    for name, leaf in adapters(train(tmp_path, resume=True)).items():
+        np.testing.assert_array_equal(leaf, judge.seen[4][name])
 
 
 def test_a_policy_far_from_the_start_stops_the_run(tmp_path):
