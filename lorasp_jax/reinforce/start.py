@@ -23,7 +23,7 @@ from lorasp_jax.training.export import describe, load_policy
 from lorasp_jax.training.finished_run import recorded_config
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Callback, Run
-from lorasp_jax.training.run_folder import CONFIG_FILE, read_json
+from lorasp_jax.training.run_folder import CONFIG_FILE, MERGED, read_json
 from lorasp_jax.training.start import ADAPTERS, KEPT, with_kept
 
 _ACTING = ("execute_steps", "denoise_steps")
@@ -44,8 +44,6 @@ _OTHERS = {
     "sde": ("online.std", "online.correlation"),
 }
 """Method or exploration -> settings, or groups of them, of another one."""
-MERGED = "merged"
-"""Folder of a base with the adapters of the start run merged into it."""
 
 
 def resolve(config: ReinforceConfig, given: Collection[str]) -> ReinforceConfig:

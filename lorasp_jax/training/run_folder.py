@@ -32,6 +32,8 @@ VALIDATION = "validation.json"
 """File with the final measurements on held-out episodes."""
 CACHE = Path("cache", "steps")
 """The dataset of a run, converted."""
+MERGED = "merged"
+"""Folder of a base with the adapters of a start run merged into it."""
 ADVANTAGES = "advantages.npz"
 """Values and advantages of recorded steps."""
 STOPPED = "stopped.json"
@@ -163,7 +165,8 @@ def open_run(config: Config, root: Path, *, resume: bool | Literal["auto"]) -> I
         try:
             yield folder
         except (ValueError, ModuleNotFoundError):
-            if is_new and not _results(folder) - {*(folder / CACHE).rglob("*")}:
+            made = {path for name in (CACHE, MERGED) for path in (folder / name).rglob("*")}
+            if is_new and not _results(folder) - made:
                 shutil.rmtree(folder, ignore_errors=True)  # a link to a folder stays
             raise
 

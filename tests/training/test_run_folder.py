@@ -232,9 +232,9 @@ def test_a_name_is_free_after_a_run_that_failed_without_results(tmp_path):
     assert json.loads((folder / "config.json").read_text())["data"]["action_noise"] == 0.005
 
 
-@pytest.mark.parametrize("left", ["cache/steps/cache.json", "cache/press.npz"])
+@pytest.mark.parametrize("left", ["cache/steps/cache.json", "cache/press.npz", "merged/config"])
 def test_a_refused_run_leaves_nothing_but_results(tmp_path, left):
-    """What the expert has collected is a result, a converted dataset is not."""
+    """What the expert has collected is a result, a converted dataset or a merged base is not."""
     file = tmp_path / "runs" / CONFIG.name / left
 
     def refuse():
