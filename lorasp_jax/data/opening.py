@@ -69,9 +69,12 @@ def open_source(
                 return reader(path, cameras)
             names, _ = choose_cameras(keys.cameras, cameras, path)
             return Renamed(reader(path, [*names.values()]), names)
+    files = ("meta/info.json", rlds.METADATA, HEADER)
+    inside = sorted(x for x in path.glob("*") if any((x / file).is_file() for file in files))
     raise ValueError(
         f"{where} is not a dataset: expected a folder with meta/info.json (LeRobot), "
         f"{rlds.METADATA} (RLDS, from python -m envs collect) or {HEADER} (cache)"
+        + (f", such as {inside[0]}" if inside else "")
     )
 
 

@@ -42,7 +42,8 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     run.policy = fixed.policy(state.adapters)
     if best.error(run.folder) < float("inf"):
         step, run.policy = best.load(run.folder, run.policy)
-        run.console.print(f"kept the adapters of iteration {step}, the best that were evaluated")
+        of = f"iteration {step}" if step else "the start"
+        run.console.print(f"kept the adapters of {of}, the best that were evaluated")
     for callback in callbacks:
         callback.on_end(run)
 

@@ -166,7 +166,10 @@ def _optimizer(config: ReinforceConfig, policy: Policy) -> optax.GradientTransfo
         return descent.optimizer()
     methods = adaptation.methods(policy.model).values()
     if any(isinstance(method, AdaLoRA) for method in methods):
-        raise ValueError("ada_lora needs a number of steps, which reinforcement learning has not")
+        raise ValueError(
+            "ada_lora needs a number of steps, which reinforcement learning has not: "
+            "choose another method"
+        )
     return make_optimizer(_optim(config), methods)
 
 

@@ -16,6 +16,7 @@ from lorasp_jax.base.writing import write_text
 from lorasp_jax.models import presets
 from lorasp_jax.report import figures
 from lorasp_jax.training import records
+from lorasp_jax.training.best import BEST
 from lorasp_jax.training.finished_run import recorded_method
 from lorasp_jax.training.run_folder import (
     CONFIG_FILE,
@@ -72,6 +73,7 @@ def write_report(folder: Path) -> Path:
         f"<p class=muted>{_subtitle(config, results)}</p>",
         *(() if finished else _progress(folder, config, rows)),
         *_success(results),
+        *(_kept(folder) if finished and config.get("online") else ()),
         "<h2>Training</h2>",
         *_datasets(folder),
         *_training(rows, config),
@@ -123,6 +125,19 @@ def _progress(folder: Path, config: dict[str, Any], rows: figures.Rows) -> Itera
     step, steps = rows[-1]["step"] if rows else 0, config["optim"]["steps"]
     yield f"<p>Running: step {step:.0f} of {steps}.</p>"
     yield _REFRESH
+
+
+def _kept(folder: Path) -> Iterable[str]:
+    """Say which adapters a run that learned from success has kept, if it evaluated any."""
+    if not (found := read_json(folder / BEST, records.BEST)):
+        return
+    yield (
+        f"<p>The result has the adapters of iteration {found['step']}, the best that were "
+        "evaluated, and is measured on other layouts.</p>"
+        if found["step"]
+        else "<p>No iteration was better than the start, whose adapters are kept: its success "
+        "before and after differs by the layouts alone.</p>"
+    )
 
 
 def _datasets(folder: Path) -> Iterable[str]:

@@ -6,7 +6,7 @@ A file's digest shows that the file is intact. Its schema shows that this versio
 from typing import Any, TypeAlias
 
 Schema: TypeAlias = dict[Any, Any]
-"""Schema of a JSON object (see `storage.json_values.check`)."""
+"""Schema of a JSON object (see `base.json_values.check`)."""
 TIMES: Schema = {str: float}
 RATE: Schema = {"success": float, "episodes": int, "ci95": (float, float), "outcomes?": str}
 BEFORE: Schema = {str: RATE}

@@ -200,6 +200,7 @@ def test_opening(tmp_path, simulated):
     assert open_source(simulated[1].path, Keys(image_size=64)).kind == "cache"
     for where, sentence in (
         (tmp_path, "is not a dataset: expected a folder"),
+        (simulated[1].path.parent, f"such as {simulated[1].path}"),
         (tmp_path / "nothing", "does not exist"),
     ):
         with pytest.raises(ValueError, match=sentence):

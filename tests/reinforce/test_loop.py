@@ -14,7 +14,7 @@ from lorasp_jax.reinforce import loop, setting, teacher, teaching
 from lorasp_jax.reinforce.config import Learning
 from lorasp_jax.training import best
 from lorasp_jax.training.run import Callback
-from lorasp_jax.training.run_folder import read_metrics
+from lorasp_jax.training.run_folder import read_metrics, write_json
 from tests.reinforce import rooms
 from tests.runs import Terminate, leaves
 
@@ -138,6 +138,13 @@ class Judge(Callback):
     def on_log(self, run, step, metrics):
         self.seen[step] = adapters(run)
         return {"success/press": self.rates[step - 1]}
+
+
+def test_a_start_that_no_iteration_betters_is_kept(tmp_path):
+    start = {"success": 0.7, "episodes": 10, "ci95": [0.4, 0.9]}
+    write_json(tmp_path / "before.json", {"press": start})
+    run = train(tmp_path, [Judge(0.2, 0.6, 0.4, 0.6)])
+    assert "kept the adapters of the start" in run.console.file.getvalue()
 
 
 def test_the_best_adapters_are_kept(tmp_path):

@@ -8,6 +8,7 @@ import pytest
 
 from lorasp_jax.report import figures
 from lorasp_jax.report.html import speed, write_report
+from lorasp_jax.training.best import BEST
 from lorasp_jax.training.run_folder import STOPPED, MetricsLog, to_json, write_json
 from tests.runs import CONFIG, RESULTS, finish
 
@@ -104,6 +105,17 @@ def test_stopped_run_shows_the_reason(folder):
     assert "http-equiv=refresh" not in page
     (folder / "results.json").write_text(results)  # resumed and finished
     assert "stopped" not in write_report(folder).read_text()
+
+
+@pytest.mark.parametrize(
+    ("step", "sentence"), [(3, "adapters of iteration 3"), (0, "No iteration was better")]
+)
+def test_run_that_learned_from_success_says_what_it_kept(folder, monkeypatch, step, sentence):
+    monkeypatch.setattr(figures, "reinforcement", lambda *_: "<svg/>")
+    write_json(folder / "config.json", to_json(CONFIG) | {"online": {"worlds": 8}})
+    assert sentence not in write_report(folder).read_text()
+    write_json(folder / BEST, {"step": step, "error": 0.4, "weights": ""})
+    assert sentence in write_report(folder).read_text()
 
 
 def test_run_that_is_evaluated_during_training(folder):
