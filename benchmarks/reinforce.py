@@ -3,12 +3,13 @@
     python -m benchmarks.reinforce --backbone pi0 --size small --task pick_place --worlds 256
 
 From random adapters: what a policy does makes no difference, since worlds run until the time limit.
+The first call of a part compiles it, unless JAX_COMPILATION_CACHE_DIR has its programs.
 """
 
 import argparse
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -72,18 +73,17 @@ def main() -> None:
 
 
 def measure(setting: Setting, state: Any) -> list[dict[str, Any]]:
-    """Return a row per part: seconds, and control steps or samples per second."""
+    """Return a row per part: times, and control steps or samples per second."""
     (task,), config = setting.environments, setting.config
     learning, key = config.online, jax.random.key(0)
     policy = setting.policy(state.adapters).with_sampler()
     env, gym = setting.environments[task], setting.gyms[task]
     steps = env.max_steps * env.num_envs
-    seen, seconds = _timed(lambda: setting.collect(task, policy, key, std=0.0))
-    rows = [{"part": "policy, pictures, physics", "seconds": seconds, "per s": steps / seconds}]
+    seen, times = _timed(lambda: setting.collect(task, policy, key, std=0.0))
+    rows = [_row("policy, pictures, physics", steps, times)]
     own, critic = state.teachers[task], state.critics[task]
-    _, seconds = _timed(lambda: teacher.practise(own, critic, gym, policy, key, learning))
-    done = gym.max_steps * gym.num_envs
-    rows.append({"part": "teacher, physics", "seconds": seconds, "per s": done / seconds})
+    _, times = _timed(lambda: teacher.practise(own, critic, gym, policy, key, learning))
+    rows.append(_row("teacher, physics", gym.max_steps * gym.num_envs, times))
     lessons = student.lessons(seen, own, policy.processor)
     size, count = config.optim.batch_size, len(lessons.prompts)
     index = student.order(count, learning.gradient_steps, size, key)
@@ -93,17 +93,29 @@ def measure(setting: Setting, state: Any) -> list[dict[str, Any]]:
         current[0], metrics = setting.imitate(current[0], setting.frozen, lessons, index, key)
         return metrics
 
-    _, seconds = _timed(imitate)
-    rows.append({"part": "gradient steps", "seconds": seconds, "per s": np.size(index) / seconds})
+    _, times = _timed(imitate)
+    rows.append(_row("gradient steps", np.size(index), times))
     return rows
 
 
-def _timed(call: Callable[[], Any]) -> tuple[Any, float]:
-    """Return the result of a call and the seconds of a second one."""
+def _row(part: str, count: int, times: Sequence[float]) -> dict[str, Any]:
+    first, seconds, cores = times
+    return {
+        "part": part,
+        "first call [s]": first,
+        "its CPU time [s]": cores,
+        "seconds": seconds,
+        "per s": count / seconds,
+    }
+
+
+def _timed(call: Callable[[], Any]) -> tuple[Any, tuple[float, float, float]]:
+    """Return the result of a call, the seconds of a first and a second one, and the first's CPU."""
+    started, used = time.perf_counter(), time.process_time()
     jax.block_until_ready(call())
-    started = time.perf_counter()
+    compiled, used = time.perf_counter(), time.process_time() - used
     result = jax.block_until_ready(call())
-    return result, time.perf_counter() - started
+    return result, (compiled - started, time.perf_counter() - compiled, used)
 
 
 if __name__ == "__main__":
