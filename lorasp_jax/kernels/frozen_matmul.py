@@ -36,9 +36,13 @@ MIN_WIDTH, MIN_PRODUCTS, MIN_SIZE = 1024, 2**34, 2**25
 product in float8."""
 
 
-@jax.custom_vjp
 def frozen_matmul(x: jax.Array, kernel: Kernel) -> jax.Array:
     """Compute x W, [..., O], in the dtype of x [..., I]. W [I, O] receives no gradient."""
+    return _frozen_matmul(x, kernel)  # whose decorator hides its types
+
+
+@jax.custom_vjp
+def _frozen_matmul(x: jax.Array, kernel: Kernel) -> jax.Array:
     return matmul(x, kernel)
 
 
@@ -99,4 +103,4 @@ def _backward(kernel: Kernel, g: jax.Array) -> tuple[jax.Array, None]:
     return matmul_transposed(g, kernel), None
 
 
-frozen_matmul.defvjp(_forward, _backward)
+_frozen_matmul.defvjp(_forward, _backward)
