@@ -59,6 +59,7 @@ def main() -> None:
         peft=LoRA(rank=64),
         model=ModelConfig(dtype="bfloat16", **names),
         tasks=(options.task,),
+        data=dataclasses.replace(config.data, episodes=16),  # for the normalization
         optim=dataclasses.replace(config.optim, batch_size=options.batch),
         online=learning,
     )
