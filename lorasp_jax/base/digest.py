@@ -18,11 +18,13 @@ import numpy as np
 
 DIGEST = "digest"
 """Key of a JSON object's digest."""
+_SMALL = 2**28
+"""Arrays of so many bytes in all take NumPy less time than compiling for their shapes."""
 
 
 def digest(arrays: Mapping[str, jax.Array], *extra: str) -> str:
     """Return the SHA-256 (hex) of `extra` and each array's name, dtype, shape and `mixed_sum`."""
-    sums = jax.device_get({name: _sum(array) for name, array in arrays.items()})
+    sums = _sums(arrays)
     entries = [
         [name, str(array.dtype), list(array.shape), int(sums[name])]
         for name, array in sorted(arrays.items())
@@ -32,7 +34,7 @@ def digest(arrays: Mapping[str, jax.Array], *extra: str) -> str:
 
 def fingerprints(weights: Mapping[str, Any]) -> dict[str, str]:
     """Hash each array to eight hex digits, in bf16 so that fp32 and bf16 copies match."""
-    sums = jax.device_get({name: _sum(array, rounded=True) for name, array in weights.items()})
+    sums = _sums(weights, rounded=True)
     return {name: f"{int(value):08x}" for name, value in sums.items()}
 
 
@@ -65,19 +67,25 @@ def _json_digest(values: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(normalized, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _sum(array: Any, *, rounded: bool = False) -> Any:
-    """Compute `mixed_sum`, optionally of floats rounded to bf16.
+def _sums(arrays: Mapping[str, Any], *, rounded: bool = False) -> dict[str, Any]:
+    """Compute `mixed_sum` of each array, optionally of floats rounded to bf16.
 
-    Arrays in host memory use NumPy, which avoids a compilation for each shape.
+    What is in host memory or small uses NumPy, which compiles nothing for each shape.
     """
-    rounded = rounded and jnp.issubdtype(array.dtype, jnp.floating)
-    on_host = isinstance(array, np.ndarray) or (
-        array.is_fully_addressable and all(d.platform == "cpu" for d in array.devices())
-    )
-    if not on_host:
-        return mixed_sum(array, rounded=rounded)
-    array = np.asarray(array)
-    return host_sum(array.astype(jnp.bfloat16) if rounded else array)
+    small = sum(array.nbytes for array in arrays.values()) <= _SMALL
+
+    def compute(array: Any) -> Any:
+        rounds = rounded and jnp.issubdtype(array.dtype, jnp.floating)
+        on_host = isinstance(array, np.ndarray) or (
+            array.is_fully_addressable
+            and (small or all(d.platform == "cpu" for d in array.devices()))
+        )
+        if not on_host:
+            return mixed_sum(array, rounded=rounds)
+        array = np.asarray(array)
+        return host_sum(array.astype(jnp.bfloat16) if rounds else array)
+
+    return jax.device_get({name: compute(array) for name, array in arrays.items()})
 
 
 def host_sum(array: np.ndarray, block: int = 2**18) -> int:

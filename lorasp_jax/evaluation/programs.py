@@ -107,7 +107,7 @@ class SplitRollout:
         worlds, slots = self.env.num_envs, policy.processor.action_slots
         policy = _shareable(policy)
         key = jax.device_put(jax.random.key(0), place)
-        blank = lambda x: jax.device_put(jnp.zeros(x.shape, x.dtype), place)  # noqa: E731
+        blank = lambda x: jax.device_put(np.zeros(x.shape, x.dtype), place)  # noqa: E731
         placed = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place)  # noqa: E731
         shape = lambda *axes, dtype: placed(jax.ShapeDtypeStruct(axes, dtype))  # noqa: E731
         with ThreadPoolExecutor() as pool:

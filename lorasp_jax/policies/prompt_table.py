@@ -117,7 +117,7 @@ class PromptTable:
         """
         count = len(self.start.ids)
         rows = np.arange(-(-count // SHARED_ROWS) * SHARED_ROWS) % count
-        start = Ids(*(jnp.asarray(array)[rows] for array in self.start))
+        start = Ids(*(jnp.asarray(np.asarray(array)[rows]) for array in self.start))
         return dataclasses.replace(self, start=start, instructions=())
 
     def plain(self) -> "PromptTable":

@@ -23,7 +23,7 @@ def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]
     execute = config.evaluation.execute_steps
     found, critics, values = experience(setting, state, setting.collect)
     batches = [_batch(each, advantages, ~each.steps.done, execute) for each, advantages in found]
-    batch = jax.tree.map(lambda *x: jnp.concatenate(x), *batches)
+    batch = rollout.joined(batches)
     key = jax.random.fold_in(RandomStream.TRAINING.key(config.seed), step)
     rows = {}
     if step:  # a critic that has learned nothing only adds noise

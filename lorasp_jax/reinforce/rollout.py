@@ -1,7 +1,7 @@
 """Episodes to learn from, in which the policy or another actor explores."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -144,11 +144,21 @@ def play(
         worlds.state, step = _act(env, worlds.state, actions)
         chunks.append(chunk)
         steps.append(Transitions(**step))
-    join = lambda *parts: jnp.concatenate(parts)  # noqa: E731
-    joined = jax.tree.map(join, *steps)
-    end = jnp.argmax(joined.ended, axis=0)
-    success = jnp.take_along_axis(joined.success, end[None], axis=0)[0]
-    return Experience(jax.tree.map(join, *chunks), joined, full_state(env, worlds.state), success)
+    return _experience(chunks, steps, full_state(env, worlds.state))
+
+
+@jax.jit
+def joined(parts: Sequence[Any]) -> Any:
+    """Concatenate trees of arrays: one program, where eager calls compile one for each shape."""
+    return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *parts)
+
+
+@jax.jit
+def _experience(chunks: Sequence[Any], parts: Sequence[Transitions], last: jax.Array) -> Experience:
+    steps = joined(parts)
+    end = jnp.argmax(steps.ended, axis=0)
+    success = jnp.take_along_axis(steps.success, end[None], axis=0)[0]
+    return Experience(joined(chunks), steps, last, success)
 
 
 def _over_devices(tree: Any, policy: Policy) -> Any:

@@ -33,6 +33,7 @@ from lorasp_jax.training.optim import make_optimizer
 from lorasp_jax.training.program import Frozen
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Run
+from lorasp_jax.training.step import copied
 
 _WIDTHS = 128, 128
 """Of the hidden layers of an actor of the noise; our choice."""
@@ -121,14 +122,15 @@ def prepare(run: Run) -> tuple[Setting, Learner, Any]:
     learned = adapters[PATH].get_value().network.layers if run.trained else adapters
     zero, one = jnp.zeros((), jnp.int32), jnp.ones(())
     critics, taught = _critics(config, environments), _teachers(config, gyms, run.policy)
-    adapters, guard = jax.tree.map(jnp.copy, adapters), Guard.initial()
-    state = Learner(zero, adapters, optimizer.init(learned), guard, critics, one, taught)
+    adapters, guard = copied(adapters), Guard.initial()
+    opt_state = jax.jit(optimizer.init)(learned)
+    state = Learner(zero, adapters, opt_state, guard, critics, one, taught)
     shardings = meshes.shardings(state, mesh)
     state = jax.device_put(state, shardings)
     processor = run.policy.processor
     frozen = Frozen(parameters, processor.shared())
     frozen = jax.device_put(frozen, meshes.shardings(frozen, mesh))
-    start = jax.tree.map(jnp.copy, state.adapters)
+    start = copied(state.adapters)
     programs = update.Programs(config, graphdef, optimizer, shardings)
     imitate = student.make_program(config, graphdef, optimizer, shardings)
 
@@ -219,9 +221,9 @@ def check_memory(config: ReinforceConfig, environments: Mapping[str, Env]) -> No
 
 
 def _critics(config: ReinforceConfig, environments: Mapping[str, Env]) -> dict[str, Critic]:
-    rate = config.online.critic_learning_rate
+    rate, init = config.online.critic_learning_rate, jax.jit(Critic.init, static_argnums=(1, 2))
     return {
-        task: Critic.init(RandomStream.CRITIC.key(config.seed, task), _size(env), rate)
+        task: init(RandomStream.CRITIC.key(config.seed, task), _size(env), rate)
         for task, env in environments.items()
     }
 
@@ -230,8 +232,9 @@ def _teachers(
     config: ReinforceConfig, gyms: Mapping[str, Env], policy: Policy
 ) -> dict[str, Teacher]:
     shape = config.evaluation.execute_steps, policy.processor.statistics.dim
+    init = jax.jit(Teacher.init, static_argnums=(1, 2, 3))
     return {
-        task: Teacher.init(RandomStream.TEACHER.key(config.seed, task), _size(env), *shape)
+        task: init(RandomStream.TEACHER.key(config.seed, task), _size(env), *shape)
         for task, env in gyms.items()
     }
 

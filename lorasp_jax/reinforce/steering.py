@@ -52,7 +52,7 @@ def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]
     The first iteration measures what normalizes x, and trains only the critic.
     """
     found, critics, values = ppo.experience(setting, state, functools.partial(_collect, setting))
-    seen, samples = jax.tree.map(lambda *x: jnp.concatenate(x), *(_samples(*x) for x in found))
+    seen, samples = rollout.joined([_samples(*x) for x in found])
     effects = jnp.concatenate([each.chunks.effect for each, _ in found])
     values["noise_effect"] = float(jnp.sqrt(jnp.mean(effects)))
     actor, guard = state.adapters[PATH].get_value(), state.guard

@@ -14,6 +14,7 @@ import numpy as np
 import optax
 
 from lorasp_jax.data.batches import Batch
+from lorasp_jax.models.perceptron import Network
 from lorasp_jax.peft.auxiliary import AUXILIARY_WEIGHTS
 from lorasp_jax.policies.processor import Processor
 from lorasp_jax.reinforce import noise
@@ -38,11 +39,16 @@ def lessons(found: Experience, teacher: Teacher | None, processor: Processor) ->
     chunks = found.chunks
     if teacher is None:
         return chunks
-    better = teacher.network(found.at_calls(found.steps.state))
-    length, slots = better.shape[1], noise.action_slots(processor)
-    own = chunks.actions[:, :length]
-    actions = chunks.actions.at[:, :length].set(jnp.where(slots, better, own))
+    actions = _corrected(found, teacher.network, noise.action_slots(processor))
     return chunks._replace(actions=actions)
+
+
+@jax.jit
+def _corrected(found: Experience, network: Network, slots: np.ndarray) -> jax.Array:
+    """Return the chunks' actions, with those of a teacher where they are executed."""
+    better = network(found.at_calls(found.steps.state))
+    own, length = found.chunks.actions, better.shape[1]
+    return own.at[:, :length].set(jnp.where(slots, better, own[:, :length]))
 
 
 def make_program(

@@ -144,19 +144,13 @@ def practise(
         return _act(teacher.network, own, *seen, spread, processor)
 
     found = rollout.play(env, policy, act, key, execute_steps=length, ranges=ranges)
-    new = jnp.all(critic.network.std == 0)
     own, other = jax.random.split(jax.random.fold_in(key, RandomStream.CRITIC))
-    advantages, critic, metrics = critics.jitted_learn(
+    advantages, learned, metrics = critics.jitted_learn(
         critic, found.steps, found.last, own, learning
     )
     slots = tuple(noise.action_slots(policy.processor).tolist())
-    quiet = ~found.chunks.noisy[: len(found.success)]
-    success = jnp.mean(found.success, where=quiet)
-    improved = _improve(teacher, found, advantages, other, learning, slots)
-    keep = new | (success >= ENOUGH)  # then what was measured does not change
-    teacher = jax.tree.map(lambda x, y: jnp.where(keep, x, y), teacher, improved)
-    metrics |= {"steps": jnp.sum(~found.steps.done)}
-    return dataclasses.replace(teacher, success=success), critic, metrics
+    teacher = _improve(teacher, critic, found, advantages, other, learning, slots)
+    return teacher, learned, metrics | {"steps": jnp.sum(~found.steps.done)}
 
 
 @jax.jit
@@ -176,16 +170,20 @@ def _act(
     return processor.decode(calls.actions, robot), calls
 
 
-@functools.partial(jax.jit, static_argnums=(4, 5))
+@functools.partial(jax.jit, static_argnums=(5, 6))
 def _improve(
     teacher: Teacher,
+    critic: Critic,
     found: Experience,
     advantages: jax.Array,
     key: jax.Array,
     learning: Learning,
     slots: tuple[bool, ...],
 ) -> Teacher:
-    """Take gradient steps on minibatches of calls until the teacher has changed enough."""
+    """Take gradient steps on minibatches of calls until the teacher has changed enough.
+
+    A teacher that succeeds often enough stays as it is, and so does one whose critic was new.
+    """
     calls, executed = found.chunks, np.array(slots)
     by_call = lambda x: rollout.by_call(x, calls.actions.shape[1])  # noqa: E731
     valid = by_call(~found.steps.done) & calls.noisy[:, None]
@@ -195,4 +193,8 @@ def _improve(
     settings = Descent(rate, _EPOCHS, size, learning.clip, learning.max_kl)
     before = Learned(teacher.network, teacher.opt_state, teacher.rate)
     after, _ = descent.improve(before, calls.state, samples, key, spread, executed, settings)
-    return Teacher(*after, teacher.success)
+    success = jnp.mean(found.success, where=~calls.noisy[: len(found.success)])
+    new = jnp.all(critic.network.std == 0)
+    keep = new | (success >= ENOUGH)  # then what was measured does not change
+    network, opt_state, rate = jax.tree.map(lambda x, y: jnp.where(keep, x, y), before, after)
+    return Teacher(network, opt_state, rate, success)

@@ -11,7 +11,7 @@ from lorasp_jax.reinforce import student
 from lorasp_jax.reinforce import teacher as teachers
 from lorasp_jax.reinforce.critic import Critic
 from lorasp_jax.reinforce.learner import Learner
-from lorasp_jax.reinforce.rollout import Experience
+from lorasp_jax.reinforce.rollout import Experience, joined
 from lorasp_jax.reinforce.setting import Setting
 from lorasp_jax.reinforce.teacher import Teacher
 from lorasp_jax.training.random_streams import RandomStream
@@ -45,7 +45,7 @@ def iterate(setting: Setting, state: Learner) -> tuple[Learner, dict[str, float]
         leads = _leads(success, rate)
         better |= leads
         given.append(student.lessons(seen, taught[task] if leads else None, policy.processor))
-    lessons = jax.tree.map(lambda *x: jnp.concatenate(x), *given)
+    lessons = joined(given)
     state = dataclasses.replace(state, critics=critics, teachers=taught)
     state, rows = jax.device_put(state, setting.shardings), {}
     if better:
@@ -71,12 +71,8 @@ def _clone(
     key = jax.random.fold_in(key, RandomStream.TEACHER)
     noisy = setting.collect(task, policy, key)
     length = setting.config.evaluation.execute_steps
-    state, actions = (
-        jnp.concatenate(x)
-        for x in zip(
-            *((x.at_calls(x.steps.state), x.chunks.actions[:, :length]) for x in (seen, noisy)),
-            strict=True,
-        )
+    state, actions = joined(
+        [(x.at_calls(x.steps.state), x.chunks.actions[:, :length]) for x in (seen, noisy)]
     )
     own, slots = jax.random.fold_in(key, RandomStream.TRAINING), policy.processor.action_slots
     return teachers.clone(new, state, actions, own, slots), _steps(noisy)

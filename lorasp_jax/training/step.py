@@ -55,10 +55,16 @@ def init_state(
     adapters: Any, optimizer: optax.GradientTransformation, *, ema: bool = False
 ) -> TrainState:
     """Return the initial state. It copies the adapters, because steps donate their buffers."""
-    adapters = jax.tree.map(jnp.copy, adapters)
-    average = jax.tree.map(jnp.copy, adapters) if ema else None
+    adapters = copied(adapters)
+    average = copied(adapters) if ema else None
     step = jnp.zeros((), jnp.int32)
     return TrainState(step, adapters, optimizer.init(adapters), Guard.initial(), average)
+
+
+@jax.jit
+def copied(tree: Any) -> Any:
+    """Copy the arrays of a tree: one program, where eager copies compile one for each shape."""
+    return jax.tree.map(jnp.copy, tree)
 
 
 def active_ranks(aux: dict[str, dict[str, Aux]]) -> Metrics:

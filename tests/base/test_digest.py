@@ -1,5 +1,8 @@
 """Array digests are the same on host and device, and detect flipped bits."""
 
+import dataclasses
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -45,6 +48,34 @@ def test_nothing_is_compiled_on_cpu(compiled):
     assert compiled == []
     digest.mixed_sum(arrays["a"])
     assert compiled
+
+
+@dataclasses.dataclass
+class OnGpu:
+    """An array that a GPU holds, if it tells the truth."""
+
+    array: np.ndarray
+    is_fully_addressable = True
+
+    def __getattr__(self, name):
+        return getattr(self.array, name)
+
+    def devices(self):
+        return [SimpleNamespace(platform="gpu")]
+
+    def __array__(self, dtype=None, copy=None):
+        return self.array
+
+
+def test_few_bytes_leave_the_gpu(monkeypatch):
+    sums, held = [], {"a": OnGpu(np.ones(37, np.float32)), "b": OnGpu(np.ones(3, np.int32))}
+    monkeypatch.setattr(digest, "mixed_sum", lambda array, rounded: sums.append(array) or 0)
+    few = digest.digest(held)
+    assert few == digest.digest({name: each.array for name, each in held.items()})
+    assert not sums
+    monkeypatch.setattr(digest, "_SMALL", 4 * 40 - 1)
+    assert digest.digest(held) != few
+    assert len(sums) == 2
 
 
 @pytest.mark.parametrize("index", [0, 41, 104])
