@@ -218,7 +218,7 @@ def _drawn(env: Env) -> tuple[Any, ...]:
 @functools.cache
 def _sources(files: tuple[str, ...]) -> str:
     """Compute the hexadecimal SHA-256 of this package's and other source files."""
-    digest, package = hashlib.sha256(), Path(__file__).parents[1]
+    digest, package = hashlib.sha256(), Path(__file__).parent
     for file in [*sorted(package.rglob("*.py")), *map(Path, files)]:
         name = file.relative_to(package) if file.is_relative_to(package) else file.name
         digest.update(f"{name}\n".encode() + file.read_bytes())

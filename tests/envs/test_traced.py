@@ -8,6 +8,7 @@ import threading
 import time
 import types
 import weakref
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -230,6 +231,14 @@ def test_a_changed_source_file_is_traced(env, cache, tmp_path):
     call(env, KEY, 0.5)
     assert not early.traced
     assert new_process(env, KEY, 0.5, files=[str(file)])[1]
+
+
+def test_the_sources_are_those_of_this_package(tmp_path, monkeypatch):
+    """An installed package has thousands of others beside it, and editors leave dead links."""
+    read, own = set(), Path(envs.__file__).parent
+    monkeypatch.setattr(Path, "read_bytes", lambda path: bytes(read.add(path) or 0))
+    programs._sources.__wrapped__((str(tmp_path / "program.py"),))
+    assert read == {*own.rglob("*.py"), tmp_path / "program.py"}
 
 
 @pytest.mark.parametrize(
