@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import dataclasses
 import threading
 from collections.abc import Mapping
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
@@ -208,6 +207,7 @@ def _refuse_existing(file: Path) -> None:
 
 def _recipe(options: argparse.Namespace, env: envs.Env) -> dict[str, Any]:
     """Return everything that the episodes depend on, as JSON values."""
+    ranges = _ranges(options)
     return {
         "task": env.task.name,
         "robot": options.robot,
@@ -220,7 +220,7 @@ def _recipe(options: argparse.Namespace, env: envs.Env) -> dict[str, Any]:
         "actions": env.actions,
         "distractors": env.distractors,
         "action_noise": options.action_noise,
-        "randomize": dataclasses.asdict(drawn) if (drawn := _ranges(options)) else None,
+        "randomize": ranges and {name: [*each] for name, each in vars(ranges).items()},
         "seed": options.seed,
         "physics": env.physics.backend,
         "device": jax.default_backend(),

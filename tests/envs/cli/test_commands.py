@@ -149,6 +149,19 @@ def test_killed_and_resumed(tmp_path, run, moment):
         assert (out / file.name).stat().st_mtime_ns == before[file]
 
 
+def test_randomized_worlds_resume_and_stay_complete(tmp_path, run):
+    whole, out = tmp_path / "whole", tmp_path / "press"
+    text = f"{COLLECT} --randomize"
+    assert run(text, "--out", whole)[0] == 0
+    code, _ = run(text, "--out", out, record=stopping(fake_record, 2))
+    assert code == 130
+    code, output = run(text, "--out", out)
+    assert code == 0, output
+    assert rlds.metadata(out) == rlds.metadata(whole)
+    code, output = run(text, "--out", out)
+    assert (code, output.endswith("press is already complete")) == (0, True), output
+
+
 @pytest.mark.slow
 def test_an_interrupted_simulation_resumes_bit_for_bit(tmp_path, run, env, monkeypatch):
     for module in (envs, collection):
