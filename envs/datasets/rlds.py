@@ -144,6 +144,7 @@ class Reader:
             # macOS writes a file ._NAME beside each file NAME on some drives.
             copies = {file.with_name(f"._{file.name}") for file in shards}
             shards = [file for file in shards if file not in copies]
+            shards = shards[: len(self.metadata["parts"])]  # the next one may be incomplete
             self._records = ArrayRecordDataSource([check_regular(f, self.path) for f in shards])
             if len(self) != (expected := sum(self.metadata["parts"])):
                 raise ValueError(f"expected {expected} episodes, found {len(self)}")

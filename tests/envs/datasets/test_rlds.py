@@ -172,6 +172,20 @@ def test_shards_add_up(tmp_path):
         assert_equal(rlds.read(each.folder), trimmed(concatenate([first, second])))
 
 
+@pytest.mark.parametrize("content", [None, b"half", b""])
+def test_a_shard_that_was_not_completed_hides_no_earlier_ones(tmp_path, content):
+    """A recording is used while it grows; a process may be killed in its next episode."""
+    parts = rlds.ShardWriter(tmp_path / "parts", {})
+    parts.append(make(2))
+    parts.complete()
+    before = (parts.folder / rlds.METADATA).read_bytes()
+    parts.append(make(3))
+    if content is not None:
+        sorted(parts.folder.glob("*array_record*"))[1].write_bytes(content)
+    (parts.folder / rlds.METADATA).write_bytes(before)
+    assert_equal(rlds.read(parts.folder), trimmed(make(2)))
+
+
 def test_shards_must_match(tmp_path):
     parts = rlds.ShardWriter(tmp_path / "parts", {"seed": 0})
     parts.append(make())
