@@ -61,7 +61,10 @@ def write(file: Path, where: str, keys: Keys) -> None:
 
     A local path, in `where`, is written relative to the file.
     """
-    path = where if hub.is_remote(where) else os.path.relpath(where, file.parent)
+    path = where
+    if not hub.is_remote(where):  # ".." leads out of where a link to a folder leads
+        above, own = (os.path.realpath(x.parent) for x in (Path(where), file))
+        path = os.path.relpath(os.path.join(above, Path(where).name), own)
     # Strings, numbers and lists look the same in JSON and in TOML.
     lines = [f"path = {_text(path)}"]
     for name in _OPTIONS:

@@ -3,6 +3,8 @@
 import dataclasses
 import functools
 import json
+import os
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -170,6 +172,18 @@ def test_inspect_saves_what_other_commands_read(tmp_path, monkeypatch, capsys):
     with pytest.raises(ValueError, match="change them there"):
         open_source(tmp_path / "my.toml", Keys(every=3))
     assert main(["inspect", str(golden("v3")), "--save", str(tmp_path / "my.toml")]) == 2
+
+
+def test_a_dataset_file_in_a_linked_folder_finds_its_dataset(tmp_path):
+    (tmp_path / "far" / "away").mkdir(parents=True)
+    (tmp_path / "link").symlink_to(tmp_path / "far" / "away")
+    (tmp_path / "data").mkdir()
+    (tmp_path / "latest").symlink_to("data")
+    for name in ("data", "latest"):  # what a link leads to may change, the link stays
+        dataset_file.write(tmp_path / "link" / "my.toml", str(tmp_path / name), Keys())
+        path, _ = dataset_file.read(tmp_path / "link" / "my.toml", 0)
+        assert os.path.samefile(path, tmp_path / "data")
+        assert Path(path).name == name
 
 
 @pytest.mark.parametrize(
