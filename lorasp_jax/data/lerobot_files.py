@@ -237,12 +237,13 @@ def read_table(
 
 def _size(metadata: pq.FileMetaData, columns: set[str]) -> int:
     """Estimate the size of columns in memory [bytes]; the file stores repeated values only once."""
+    prefixes = tuple(f"{name}." for name in columns)
     groups = (metadata.row_group(i) for i in range(metadata.num_row_groups))
     chunks = (group.column(j) for group in groups for j in range(group.num_columns))
     return sum(
         max(chunk.total_uncompressed_size, _MAX_VALUE_BYTES * chunk.num_values)
         for chunk in chunks
-        if columns & {chunk.path_in_schema, chunk.path_in_schema.partition(".")[0]}
+        if f"{chunk.path_in_schema}.".startswith(prefixes)  # names may have dots, too
     )
 
 

@@ -101,11 +101,16 @@ def test_image_formats():
         decode_image(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n", "a picture")
 
 
-def test_many_equal_rows(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "is_list"), [("action", False), ("action", True), ("observation.state", True)]
+)
+def test_many_equal_rows(name, is_list, tmp_path):
     """A small file that takes much memory."""
     column = pa.DictionaryArray.from_arrays(pa.array([0] * 10**6, pa.int8()), pa.array([1.5]))
+    if is_list:
+        column = pa.FixedSizeListArray.from_arrays(column, 1)
     path = tmp_path / "many.parquet"
-    table = pa.table({"action": column})
+    table = pa.table({name: column})
     with pq.ParquetWriter(path, table.schema) as writer:
         for _ in range(10):
             writer.write_table(table)
