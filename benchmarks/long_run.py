@@ -72,8 +72,9 @@ def run(env: Env, episodes: int) -> Iterator[Report]:
     def episode(state: State, key: jax.Array) -> tuple[State, dict[str, jax.Array]]:
         # Restart all worlds, including those whose expert finished before the time limit.
         state = dataclasses.replace(state, done=jnp.ones(env.num_envs, bool))
-        state = env.reset_done(state, key, ranges)
-        plan = expert.plan(env, state, key)
+        reset_key, plan_key = jax.random.split(key)
+        state = env.reset_done(state, reset_key, ranges)
+        plan = expert.plan(env, state, plan_key)
 
         def body(state: State, _: None) -> tuple[State, None]:
             return env.step(state, expert.act(env, plan, state)), None

@@ -7,6 +7,7 @@ import socket
 import socketserver
 import threading
 import time
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -23,6 +24,7 @@ from benchmarks import (
     small_cards,
 )
 from benchmarks.deployment import Case
+from envs.state import State
 from lorasp_jax import peft
 from lorasp_jax.data.cache import Cache
 from lorasp_jax.models.pi0 import Pi0Config
@@ -61,6 +63,26 @@ def test_long_run_reports_at_its_end(episodes, monkeypatch):
     assert len(reports) == min(episodes, 5)
     assert reports[-1].episodes == episodes
     assert reports[-1].success == 0.5
+
+
+def test_a_long_run_plans_with_other_keys_than_it_restarts(monkeypatch):
+    """A plan splits its key as a restart does: from one key, its noise would be the layout's."""
+    keys, zero = [], np.zeros(1)
+
+    def note(_, state, key, *__):
+        keys.append(key)
+        return state
+
+    state = State(None, zero, zero, {}, {"success": zero, "broken": zero})
+    worlds = SimpleNamespace(num_envs=1, expert_steps=0, reset=lambda *_: state)
+    worlds.reset_done, worlds.step = functools.partial(note, worlds), lambda state, _: state
+    worlds.observe = lambda _: {"image": {}}
+    monkeypatch.setattr(long_run.expert, "plan", note)
+    monkeypatch.setattr(long_run.expert, "act", lambda *_: None)
+    monkeypatch.setattr(long_run, "memory", lambda env: {})
+    list(long_run.run(worlds, 1))
+    restart, plan = keys
+    assert restart is not plan
 
 
 @pytest.mark.slow
