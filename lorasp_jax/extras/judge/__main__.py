@@ -51,6 +51,7 @@ def _run(options: argparse.Namespace) -> None:
     if options.out:
         source = options.server or str(options.run)
         described = {"policy": source, "env": options.env, "seed": options.seed, **results}
+        options.out.parent.mkdir(parents=True, exist_ok=True)
         write_text(options.out, json.dumps(described, indent=1))
         print(f"written: {options.out}")
 
@@ -88,10 +89,11 @@ def _print_progress(task: str, done: int, successes: int) -> None:
 
 def table(results: dict[str, Any]) -> str:
     """Format success rates with their intervals, one line per task and group."""
-    rows = {**results["tasks"], **results["groups"], "all": results}
-    width = max(map(len, rows))
+    # A group may have the name of one of its tasks.
+    rows = [*results["tasks"].items(), *results["groups"].items(), ("all", results)]
+    width = max(len(name) for name, _ in rows)
     lines = []
-    for name, row in rows.items():
+    for name, row in rows:
         low, high = (100 * bound for bound in row["ci95"])
         wins = round(row["success"] * row["episodes"])
         lines.append(

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from lorasp_jax.base.intervals import wilson_interval
-from lorasp_jax.extras.judge.__main__ import main
+from lorasp_jax.extras.judge.__main__ import main, table
 from lorasp_jax.extras.judge.actors import RunActor
 from lorasp_jax.extras.judge.judge import judge
 from lorasp_jax.extras.judge.parallel import judge_in_processes
@@ -86,6 +86,14 @@ def test_groups_pool_their_episodes_and_films_have_a_frame_per_action(tmp_path):
         assert film.size == (8, 8)
 
 
+def test_the_table_shows_a_task_and_a_group_of_one_name():
+    both = [dataclasses.replace(each, group="line") for each in tasks()]
+    lines = [line.split() for line in table(judge(both, Mover(), 2)).splitlines()]
+    assert [(line[0], line[-1]) for line in lines[:4]] == [
+        *(("line", "2"), ("other", "2"), ("line", "4"), ("all", "4")),
+    ]
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
@@ -139,7 +147,7 @@ def test_processes_judge_as_one_does(tmp_path, capsys):
     found = {}
     with policy_server(act) as url:
         for count in ("1", "2"):
-            out, films = tmp_path / f"{count}.json", tmp_path / f"films{count}"
+            out, films = tmp_path / "new" / f"{count}.json", tmp_path / f"films{count}"
             options = ["--server", url, "--processes", count, "--out", str(out)]
             options += ["--episodes", "3", "--seed", "4", "--films", str(films)]
             assert main([*COMMAND[3:], *options]) == 0
