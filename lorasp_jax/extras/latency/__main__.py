@@ -37,6 +37,7 @@ def _measure(options: argparse.Namespace) -> None:
         results = run_here(study, run / study.name, [cell.name for cell in study.cells])
         curves.append((run.name, results))
         print(f"written: {run / study.name}")
+    path.parent.mkdir(parents=True, exist_ok=True)
     figure.write(path, curves)
     print(f"written: {path}")
 

@@ -96,7 +96,7 @@ def test_a_figure_of_several_runs(folder, tmp_path, monkeypatch):
     write_json(other / "config.json", read_json(folder / "config.json"))
     write_description(other)
     command.main([str(folder), "--executions", "naive", "--delays", "0", "1", "--tasks", "press"])
-    path = tmp_path / "both.svg"
+    path = tmp_path / "new" / "both.svg"
     options = ["--delays", "0", "1", "--tasks", "press", "--figure", str(path)]
     contents = set()
     monkeypatch.setattr(figure, "write", WRITE)
