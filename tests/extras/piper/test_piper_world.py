@@ -1,7 +1,9 @@
 """The fake arm's scene: the same layout and pictures as the simulator's, other physics."""
 
+import jax
 import numpy as np
 
+from lorasp_jax.extras.piper.fake import world as scenes
 from lorasp_jax.extras.piper.fake.world import TIMESTEP
 
 
@@ -52,3 +54,13 @@ def test_seeds_give_layouts(world):
     assert (world.model.body_pos != first[1]).any()
     world.reset(1)
     np.testing.assert_array_equal(world.data.qpos, first[0])
+
+
+def test_an_experts_noise_is_not_that_of_the_layout(world, monkeypatch):
+    """A plan splits its key into one per world, as a reset does."""
+    keys = []
+    monkeypatch.setattr(scenes, "_actions", lambda _, __, key: keys.append(key))
+    world.reset(3)
+    world.demonstration(3)
+    plan, layout = (jax.random.split(key, 1) for key in (*keys, jax.random.key(3)))
+    assert (jax.random.key_data(plan) != jax.random.key_data(layout)).any()

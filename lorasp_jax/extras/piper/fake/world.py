@@ -127,7 +127,8 @@ class World:
 
     def demonstration(self, seed: int) -> np.ndarray:
         """Return the scripted expert's actions [T, 7] from the start of this layout."""
-        return np.asarray(_actions(self.env, self.state, jax.random.key(seed)))
+        _, key = jax.random.split(jax.random.key(seed))  # the first is the layout's
+        return np.asarray(_actions(self.env, self.state, key))
 
     def command(self, pose: np.ndarray) -> None:
         """Set the servos' targets [7]."""
