@@ -7,7 +7,6 @@ with the requests of other sites' pages, too.
 """
 
 import base64
-import binascii
 import contextlib
 import http
 import ipaddress
@@ -179,7 +178,7 @@ def password(header: str) -> str:
     scheme, _, text = header.partition(" ")
     if scheme.lower() != "basic":
         return header
-    with contextlib.suppress(binascii.Error, UnicodeDecodeError):
+    with contextlib.suppress(ValueError):  # also of base64 and of UTF-8
         return base64.b64decode(text, validate=True).decode().partition(":")[2]
     return ""
 

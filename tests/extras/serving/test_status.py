@@ -43,8 +43,12 @@ def status(server):
     return json.loads(fetch(server, "/status")[2])
 
 
+def scheme(text):
+    return {"Authorization": f"Basic {text}"}
+
+
 def basic(password, name="anyone"):
-    return {"Authorization": "Basic " + base64.b64encode(f"{name}:{password}".encode()).decode()}
+    return scheme(base64.b64encode(f"{name}:{password}".encode()).decode())
 
 
 @pytest.fixture(scope="module")
@@ -144,7 +148,7 @@ def test_pictures_are_encoded_only_when_asked_for(server, monkeypatch):
 def test_pages_need_the_token_as_password():
     with serving(StandIn(), token="sécret: a") as server, connect(server, token="sécret: a"):
         for path in ("/", "/status", "/pictures/0/side"):
-            for wrong in ({}, basic("wrong"), basic(""), {"Authorization": "Basic !"}):
+            for wrong in ({}, basic("wrong"), basic(""), *map(scheme, ("!", "ÿ", "/w=="))):
                 code, headers, _ = fetch(server, path, **wrong)
                 assert (code, headers["WWW-Authenticate"][:6]) == (401, "Basic ")
             expected = 404 if "pictures" in path else 200
