@@ -24,7 +24,7 @@ def fill(path: Path, blocks: Mapping[str, str]) -> None:
     Raises:
         ValueError: the page lacks a part, or has one that `blocks` lacks.
     """
-    text = path.read_text()
+    text = path.read_text("utf-8")
     if different := {name for _, name, _ in _BLOCK.findall(text)} ^ blocks.keys():
         raise ValueError(f"{path} and its study have different parts: {', '.join(different)}")
     write_text(path, _BLOCK.sub(lambda m: f"{m[1]}\n{blocks[m[2]]}\n{m[3]}", text))

@@ -188,4 +188,4 @@ def tidy(folder: Path) -> None:
 def _failure(folder: Path) -> str:
     """Return the reason in failed.txt, "" if there is none."""
     path = folder / FAILED_FILE
-    return path.read_text().partition("\n")[0] if path.exists() else ""
+    return path.read_text("utf-8").partition("\n")[0] if path.exists() else ""

@@ -3,10 +3,11 @@ import re
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from lorasp_jax.extras.study import results
+from lorasp_jax.extras.study import page, progress, results
 from lorasp_jax.extras.study.study import select
 from tests import ROOT
 from tests.extras.study import fakes
@@ -203,3 +204,17 @@ def test_the_readme_beside_the_results_gets_the_tables(start, committed, tmp_pat
     assert readme.read_text() == text.format("\n6 cells\n")
     readme.write_text(text.format("").replace("count", "other"))
     assert "different parts" in start("--results", str(committed))[1]
+
+
+def test_texts_are_utf8_whatever_the_locale(tmp_path, monkeypatch):
+    def read(path, encoding="latin-1"):
+        return path.read_bytes().decode(encoding)
+
+    readme, mark = tmp_path / "README.md", "π0 – ü\n<!-- begin: a -->\n{}<!-- end -->\n"
+    readme.write_text(mark.format(""), "utf-8")
+    progress.record_failure(tmp_path, "no π0", "")
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "read_text", read)
+        page.fill(readme, {"a": "−"})
+        assert progress._failure(tmp_path) == "no π0"
+    assert readme.read_text("utf-8") == mark.format("\n−\n")
