@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from lorasp_jax.base.arguments import positive
+from lorasp_jax.base.arguments import positive, seed
 from lorasp_jax.base.errors import INTERRUPTED, REFUSED, describe
 from lorasp_jax.base.writing import write_text
 from lorasp_jax.extras.judge.actors import Actor, RunActor, ServerActor
@@ -125,7 +125,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     text = "tasks judged at once, each in a process; needs --server (default: %(default)s)"
     add("--processes", type=positive, default=1, metavar="N", help=text)
     text = "seed of the first episode; the next has the next seed (default: %(default)s)"
-    add("--seed", type=int, default=0, help=text)
+    add("--seed", type=seed, default=0, help=text)
     add("--out", type=Path, metavar="FILE", help="JSON file to write")
     add("--films", type=Path, metavar="FOLDER", help="film the first episode of each task")
     return parser

@@ -77,7 +77,7 @@ class RunActor:
 
     def reset(self, seed: int) -> None:
         """Start an episode."""
-        self._episode, self._calls = seed, 0
+        self._episode, self._calls = seed % 2**31, 0  # an int32
 
     def act(
         self, images: Mapping[str, np.ndarray], state: np.ndarray, instruction: str
