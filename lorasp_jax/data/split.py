@@ -22,7 +22,7 @@ def held_out(
 
     A share or a number of episodes is spread over the tasks, within a task over its instructions,
     and then over the time in which the episodes were recorded. Every task keeps an episode to learn
-    from, and every instruction does while others of its task have more.
+    from, and every instruction does if those of its task have enough others for the share.
 
     Args:
         choice: `DataConfig.validation`.
