@@ -62,7 +62,7 @@ def test_arrays_larger_than_their_files(tmp_path):
     assert published._restore(tmp_path / "params")["a"].shape == (2, 3)
     (header,) = (tmp_path / "params").rglob(".zarray")
     header.write_text(json.dumps(json.loads(header.read_text()) | {"shape": [10**6, 10**6]}))
-    with pytest.raises(ValueError, match="params is damaged"):
+    with pytest.raises(ValueError, match=r"params would take .* GiB of memory"):
         published._restore(tmp_path / "params")
 
 

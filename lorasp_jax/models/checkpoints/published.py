@@ -27,7 +27,7 @@ import safetensors.numpy
 from flax import nnx
 
 from lorasp_jax.adapters.paths import by_path
-from lorasp_jax.base.files import check_local, check_memory
+from lorasp_jax.base.files import RefusedError, check_local, check_memory
 from lorasp_jax.base.writing import atomic_file
 from lorasp_jax.models.checkpoints import layouts, orbax_folders
 from lorasp_jax.models.checkpoints.native import base_arrays, named_arrays, set_arrays
@@ -197,6 +197,8 @@ def _restore(folder: Path) -> dict[str, np.ndarray]:
         check_memory(sum(sizes), folder)
         as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), tree)
         restored = checkpointer.restore(folder.absolute(), restore_args=as_numpy)
+    except (RefusedError, MemoryError):
+        raise
     except Exception as error:  # Orbax and its C++ layer raise many exception types
         raise ValueError(f"{folder} is damaged or not an Orbax checkpoint") from error
     return {
