@@ -41,8 +41,7 @@ class Rollout:
         steps: `[W]` int32, control steps up to success or the time limit.
         running: `[calls]` int32, number of unfinished worlds.
         active_rank: `[calls, L]` per linear layer, mean over tokens and unfinished worlds.
-        active_rank_histogram: `[calls, R + 1]` int32 per tower; see `metrics.rank_histogram`. R is
-            the largest adapter rank.
+        active_rank_histogram: `[calls, R + 1]` int32 per tower; see `metrics.rank_histogram`.
         poses: poses of the first worlds at every control step, leading axes `[time, worlds]`.
         draw: randomized values of these worlds, leading axis `[worlds]`; None without ranges.
     """
@@ -287,5 +286,5 @@ def _placement(policy: Policy) -> Any:
 
 
 def _max_rank(policy: Policy) -> int:
-    """Return the largest adapter rank; 0 if no method has a rank."""
-    return max((getattr(method, "rank", 0) for method in policy.model.methods), default=0)
+    """Return the largest possible active rank; 0 if no method has a rank."""
+    return max((method.largest_active_rank for method in policy.model.methods), default=0)

@@ -62,6 +62,11 @@ class LoRAMoE(Method):
         """α/R."""
         return 2.0 if self.alpha is None else self.alpha / self.rank
 
+    @property
+    def largest_active_rank(self) -> int:
+        """R of the chosen expert, or that of all experts."""
+        return self.rank * (1 if self.routing == "top1" else self.experts)
+
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
         """Initialize A and the router uniformly and B to zero; the delta is exactly zero."""
         width = self.experts * self.rank
@@ -84,12 +89,12 @@ class LoRAMoE(Method):
         probabilities = softmax(logits)
         columns = jnp.repeat(self.scale * self._weights(probabilities), self.rank, axis=-1)
         z = expert_inputs * columns
-        active = self.rank * (1 if self.routing == "top1" else self.experts)
         losses = {
             "balance": balance_loss(probabilities, token_mask),
             "z": z_loss(logits, token_mask),
         }
-        return z, Aux(jnp.full(rows.shape[:-1], active, jnp.float32), None, losses)
+        active_rank = jnp.full(rows.shape[:-1], self.largest_active_rank, jnp.float32)
+        return z, Aux(active_rank, None, losses)
 
     def up(self, params: Params) -> jax.Array:
         """B."""

@@ -87,6 +87,11 @@ class Method(Bottleneck):
         return name_of(type(self))
 
     @property
+    def largest_active_rank(self) -> int:
+        """Most directions that a token can use; 0 for a method without a rank."""
+        return getattr(self, "rank", 0)
+
+    @property
     def as_saved(self) -> "Method":
         """The method to save with the parameters and to load them with."""
         return self

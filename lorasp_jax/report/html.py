@@ -294,15 +294,16 @@ def _rule_cells(row: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _largest_rank(folder: Path, config: dict[str, Any]) -> int:
-    """Return the largest rank of the run's methods."""
+    """Return the largest active rank that the run's methods allow."""
     if "plan" in config:
         return max(map(max, config["plan"]["ranks"].values()))
     if "adapt" not in config:
         with as_value_error(folder / CONFIG_FILE):
             check(config, records.WITH_RANK)
-        return config["peft"]["rank"]
+        method = config["peft"]  # of any version
+        return method["rank"] * (method["experts"] if method.get("routing") == "weighted" else 1)
     named = presets.parse(config["adapt"], recorded_method(config["peft"]))
-    return max(getattr(method, "rank", 0) for _, method in named.values())
+    return max(method.largest_active_rank for _, method in named.values() if method)
 
 
 def _active_rank(

@@ -21,7 +21,7 @@ from lorasp_jax.config import EvaluationConfig
 from lorasp_jax.evaluation import programs
 from lorasp_jax.evaluation.programs import compiled_rollout, make_rollout
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.peft import Aux, FullFineTuning, LoRA, LoRASP, Method
+from lorasp_jax.peft import Aux, FullFineTuning, LoRA, LoRAMoE, LoRASP, Method
 from lorasp_jax.policies import statistics_files
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor
@@ -150,7 +150,15 @@ def step_by_step(room, policy, key, ranges=None):
     return state, running, ranks
 
 
-@pytest.mark.parametrize(("method", "rank"), [(LoRA(rank=5), 5), (FullFineTuning(), 0)])
+@pytest.mark.parametrize(
+    ("method", "rank"),
+    [
+        (LoRA(rank=5), 5),
+        (FullFineTuning(), 0),
+        (LoRAMoE(experts=3, rank=2), 6),
+        (LoRAMoE(experts=3, rank=2, routing="top1"), 2),
+    ],
+)
 def test_max_rank(method, rank):
     assert programs._max_rank(policy(method=method)) == rank
 

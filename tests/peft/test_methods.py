@@ -107,6 +107,8 @@ def test_apply_is_base_plus_delta(method, kernel, x):
         np.testing.assert_allclose(y, expected, rtol=1e-5, atol=1e-5)
     for per_token in (aux.active_rank, aux.kept_energy):
         assert per_token is None or (per_token.shape, per_token.dtype) == ((2, 5), jnp.float32)
+    if aux.active_rank is not None:
+        assert aux.active_rank.max() <= method.largest_active_rank
     assert all(v.shape == () and v.dtype == jnp.float32 for v in aux.losses.values())
 
 

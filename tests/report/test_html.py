@@ -6,6 +6,7 @@ import re
 
 import pytest
 
+from lorasp_jax.peft import LoRAMoE
 from lorasp_jax.report import figures
 from lorasp_jax.report.html import speed, write_report
 from lorasp_jax.training.best import BEST
@@ -47,6 +48,15 @@ def test_full_fine_tuning_has_no_ranks(folder):
     write_json(folder / "results.json", results)
     (folder / "metrics.jsonl").write_text(json.dumps({"step": 2, "task": 0.5}) + "\n")
     assert "Active rank" not in write_report(folder).read_text()
+
+
+@pytest.mark.parametrize("adapt", [(), ("vision=none", "language=lora_moe")])
+def test_all_experts_of_a_mixture_fit_into_the_figure(folder, monkeypatch, adapt):
+    ranks, config = [], dataclasses.replace(CONFIG, peft=LoRAMoE(experts=3, rank=2), adapt=adapt)
+    monkeypatch.setattr(figures, "active_rank", lambda _, rank: ranks.append(rank))
+    write_json(folder / "config.json", to_json(config))
+    write_report(folder)
+    assert ranks == [6]
 
 
 def test_unfinished_run(folder):
