@@ -71,7 +71,8 @@ def uses_float8(kernel: Kernel, rows: int, width: int) -> TypeGuard[QuantizedKer
 def encode(x: jax.Array, dtype: Any) -> tuple[jax.Array, jax.Array]:
     """Return codes of a float8 dtype, and their scale, f32 []; NaN or infinity in x gives NaN."""
     largest = jnp.max(jnp.abs(x)).astype(jnp.float32)
-    scale = jnp.where(largest == 0, 1, largest / float(jnp.finfo(dtype).max))
+    # Division by a subnormal scale, which XLA may take for 0, could give NaN.
+    scale = jnp.maximum(largest / float(jnp.finfo(dtype).max), jnp.finfo(jnp.float32).tiny)
     return (x.astype(jnp.float32) / scale).astype(dtype), scale
 
 

@@ -170,7 +170,8 @@ def _held_out_fits(
         rows, held_out = known & (fold != index), fold == index
         gram, target = x[rows].T @ x[rows], x[rows].T @ (returns[rows] - mean)
         for value, ridge in zip(fits, _RIDGES, strict=True):
-            weights = np.linalg.solve(gram + ridge * rows.sum() * np.eye(len(gram)), target)
+            penalty = ridge * max(rows.sum(), 1) * np.eye(len(gram))
+            weights = np.linalg.solve(gram + penalty, target)
             value[held_out] = np.clip(mean + x[held_out] @ weights, -1, 0)
     return fits
 

@@ -71,6 +71,8 @@ def test_scaling_reaches_the_largest_code_and_no_further(dtype):
     codes = rounded(np.array([1, 1.3], np.float32) * np.float32(largest / 1.3), dtype)
     np.testing.assert_allclose(codes, np.array([1, 1.3]) * largest / 1.3, rtol=0.08)
     np.testing.assert_array_equal(rounded(np.zeros(2, np.float32), dtype), 0)
+    tiny = np.array([1, -0.5, 0], np.float32) * np.float32(1e-36)
+    np.testing.assert_allclose(rounded(tiny, dtype), tiny, rtol=0.08)
     assert np.isnan(
         rounded(np.array([1, np.nan], np.float32), dtype)
     ).all()  # the guard must see it

@@ -396,6 +396,13 @@ def test_equal_values_have_a_share_of_good_ones_and_no_correlation(folder, monke
     assert found.correlation == 0
 
 
+def test_one_known_outcome_is_what_all_steps_are_worth():
+    returns, episode = np.linspace(-1, 0, 6), np.repeat([0, 1, 2], 2)
+    observed = np.random.default_rng(0).normal(size=(6, 3)).astype(np.float32)
+    value = advantage._values(observed, returns, episode, episode == 1)
+    np.testing.assert_allclose(value[2:4], returns[2:4].mean())
+
+
 def test_demonstrations_are_good(tmp_path):
     """A dataset without outcomes or failures, joined with a policy's episodes."""
     rlds.write(labelled(), tmp_path / "tries")
