@@ -37,8 +37,9 @@ def input_moments(run: Run, model: Backbone, processor: Processor) -> dict[str, 
 def sampled(run: Run, processor: Processor, chunk: int) -> Iterator[fixed_batches.Keyed]:
     """Yield `BATCHES` random keys and training batches."""
     sample = batch_sampler(run, processor, chunk)
-    for key in jax.random.split(RandomStream.STATISTICS.key(run.config.seed), BATCHES):
-        yield key, sample(key)
+    key = RandomStream.STATISTICS.key(run.config.seed)
+    for batch_key, loss_key in jax.random.split(key, (BATCHES, 2)):
+        yield loss_key, sample(batch_key)
 
 
 def batch_sampler(run: Run, processor: Processor, chunk: int) -> Callable[[jax.Array], Batch]:

@@ -1,14 +1,15 @@
 """Fixed batches: prompts by the policy's table, no state noise, the same for the same key."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 
 from lorasp_jax.data.batches import flatten
-from lorasp_jax.training import fixed_batches
-from tests.runs import make_run, random_episodes
+from lorasp_jax.training import activations, fixed_batches
+from tests.runs import CONFIG, make_run, random_episodes
 
 
 @pytest.fixture(scope="module")
@@ -54,3 +55,11 @@ def test_all_tasks_have_the_same_keys(run):
     np.testing.assert_array_equal(*keys)
     assert len(np.unique(keys[0], axis=0)) == 3
     assert not same(found["press"][0][1], found["pick_place"][0][1])
+
+
+def test_a_batch_and_its_loss_share_no_key(monkeypatch):
+    """Otherwise the flow times would follow the noise of the states."""
+    monkeypatch.setattr(activations, "batch_sampler", lambda *_: lambda key: key)
+    pairs = activations.sampled(SimpleNamespace(config=CONFIG), None, 4)
+    keys = [jax.random.key_data(key) for pair in pairs for key in pair]
+    assert len(np.unique(keys, axis=0)) == 2 * activations.BATCHES
