@@ -1,21 +1,24 @@
 """An environment without physics, and runs in it."""
 
 import dataclasses
+import functools
 import io
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from rich.console import Console
 
 from envs.state import Data, State
 from lorasp_jax.config import EvaluationConfig, OptimConfig
+from lorasp_jax.policies.policy import Policy
 from lorasp_jax.reinforce.config import Learning, ReinforceConfig
 from lorasp_jax.training.run import Run
 from tests.runs import CONFIG, make_run
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True)  # equal rooms share programs
 class Room:
     """A world succeeds when its first joint is commanded to a sum of more than `goal`.
 
@@ -77,7 +80,9 @@ def config(**changes) -> ReinforceConfig:
     learn = dataclasses.replace(learn, rounds=2, gradient_steps=4)
     optim = OptimConfig(steps=4, batch_size=8, learning_rate=1e-3)
     evaluation = EvaluationConfig(episodes=8, num_envs=8, execute_steps=2, denoise_steps=2)
+    targets = "q_proj", "action_out_proj"  # programs of more layers take longer to compile
     fields |= {"tasks": ("press",), "optim": optim, "evaluation": evaluation, "online": learn}
+    fields |= {"targets": targets}
     return ReinforceConfig(**fields | {"log_every": 1, "checkpoint_every": 1} | changes)
 
 
@@ -86,3 +91,14 @@ def start(folder: Path, settings: ReinforceConfig, devices: int = 1) -> Run:
     run = make_run(folder, settings, devices=devices)
     run.console = Console(file=io.StringIO())
     return run
+
+
+_sample = jax.jit(functools.partial(Policy.sample, num_steps=2))
+
+
+def outputs(policy: Policy) -> jax.Array:
+    """Return actions in two random situations."""
+    rng = np.random.default_rng(0)
+    image = {n: rng.integers(0, 255, (2, 32, 32, 3), np.uint8) for n in ("side", "wrist")}
+    raw = {"image": image, "state": rng.normal(size=(2, 7)).astype("f")}
+    return _sample(policy, jax.random.key(0), raw, np.zeros(2, np.int32))

@@ -1,5 +1,7 @@
 """Rollouts: what is recorded, restarts."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,10 +23,15 @@ def collect(policy, room, std=0.2, sde=False):
     return rollout.collect(room, policy, jax.random.key(4), spread, sde=sde, **OPTIONS)
 
 
+@functools.partial(jax.jit, static_argnums=(3, 4))
+def means_of(*arguments):
+    return rollout.means(*arguments)[0]
+
+
 def test_the_recorded_noise_gives_the_mean_of_the_actions(policy):
     found = collect(policy, rooms.Room())
     chunks, processor = found.chunks, policy.processor.shared()
-    means, _ = rollout.means(policy.model, processor, chunks, 2, 0.0)
+    means = means_of(policy.model, processor, chunks, 2, 0.0)
     slots = noise.action_slots(processor)
     z = ((chunks.actions - means)[:, :2] / 0.2)[..., slots]
     np.testing.assert_allclose(chunks.actions[:, 2:], means[:, 2:], atol=1e-4)
@@ -36,7 +43,7 @@ def test_the_recorded_noise_gives_the_mean_of_the_actions(policy):
 
 def test_the_recorded_step_gives_the_mean_of_its_end(policy):
     chunks, processor = collect(policy, rooms.Room(), sde=True).chunks, policy.processor.shared()
-    means, _ = rollout.means(policy.model, processor, chunks, 2, 0.2)
+    means = means_of(policy.model, processor, chunks, 2, 0.2)
     slots = noise.action_slots(processor)
     z = (chunks.actions - means) / flow_sde.spread_of(chunks.step, 2, 0.2).std[..., None]
     z = z[:, :2, slots]

@@ -23,6 +23,7 @@ from lorasp_jax.training.overrides import parse
 from lorasp_jax.training.run_folder import read_json, to_json, write_json
 from tests import ROOT
 from tests.reinforce import rooms
+from tests.reinforce.rooms import outputs
 from tests.runs import CONFIG, RESULTS, finish_with_weights, leaves, write_description
 
 SDE = ["--online.method", "ppo", "--online.exploration", "sde"]
@@ -172,13 +173,6 @@ def test_adapters_are_not_merged_into_a_quantized_base(changed):
 def load(config, folder):
     folder.mkdir()
     return start.load(config, folder, Console(quiet=True), 0.0)
-
-
-def outputs(policy):
-    rng = np.random.default_rng(0)
-    image = {n: rng.integers(0, 255, (2, 32, 32, 3), np.uint8) for n in ("side", "wrist")}
-    raw = {"image": image, "state": rng.normal(size=(2, 7)).astype("f")}
-    return policy.sample(jax.random.key(0), raw, np.zeros(2, np.int32), num_steps=2)
 
 
 def test_adapters_go_on_and_are_exported(few, tmp_path):

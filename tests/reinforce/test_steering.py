@@ -34,6 +34,7 @@ from tests import ROOT
 from tests.extras.serving.test_policies import STEPS, noise_of, reference, request
 from tests.models.random_models import random_backbone
 from tests.reinforce import rooms
+from tests.reinforce.rooms import outputs
 from tests.runs import RESULTS, finish_with_weights, leaves, make_run
 
 CALLS, STD, SLOTS = 512, 0.5, (True, True, False)
@@ -155,13 +156,6 @@ def run(few, tmp_path_factory):
     write_json(folder / "config.json", to_json(config))
     write_json(folder / "results.json", RESULTS)
     return run
-
-
-def outputs(policy):
-    rng = np.random.default_rng(0)
-    image = {n: rng.integers(0, 255, (2, 32, 32, 3), np.uint8) for n in ("side", "wrist")}
-    raw = {"image": image, "state": rng.normal(size=(2, 7)).astype("f")}
-    return policy.sample(jax.random.key(0), raw, np.zeros(2, np.int32), num_steps=2)
 
 
 def test_a_run_is_exported_with_its_actor(run, few):
