@@ -21,7 +21,7 @@ from lorasp_jax.training.export import BASE, load_policy
 from lorasp_jax.training.finished_run import recorded_config
 from lorasp_jax.training.overrides import parse
 from lorasp_jax.training.run_folder import read_json, to_json, write_json
-from tests import ROOT
+from tests import ROOT, runs
 from tests.runs import CONFIG, RESULTS, Terminate, finish_with_weights, leaves, make_run, repeatable
 
 FILE = str(ROOT / "configs/distill_flow.py")
@@ -105,7 +105,7 @@ def distilling(folder, **changes):
     fields |= {"peft": LoRA(rank=4), "optim": optim, "keep": "last"}
     fields |= {"evaluation": EvaluationConfig(denoise_steps=1), "distill": Distillation()}
     run = make_run(folder, DistillFlowConfig(**fields | changes))
-    run.console = Console(file=io.StringIO())
+    run.console, run.programs = Console(file=io.StringIO()), runs.PROGRAMS
     return command.student(run)
 
 

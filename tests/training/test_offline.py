@@ -22,6 +22,7 @@ from lorasp_jax.data.stream import Stream
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
 from lorasp_jax.peft import LoRA
+from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.tokenizer import Offline
 from lorasp_jax.training import advantage, export, finished_run, offline, setup
 from lorasp_jax.training.cost import preflight
@@ -81,12 +82,15 @@ def prepare(folder, learn, backbone="pi0", **more):
     return run
 
 
+sample = jax.jit(Policy.sample)
+
+
 def right(run, row=0):
     """Return how often the policy goes right at the fork, told what `row` of its prompts says."""
     observation = {"image": {"side": np.zeros((64, 32, 32, 3), np.uint8)}}
     observation["state"] = np.zeros((64, 7), np.float32)
     policy = run.policy.with_sampler()
-    actions = policy.sample(jax.random.key(0), observation, np.full(64, row, np.int32))
+    actions = sample(policy, jax.random.key(0), observation, np.full(64, row, np.int32))
     return float((np.asarray(actions)[:, 0, 0] > 0).mean())
 
 

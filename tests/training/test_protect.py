@@ -21,11 +21,12 @@ from lorasp_jax.training import early, export, loop, program, protect, setup
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.export import load_policy
 from lorasp_jax.training.overrides import parse
-from lorasp_jax.training.run_folder import read_json, to_json, write_json
+from lorasp_jax.training.run_folder import to_json, write_json
 from tests import ROOT
 from tests.models.random_models import random_backbone, with_noise
 from tests.runs import (
     CONFIG,
+    PROGRAMS,
     RESULTS,
     Terminate,
     finish_with_weights,
@@ -51,9 +52,10 @@ def protecting(folder, backbone=Pi0Config.dummy, devices=1):
     """A run on random adapters, of which some entries are -0, that protects some directions."""
     config = dataclasses.replace(CONFIG, optim=OPTIM)
     run = make_run(folder, config, random_backbone(backbone()), devices)
+    run.programs = PROGRAMS
     graphdef, adapters, frozen = adaptation.split(run.policy.model)
     adapters = with_noise(adapters, 0.1)
-    adapters = jax.tree.map(lambda x: jnp.where(jnp.arange(x.shape[-1]) % 3, x, -0.0), adapters)
+    adapters = jax.tree.map(lambda x: np.where(np.arange(x.shape[-1]) % 3, x, -0.0), adapters)
     run.policy = dataclasses.replace(run.policy, model=nnx.merge(graphdef, adapters, frozen))
     run.fixed = protect.fixed(run.policy.model, some(run.policy.model))
     return run
@@ -254,9 +256,11 @@ def test_other_kinds_of_runs_refuse_it(finished):
         _resolved(parse([*options, "--from", str(finished), "--protect", str(finished)]))
 
 
-def test_damaged_directions_are_refused(settings, tmp_path):
+def test_damaged_directions_are_refused(tmp_path):
     write_json(tmp_path / protect.FILE, {"x": ["01"]})
+    with pytest.raises(ValueError, match="it has x, which is no layer"):
+        protect.read(tmp_path, nnx.Dict())
     text = (tmp_path / protect.FILE).read_text()
     (tmp_path / protect.FILE).write_text(text.replace("01", "11"))
     with pytest.raises(ValueError, match="the digest does not match"):
-        read_json(tmp_path / protect.FILE)
+        protect.read(tmp_path, nnx.Dict())
