@@ -454,9 +454,8 @@ def test_policies_of_all_ranks_share_the_programs_of_evaluation(backbone, tmp_pa
         shown = judge.padded(own, config.targets)
         structures.append(adaptation.split(shown.model)[0])
         key, batch = next(activations.sampled(run, own.processor, base.config.chunk))
-        chunks = [
-            x.model.loss(key, batch.observation, batch.actions)[0] for x in (own, shown, run.policy)
-        ]
+        loss = jax.jit(lambda x: x.model.loss(key, batch.observation, batch.actions)[0])  # noqa: B023
+        chunks = [loss(x) for x in (own, shown, run.policy)]
         np.testing.assert_allclose(*chunks[:2], rtol=1e-4, atol=1e-5)
         assert float(jnp.abs(chunks[0] - chunks[2]).max()) > 1e-2
     assert structures[0] == structures[1] != structures[2]
