@@ -1,6 +1,7 @@
 """Held-out episodes: never trained on, measured repeatably, and the best adapters are kept."""
 
 import dataclasses
+import functools
 import re
 from unittest import mock
 
@@ -28,13 +29,15 @@ from tests.data.lerobots import golden
 from tests.runs import CONFIG, Terminate, leaves
 from tests.training.test_dataset import prepare
 
-OUT = (1, 2)
+KEY, OUT = jax.random.key(0), (1, 2)
 DATA = DataConfig(source=str(golden("v3")), validation=("episode_1", "episode_2"))
 CONFIG = dataclasses.replace(
     CONFIG,
     data=DATA,
     model=dataclasses.replace(CONFIG.model, max_tokens=16),
-    evaluation=dataclasses.replace(CONFIG.evaluation, validate_every=2, execute_steps=1),
+    evaluation=dataclasses.replace(
+        CONFIG.evaluation, validate_every=2, execute_steps=1, denoise_steps=2
+    ),
 )
 
 
@@ -196,9 +199,12 @@ def test_noise_that_a_policy_has_learned_counts(recorded):
     policy, found = recorded.policy, windows(LeRobot(golden("v3")), OUT, recorded.policy, every=10)
     actor = NoiseActor.blank(policy.model.config, std=0.999999, widths=(4,))
     steered = dataclasses.replace(policy, model=attach(policy.model, actor))
-    with mock.patch.object(jax.random, "normal", lambda _, shape: jnp.zeros(shape)):
+    program = functools.partial(held_out._program.__wrapped__)  # has a cache of its own
+    with (
+        mock.patch.object(held_out, "_program", jax.jit(program, static_argnames="num_steps")),
+        mock.patch.object(jax.random, "normal", lambda _, shape: jnp.zeros(shape)),
+    ):
         expected = held_out.sample(policy, found, num_steps=2)  # of no noise
-    jax.clear_caches()
     plain, other = (measure(x, found, num_steps=2) for x in (policy, steered))
     np.testing.assert_allclose(other.actions, expected, atol=1e-2)
     assert np.abs(plain.actions - expected).max() > 0.1
@@ -236,7 +242,7 @@ def test_a_run_measures_keeps_the_best_and_resumes(recorded, tmp_path, monkeypat
         folder = tmp_path / name
         folder.mkdir()
         run = dataclasses.replace(recorded, folder=folder)
-        run.policy = recorded.policy
+        run.policy, run.programs = recorded.policy, recorded.programs
         write_json(folder / "config.json", to_json(run.config))
         if name == "whole":
             watcher = Watcher()
@@ -276,14 +282,13 @@ def test_the_loss_is_that_of_training(recorded):
     """Of the model that trains, although the sampler's weights give it."""
     policy = recorded.policy
     found = windows(LeRobot(golden("v3")), OUT, policy, every=10)
-    batch = encode(jax.random.key(0), found.raw, policy.processor, state_noise=0.0)
+    encoded = jax.jit(lambda raw: encode(KEY, raw, policy.processor, state_noise=0.0))
+    batch = encoded(found.raw)
     wrapped = jax.tree.map(lambda x: jnp.concatenate([x, x]), batch)  # to the size of a batch
-    key = jax.random.split(jax.random.fold_in(jax.random.key(0), 0))[0]
-    losses = jax.vmap(
-        lambda key: policy.model.loss(
-            key, wrapped.observation, wrapped.actions, action_mask=wrapped.action_mask
-        )[0]
-    )(jax.random.split(key, held_out._NOISES))
+    key = jax.random.split(jax.random.fold_in(KEY, 0))[0]
+    inputs, mask = (wrapped.observation, wrapped.actions), wrapped.action_mask
+    loss = jax.jit(jax.vmap(lambda key: policy.model.loss(key, *inputs, action_mask=mask)[0]))
+    losses = loss(jax.random.split(key, held_out._NOISES))
     valid = np.broadcast_to(batch.action_mask, (held_out._NOISES, *batch.action_mask.shape))
     expected = np.asarray(losses)[:, :8][valid].mean()
     assert measure(policy, found, num_steps=1).loss == pytest.approx(expected, rel=1e-4)

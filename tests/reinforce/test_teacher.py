@@ -44,6 +44,7 @@ def judge():
 
 def test_a_clone_acts_like_the_policy(policy, monkeypatch):
     monkeypatch.setattr(teacher, "_CLONE_STEPS", 1000)
+    monkeypatch.setattr(teacher, "_CLONE_BATCH", 128)
     state = 3 + 2 * jax.random.normal(jax.random.key(1), (2048, SIZE))
     target = jnp.sin(state[:, :LENGTH, None] + jnp.arange(SLOTS))
     slots = policy.processor.action_slots

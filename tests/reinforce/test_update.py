@@ -73,6 +73,16 @@ def make(model, processor, config=None, rate=3e-2):
     return programs, jax.device_put(state, shardings), Frozen(parameters, processor)
 
 
+explore = jax.jit(noise.explore)
+
+
+@jax.jit
+def from_noise(key, target, *inputs):
+    """Sample with the velocity whose flow ends at `target`."""
+    velocity = lambda x, t: ((x - target) / t[:, None, None], None)  # noqa: E731
+    return flow_sde.sample(key, velocity, *inputs, num_steps=2)
+
+
 def explored(processor, means, key, changes=(), std=STD, count=CHUNKS):
     """Return executed actions that are drawn around `means`, `[S, A]`, and their chunks."""
     rng, config = np.random.default_rng(0), Pi0Config.dummy()
@@ -83,12 +93,10 @@ def explored(processor, means, key, changes=(), std=STD, count=CHUNKS):
     prompts, slots = np.zeros(count, np.int32), noise.action_slots(processor)
     if changes:
         target = jnp.zeros(flow.shape[1:]).at[: len(means)].set(means)
-        velocity = lambda x, t: ((x - target) / t[:, None, None], None)  # noqa: E731
-        inputs = key, velocity, flow, slots, changes["noise_level"]
-        ends, (x, after, step) = flow_sde.sample(*inputs, num_steps=2)
+        ends, (x, after, step) = from_noise(key, target, flow, slots, changes["noise_level"])
         return ends[:, : len(means)], Chunks(raw, prompts, x, after[:, : len(means)], step)
     mean = jnp.broadcast_to(means, (count, *means.shape))
-    actions = noise.explore(key, mean, noise.Spread(std, 0.0), slots)
+    actions = explore(key, mean, noise.Spread(std, 0.0), slots)
     return actions, Chunks(raw, prompts, flow, actions)
 
 
