@@ -1,4 +1,4 @@
-"""Inspect traced programs, independently of how they are split into functions."""
+"""Trace programs for other devices, and inspect them independently of their functions."""
 
 import jax
 
@@ -17,3 +17,9 @@ def equations(jaxpr):
             inner = getattr(inner, "jaxpr", inner)
             if hasattr(inner, "eqns"):
                 yield from equations(inner)
+
+
+def target(platform, kind=""):
+    """Trace for this platform, by default a device of no known kind, on a host without it."""
+    device = jax.sharding.AbstractDevice(kind, num_cores=None, platform=platform)
+    return jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), (), abstract_device=device))

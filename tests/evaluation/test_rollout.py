@@ -13,6 +13,7 @@ from lorasp_jax.evaluation.programs import predict
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Offline
+from tests.jaxprs import target
 from tests.runs import CONFIG, make_run
 
 
@@ -27,14 +28,12 @@ from tests.runs import CONFIG, make_run
 )
 def test_lowers_for(platform, kind, gate, tmp_path):
     policy = make_run(tmp_path / "run", dataclasses.replace(CONFIG, targets=("q_proj",))).policy
-    device = jax.sharding.AbstractDevice(device_kind=kind, num_cores=None, platform=platform)
-    mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
     images = {name: np.zeros((2, 32, 32, 3), np.uint8) for name in ("side", "wrist")}
     observation = {"image": images, "state": np.zeros((2, 7), np.float32)}
     rows, done = np.zeros(2, np.int32), np.zeros(2, bool)
     inputs = jax.random.key(0), np.int32(0), observation, rows, done
     shapes = jax.eval_shape(lambda: (policy.with_sampler(), *inputs))
-    with jax.sharding.use_abstract_mesh(mesh):
+    with target(platform, kind):
         traced = jax.jit(functools.partial(predict, denoise_steps=2)).trace(*shapes)
         text = traced.lower(lowering_platforms=(platform,)).as_text()
     assert ("__gpu$xla.gpu.triton" in text) == (gate == "pallas")

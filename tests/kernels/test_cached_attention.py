@@ -10,6 +10,7 @@ from lorasp_jax.kernels.cached_attention import cached_attention
 from lorasp_jax.models.transformer import attention
 from lorasp_jax.training.cost import flops
 from tests.cases import mostly_slow
+from tests.jaxprs import target
 
 BATCH, TOKENS, KV_HEADS, GROUP, DIM = 2, 5, 2, 3, 16
 LAUNCHES = {
@@ -126,9 +127,7 @@ def test_a_mask_may_be_shared_by_batch_and_queries():
     np.testing.assert_array_equal(call(q, own, cache, one), expected)
 
 
-def on_gpu():
-    device = jax.sharding.AbstractDevice("NVIDIA H200", num_cores=None, platform="cuda")
-    return jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), (), abstract_device=device))
+on_gpu = functools.partial(target, "cuda", "NVIDIA H200")
 
 
 def published(name):

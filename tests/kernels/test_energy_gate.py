@@ -10,6 +10,7 @@ import pytest
 from lorasp_jax.kernels import energy_gate as gate
 from tests import GOLDEN
 from tests.cases import mostly_slow
+from tests.jaxprs import target
 
 GOLDEN = GOLDEN / "energy_gate_exact.npz"
 
@@ -209,10 +210,8 @@ def test_unknown_implementation():
     ],
 )
 def test_lowers_without_the_device(platform, kind, implementation, call):
-    device = jax.sharding.AbstractDevice(device_kind=kind, num_cores=None, platform=platform)
-    mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
     run = jax.jit(lambda s: gate.energy_gate(s, 0.9, implementation=implementation))
-    with jax.sharding.use_abstract_mesh(mesh):
+    with target(platform, kind):
         traced = run.trace(jax.ShapeDtypeStruct((3, 50, 100), jnp.float32))
         text = traced.lower(lowering_platforms=(platform,)).as_text()
     assert call in text

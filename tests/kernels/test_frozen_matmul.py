@@ -13,7 +13,7 @@ from lorasp_jax.kernels import frozen_matmul as fm
 from lorasp_jax.kernels.quantized_weights import quantize_kernel
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.training.distributed import mesh as meshes
-from tests.jaxprs import equations
+from tests.jaxprs import equations, target
 
 METHOD = LoRASP(rank=8)
 
@@ -106,9 +106,7 @@ def traced(tokens, d_in, d_out, kind="float8", platform="cuda"):
     def loss(params, x, kernel):
         return METHOD.apply(params, x, kernel)[0].astype(jnp.float32).sum()
 
-    device = jax.sharding.AbstractDevice("NVIDIA H200", num_cores=None, platform=platform)
-    mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
-    with jax.sharding.use_abstract_mesh(mesh):
+    with target(platform, "NVIDIA H200"):
         return jax.jit(jax.value_and_grad(loss, (0, 1))).trace(params, x, kernel)
 
 

@@ -7,9 +7,9 @@ import pytest
 from lorasp_jax.kernels.quantized_weights import quantize_kernel
 from lorasp_jax.kernels.rematerialization import save_narrow_products, save_products
 from lorasp_jax.peft import LoRA, LoRASP
+from tests.jaxprs import target
 
 TOKENS, WIDTH = 8192, 2048
-GPU = jax.sharding.AbstractDevice("", num_cores=None, platform="cuda")
 
 
 def saved(policy, columns, *, method, float8):
@@ -26,7 +26,7 @@ def saved(policy, columns, *, method, float8):
 
         return jax.vjp(jax.checkpoint(block, policy=policy), params, x)[1]
 
-    with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), (), abstract_device=GPU)):
+    with target("cuda"):
         x = jax.ShapeDtypeStruct((TOKENS, WIDTH), jnp.bfloat16)
         leaves = jax.tree.leaves(jax.eval_shape(residuals, params, x))
     return sum(leaf.shape == (TOKENS, columns) for leaf in leaves)

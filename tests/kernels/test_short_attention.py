@@ -8,6 +8,7 @@ import pytest
 from lorasp_jax.kernels.blocks import Launch
 from lorasp_jax.kernels.short_attention import MAX_KEYS, short_attention
 from lorasp_jax.models.transformer.attention import attention
+from tests.jaxprs import target
 
 LAUNCHES = Launch(rows=16, keys=32, warps=4), Launch(rows=32, keys=16, warps=4)
 
@@ -122,8 +123,7 @@ def test_layers_in_a_scan_with_remat():
 )
 def test_lowers_for_a_gpu_without_arrays_of_all_logits(tokens, keys, heads, kv_heads, size, masked):
     arrays = inputs(tokens, keys, heads, kv_heads, masked=masked, size=size)
-    device = jax.sharding.AbstractDevice("NVIDIA H200", num_cores=None, platform="cuda")
-    with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), (), abstract_device=device)):
+    with target("cuda", "NVIDIA H200"):
         traced = jax.jit(lambda *arrays: run(short_attention, *arrays)).trace(*arrays)
         text = traced.lower(lowering_platforms=("cuda",)).as_text()
     assert text.count("custom_call @__gpu$xla.gpu.triton") == 2

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 from typing import Any, cast
 
 import jax
@@ -14,6 +15,7 @@ from lorasp_jax.kernels import frozen_matmul
 from lorasp_jax.kernels.quantized_weights import Kind, QuantizedKernel
 from lorasp_jax.models import pi0
 from lorasp_jax.models.sampling import Sampler
+from tests.jaxprs import target
 from tests.models.random_models import observation, random_backbone
 from tests.nets import METHODS, trained
 
@@ -55,9 +57,7 @@ def nbytes(sampler) -> int:
     return sum(leaf.size * leaf.dtype.itemsize for leaf in sampler.weights)
 
 
-def on_hopper() -> Any:
-    device = jax.sharding.AbstractDevice("NVIDIA H100", num_cores=None, platform="cuda")
-    return jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), (), abstract_device=device))
+on_hopper = functools.partial(target, "cuda", "NVIDIA H100")
 
 
 def test_float8_stays_only_where_the_gpu_multiplies_it():

@@ -11,6 +11,7 @@ from envs import actions
 from envs.physics import physics
 from envs.scene import placing
 from tests.envs.demonstrations import demonstration
+from tests.jaxprs import equations
 
 
 @pytest.mark.parametrize(
@@ -31,16 +32,6 @@ def test_sums_in_order(segments, number):
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
     order = np.array([1e8, 1.0, -1e8], np.float32)  # the sum depends on the order
     assert physics._sum_in_order(jnp.array(order), np.zeros(3, int), 1)[0] == 0.0
-
-
-def equations(jaxpr):
-    """Yield all equations of a program, including those in loops and calls."""
-    for equation in jaxpr.eqns:
-        yield equation
-        for inner in jax.tree.leaves(list(equation.params.values())):
-            inner = getattr(inner, "jaxpr", inner)
-            if hasattr(inner, "eqns"):
-                yield from equations(inner)
 
 
 def unordered(function, *arguments):

@@ -13,18 +13,12 @@ from lorasp_jax.kernels.short_attention import short_attention
 from lorasp_jax.models import pi0, smolvla
 from lorasp_jax.models.transformer import attention as module
 from lorasp_jax.models.transformer.attention import MASKED, attention
-from tests.jaxprs import equations
+from tests.jaxprs import equations, target
 from tests.models.random_models import observation, random_backbone
 
 ALLOW_TRITON = pytest.mark.filterwarnings(
     "ignore:The Pallas Triton backend is deprecated:DeprecationWarning"
 )
-
-
-def target(platform):
-    """Trace for this platform on a host without it."""
-    device = jax.sharding.AbstractDevice("", num_cores=None, platform=platform)
-    return jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), (), abstract_device=device))
 
 
 def shapes(keys, head_dim, dtype="bfloat16", *, tokens=11, heads=4, kv_heads=2):

@@ -16,7 +16,7 @@ from lorasp_jax.peft import LoRA, LoRASP
 from lorasp_jax.peft.lora_sp import gpu_kernel, losses
 from lorasp_jax.peft.lora_sp.gpu_kernel import FusedBottleneck
 from lorasp_jax.peft.lora_sp.router import router_scores
-from tests.jaxprs import primitives
+from tests.jaxprs import primitives, target
 
 D_IN, D_OUT = 24, 40
 KERNEL = jax.ShapeDtypeStruct((D_IN, D_OUT), jnp.float32)
@@ -214,9 +214,7 @@ def test_kernels_on_an_nvidia_gpu(x, method, kernels):
     params, kernel = jax.eval_shape(lambda: initial(method)), np.ones((D_IN, D_OUT), "f")
     run = jax.jit(lambda params, x: method.apply(params, x, kernel)[0])
     for platform, expected in (("cuda", kernels), ("cpu", [])):
-        device = jax.sharding.AbstractDevice("", num_cores=None, platform=platform)
-        mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
-        with jax.sharding.use_abstract_mesh(mesh):
+        with target(platform):
             text = str(run.trace(params, x).jaxpr)
         assert sorted(set(re.findall(r"name=(rowwise_kernel|energy_gate)", text))) == expected
 
