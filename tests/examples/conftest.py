@@ -6,6 +6,7 @@ import sys
 import pytest
 
 from tests import ROOT
+from tests.extras.piper.conftest import bench, patient, world  # noqa: F401
 
 
 @pytest.fixture(scope="session")

@@ -5,12 +5,9 @@ import threading
 import numpy as np
 import pytest
 
-from lorasp_jax.extras.piper import safety
 from lorasp_jax.extras.piper.arms import PERIOD
 from lorasp_jax.extras.piper.fake.timing import RealTime
-from lorasp_jax.extras.piper.fake.world import World
 from lorasp_jax.extras.piper.safety import Limits, Unsafe
-from tests.extras.piper.benches import Bench
 
 LIMITS = Limits.of()
 STEP = np.array([0.03, 0, 0, 0, 0, 0, 0])  # rad per action
@@ -19,18 +16,6 @@ STEP = np.array([0.03, 0, 0, 0, 0, 0, 0])  # rad per action
 @pytest.fixture(scope="module")
 def module(load):
     return load("lerobot/lerobot_robot_lorasp_piper/follower.py")
-
-
-@pytest.fixture(scope="module")
-def world():
-    return World("press", image_size=16)
-
-
-@pytest.fixture
-def bench(world):
-    bench = Bench(world).ready()
-    yield bench
-    bench.close()
 
 
 @pytest.fixture
@@ -124,9 +109,8 @@ def test_an_error_of_its_thread_is_told(follower, bench, monkeypatch):
         follower.pose()
 
 
-def test_it_runs_in_a_thread_until_it_is_stopped(module, bench, monkeypatch):
-    monkeypatch.setattr(safety, "MAX_AGE", 60.0)  # a busy machine pauses threads
-    monkeypatch.setattr(safety, "MAX_DRIVER_AGE", 60.0)
+@pytest.mark.usefixtures("patient")
+def test_it_runs_in_a_thread_until_it_is_stopped(module, bench):
     clock = RealTime(bench.fake)
     bench.arm._clock = clock
     clock.start(bench.arm)

@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 
 from lorasp_jax.data.lerobot import LeRobot
-from lorasp_jax.extras.piper import safety
 from lorasp_jax.extras.piper.arm import PiperArm
 from lorasp_jax.extras.piper.fake.firmware import FakePiper
 from lorasp_jax.extras.piper.fake.timing import RealTime
-from lorasp_jax.extras.piper.fake.world import World
 from tests import ROOT
 from tests.extras.piper.benches import channel
 
@@ -100,10 +98,8 @@ def plugin(monkeypatch, tmp_path):
         return importlib.import_module(NAME)
 
 
-def test_the_robot_of_a_real_arm_moves_brakes_and_lets_go(plugin, monkeypatch, tmp_path):
-    monkeypatch.setattr(safety, "MAX_AGE", 60.0)  # a busy machine pauses threads
-    monkeypatch.setattr(safety, "MAX_DRIVER_AGE", 60.0)
-    world = World("press", image_size=16)
+@pytest.mark.usefixtures("patient")
+def test_the_robot_of_a_real_arm_moves_brakes_and_lets_go(plugin, world, monkeypatch, tmp_path):
     world.reset(3)
     bus = channel()
     fake = FakePiper(bus, world)
