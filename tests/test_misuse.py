@@ -42,7 +42,7 @@ def check_error(call, name):
 )
 def test_rules(rules):
     """NNX, Linen and quantization check rules in the same way."""
-    name = "regular expression" if rules == [("(", METHOD)] else "(pattern, "
+    name = "'(' is not a regular expression" if rules == [("(", METHOD)] else "(pattern, "
     check_error(lambda: lorasp_jax.adapt(NET, rules, rngs=nnx.Rngs(0)), name)
     check_error(lambda: lorasp_jax.LinenAdapter(nn.Dense(3), rules), name)
     check_error(lambda: lorasp_jax.quantize(NET, rules), "(pattern, ")

@@ -171,8 +171,6 @@ def test_adapting_a_fully_fine_tuned_layer_freezes_it(net):
     model = adapted(full, ("inp", LoRA(rank=2)), (".*", None))
     assert isinstance(model.inp, nnx.Linear) or model.inp.method == LoRA(rank=2)
     assert not isinstance(model.inp.kernel, AdapterParam)
-    with pytest.raises(ValueError, match="inp/kernel"):
-        adapted(net, ("kernel$", FullFineTuning()), ("inp", LoRA(rank=2)))
 
 
 def test_an_adapter_is_never_replaced(net, x):
@@ -193,8 +191,6 @@ def test_rules_that_apply_to_nothing(net):
         adapted(net, ("norm", LoRA(rank=2)))  # a norm is not a dense layer
     with pytest.raises(ValueError, match="rule 'inp'"):
         adapted(net, (".*", LoRA(rank=2)), ("inp", SP))  # shadowed
-    with pytest.raises(ValueError, match=r"'\('"):
-        adapted(net, ("(", SP))
     with pytest.raises(ValueError, match="rule 'haeds'"):
         adapted(net, ("haeds", None), (".*", SP))
 

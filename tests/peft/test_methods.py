@@ -201,8 +201,3 @@ def test_unknown_names():
         match=r"did you mean 'lora_sp'.*valid methods are ada_lora, dora, full, lora, lora_moe, ",
     ):
         peft.create("lora_ps")
-    with pytest.raises(
-        ValueError,
-        match=r"lora has no field 'rnk' \(did you mean 'rank'\?\); valid fields are rank, alpha",
-    ):
-        peft.create("lora", rnk=4)
