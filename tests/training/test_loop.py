@@ -61,6 +61,26 @@ def test_the_bar_has_the_rate_of_training_alone(tmp_path, monkeypatch):
     assert [rate for _, rate in shown if rate] == logged
 
 
+def gained(model, start, batch, noise, flow_time):
+    """An objective: how much lower the loss is than at the start."""
+    options = {"action_mask": batch.action_mask, "noise": noise, "flow_time": flow_time}
+    (now, aux), (before, _) = (
+        each.loss(None, batch.observation, batch.actions, **options) for each in (model, start)
+    )
+    return now - before, aux
+
+
+def test_an_objective_replaces_the_loss(tmp_path):
+    """It sees the model and that of the start, which are equal in the first step."""
+    config = dataclasses.replace(CONFIG, peft=LoRA(rank=4), targets=("inp",), log_every=1)
+    run = make_run(tmp_path / "run", config, Miniature())
+    run.objective = gained
+    train(run)
+    first, *_, last = (row["task"] for row in read_metrics(run.folder))
+    assert first == 0
+    assert last < 0
+
+
 class LogSize(Callback):
     def on_log(self, run, step, metrics):
         adapters = leaves(adaptation.split(run.policy.model)[1]).values()
